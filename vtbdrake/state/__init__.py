@@ -1,0 +1,22 @@
+"""s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
+
+from vtbdrake.state.collect import collect
+from vtbdrake.state.element import Codec, Element, continuous_state, discrete_state, parameter
+from vtbdrake.state.snapshot import Snapshot, SnapshotError
+from vtbdrake.state.variable import Variable, VariableError
+from vtbdrake.state.variables import AddressError, Variables
+
+__all__ = [
+    "AddressError",
+    "Codec",
+    "Element",
+    "Snapshot",
+    "SnapshotError",
+    "Variable",
+    "VariableError",
+    "Variables",
+    "collect",
+    "continuous_state",
+    "discrete_state",
+    "parameter",
+]

@@ -1,0 +1,52 @@
+"""All variables of a Diagram, gathered from its systems."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Diagram
+
+from vtbdrake.state.friction import friction_variables
+from vtbdrake.state.multibody import Prefix, multibody_variables, pose_entries_by_demand
+from vtbdrake.state.systems import leaf_variables, leaves
+from vtbdrake.state.variable import Variable
+from vtbdrake.state.variables import Variables
+
+
+def collect(
+    diagram: Diagram,
+    *,
+    plant_prefix: Callable[[str, str], str] | None = None,
+    skip: Iterable[str] = (),
+    extra: Iterable[Variable] = (),
+) -> Variables:
+    """The variables of every system of ``diagram``.
+
+    Args:
+        plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to
+            that instance. By default the path of the plant.
+        skip: paths of leaf systems whose variables are not listed.
+        extra: further variables of the diagram.
+    """
+    plant_prefix = plant_prefix or (lambda path, instance: path)
+    skipped = set(skip)
+    systems = [(path, system) for path, system in leaves(diagram) if path not in skipped]
+    scene_graph = next((system for _, system in systems if isinstance(system, SceneGraph)), None)
+    listed: list[Variable] = list(extra)
+    by_demand: dict[str, Callable[[], Variable]] = {}
+    for path, system in systems:
+        if isinstance(system, MultibodyPlant):
+            prefix = _prefix_of(plant_prefix, path)
+            listed.extend(multibody_variables(system, prefix=prefix))
+            if scene_graph is not None and system.geometry_source_is_registered():
+                listed.extend(friction_variables(system, scene_graph, prefix=prefix))
+            by_demand |= pose_entries_by_demand(system, prefix=prefix)
+        elif not isinstance(system, SceneGraph):
+            listed.extend(leaf_variables(path, system))
+    return Variables(listed, derived_by_demand=by_demand)
+
+
+def _prefix_of(plant_prefix: Callable[[str, str], str], path: str) -> Prefix:
+    return lambda instance: plant_prefix(path, instance)

@@ -1,0 +1,250 @@
+"""The variables of a MultibodyPlant: its joints, bodies, frames, actuators and contact friction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import inf
+
+import numpy as np
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    FrameIndex,
+    Joint,
+    JointActuator,
+    ModelInstanceIndex,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import Context
+
+from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
+from vtbdrake.state.variable import A, Variable, VariableError, X
+
+# Name of a model instance -> the dotted prefix of the addresses of its variables.
+Prefix = Callable[[str], str]
+
+_JOINT_UNITS = {"revolute": ("rad", "rad/s", "N m s/rad"), "prismatic": ("m", "m/s", "N s/m")}
+_MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
+_POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+
+
+def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Variable]:
+    """Every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of the floating bases only."""
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if joint.num_velocities() > 0:
+            yield from _joint_variables(plant, joint, element_address(plant, joint, prefix))
+    for body in bodies(plant):
+        address = element_address(plant, body, prefix)
+        yield from _body_variables(plant, body, address)
+        if body.is_floating_base_body():
+            yield _floating_pose(plant, body, address)
+            for entry in _POSE_ENTRIES:
+                yield _pose_entry(plant, body, address, entry)
+    for index in range(plant.num_frames()):
+        frame = plant.get_frame(FrameIndex(index))
+        if isinstance(frame, FixedOffsetFrame) and frame.name() and not frame.is_ephemeral():
+            yield _frame_pose(plant, frame, element_address(plant, frame, prefix))
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        yield _rotor_inertia(plant, actuator, element_address(plant, actuator, prefix))
+
+
+def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str, Callable[[], Variable]]:
+    """The derived pose entries of every body that is not a floating base, made when they are asked for."""
+
+    def demand(body: RigidBody, address: str, entry: str) -> Callable[[], Variable]:
+        return lambda: _pose_entry(plant, body, address, entry)
+
+    return {
+        f"{address}.{entry}": demand(body, address, entry)
+        for body in bodies(plant)
+        if not body.is_floating_base_body()
+        for address in [element_address(plant, body, prefix)]
+        for entry in _POSE_ENTRIES
+    }
+
+
+def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
+    """All bodies but the world, by model instance."""
+    for instance in range(1, plant.num_model_instances()):
+        for index in plant.GetBodyIndices(ModelInstanceIndex(instance)):
+            yield plant.get_body(index)
+
+
+def element_address(
+    plant: MultibodyPlant, element: RigidBody | Joint | FixedOffsetFrame | JointActuator, prefix: Prefix
+) -> str:
+    """``prefix.instance.element``; an element that bears its model instance's name is called by it alone."""
+    instance = plant.GetModelInstanceName(element.model_instance())
+    parts = [prefix(instance), instance.replace("::", ".")]
+    if element.name() != instance.split("::")[-1]:
+        parts.append(element.name())
+    return ".".join(part for part in parts if part)
+
+
+def _joint_variables(plant: MultibodyPlant, joint: Joint, address: str) -> Iterator[Variable]:
+    nq, nv = joint.num_positions(), joint.num_velocities()
+    q = slice(joint.position_start(), joint.position_start() + nq)
+    v = slice(joint.velocity_start(), joint.velocity_start() + nv)
+    units = _JOINT_UNITS.get(joint.type_name(), _MIXED_UNITS)
+
+    def read_position(root: Context) -> np.ndarray:
+        return plant.GetPositions(plant.GetMyContextFromRoot(root))[q]
+
+    def write_position(root: Context, value: np.ndarray) -> None:
+        context = plant.GetMyMutableContextFromRoot(root)
+        positions = plant.GetPositions(context)
+        positions[q] = value.ravel()
+        plant.SetPositions(context, positions)
+
+    def read_velocity(root: Context) -> np.ndarray:
+        return plant.GetVelocities(plant.GetMyContextFromRoot(root))[v]
+
+    def write_velocity(root: Context, value: np.ndarray) -> None:
+        context = plant.GetMyMutableContextFromRoot(root)
+        velocities = plant.GetVelocities(context)
+        velocities[v] = value.ravel()
+        plant.SetVelocities(context, velocities)
+
+    def read_damping(root: Context) -> np.ndarray:
+        return np.asarray(joint.GetDampingVector(plant.GetMyContextFromRoot(root)))
+
+    def write_damping(root: Context, value: np.ndarray) -> None:
+        joint.SetDampingVector(plant.GetMyMutableContextFromRoot(root), np.atleast_1d(value))
+
+    position_bounds = (-inf, inf)
+    if nq == 1:
+        position_bounds = (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
+    yield Variable(f"{address}.position", X, _shape(nq), units[0], _scalar(read_position, nq), write_position,
+                   bounds=position_bounds)  # fmt: skip
+    yield Variable(f"{address}.velocity", X, _shape(nv), units[1], _scalar(read_velocity, nv), write_velocity)
+    yield Variable(f"{address}.damping", A, _shape(nv), units[2], _scalar(read_damping, nv), write_damping,
+                   bounds=(0.0, inf))  # fmt: skip
+    if plant.time_step() > 0.0:  # Every supported Drake version locks the joints of discrete plants.
+        yield _joint_lock(plant, joint, address)
+
+
+def _shape(n: int) -> tuple[int, ...]:
+    return () if n == 1 else (n,)
+
+
+def _scalar(read: Callable[[Context], np.ndarray], n: int) -> Callable[[Context], np.ndarray]:
+    return (lambda root: read(root)[0]) if n == 1 else read
+
+
+def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
+    name = f"{address}.locked"
+
+    def read(root: Context) -> float:
+        return float(joint.is_locked(plant.GetMyContextFromRoot(root)))
+
+    def write(root: Context, value: np.ndarray) -> None:
+        if float(value) not in (0.0, 1.0):
+            raise VariableError(f"{name} is 0 (free) or 1 (locked), but the value given is {float(value):g}")
+        context = plant.GetMyMutableContextFromRoot(root)
+        if value:
+            joint.Lock(context)  # This sets the joint's velocity to zero, as Drake requires.
+        else:
+            joint.Unlock(context)
+
+    return Variable(name, A, (), "1", read, write, bounds=(0.0, 1.0), hidden=True)
+
+
+def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Iterator[Variable]:
+    def inertia_in_body(root: Context) -> SpatialInertia:
+        return body.CalcSpatialInertiaInBodyFrame(plant.GetMyContextFromRoot(root))
+
+    def set_inertia(root: Context, M_BBo_B: SpatialInertia) -> None:
+        body.SetSpatialInertiaInBodyFrame(plant.GetMyMutableContextFromRoot(root), M_BBo_B)
+
+    def read_mass(root: Context) -> float:
+        return float(body.get_mass(plant.GetMyContextFromRoot(root)))
+
+    def write_mass(root: Context, value: np.ndarray) -> None:
+        body.SetMass(plant.GetMyMutableContextFromRoot(root), float(value))
+
+    def read_com(root: Context) -> np.ndarray:
+        return inertia_in_body(root).get_com()
+
+    def write_com(root: Context, value: np.ndarray) -> None:
+        # SpatialInertia keeps the inertia about the body's origin: shift it, or it would not stay physical.
+        M_BBo_B = inertia_in_body(root)
+        G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(M_BBo_B.get_com())
+        set_inertia(root, SpatialInertia(M_BBo_B.get_mass(), value, G_BBcm_B.ShiftFromCenterOfMass(value)))
+
+    def read_inertia(root: Context) -> np.ndarray:
+        M_BBo_B = inertia_in_body(root)
+        I_BBcm_B = M_BBo_B.Shift(M_BBo_B.get_com()).CalcRotationalInertia()
+        return np.concatenate([I_BBcm_B.get_moments(), I_BBcm_B.get_products()])
+
+    def write_inertia(root: Context, value: np.ndarray) -> None:
+        M_BBo_B = inertia_in_body(root)
+        mass, com = M_BBo_B.get_mass(), M_BBo_B.get_com()
+        if mass <= 0.0:
+            raise VariableError(f"{address}.inertia cannot be set while {address}.mass is zero: set the mass first")
+        try:
+            G_BBcm_B = UnitInertia(*(value / mass))
+            M_new = SpatialInertia(mass, com, G_BBcm_B.ShiftFromCenterOfMass(com))
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0]
+            raise VariableError(
+                f"{address}.inertia {value.tolist()} is not that of any rigid body: its principal moments must be "
+                f"positive and none larger than the sum of the others ({reason})"
+            ) from None
+        set_inertia(root, M_new)
+
+    yield Variable(f"{address}.mass", A, (), "kg", read_mass, write_mass, bounds=(0.0, inf))
+    yield Variable(f"{address}.center_of_mass", A, (3,), "m", read_com, write_com)
+    yield Variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia)
+
+
+def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:
+    def read(root: Context) -> np.ndarray:
+        return pose_to_array(plant.GetFreeBodyPose(plant.GetMyContextFromRoot(root), body))
+
+    def write(root: Context, value: np.ndarray) -> None:
+        plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(root), body, pose_from_array(value))
+
+    return Variable(f"{address}.pose", X, (6,), POSE_UNIT, read, write)
+
+
+def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str) -> Variable:
+    def translation(axis: int) -> Callable[[Context], float]:
+        return lambda root: body.EvalPoseInWorld(plant.GetMyContextFromRoot(root)).translation()[axis]
+
+    def angle(axis: int) -> Callable[[Context], float]:
+        def read(root: Context) -> float:
+            X_WB = body.EvalPoseInWorld(plant.GetMyContextFromRoot(root))
+            return RollPitchYaw(X_WB.rotation()).vector()[axis]
+
+        return read
+
+    names = list(_POSE_ENTRIES)
+    axis = names.index(entry) % 3
+    read = translation(axis) if _POSE_ENTRIES[entry] == "m" else angle(axis)
+    return Variable(f"{address}.{entry}", X, (), _POSE_ENTRIES[entry], read)
+
+
+def _frame_pose(plant: MultibodyPlant, frame: FixedOffsetFrame, address: str) -> Variable:
+    def read(root: Context) -> np.ndarray:
+        return pose_to_array(frame.GetPoseInParentFrame(plant.GetMyContextFromRoot(root)))
+
+    def write(root: Context, value: np.ndarray) -> None:
+        frame.SetPoseInParentFrame(plant.GetMyMutableContextFromRoot(root), pose_from_array(value))
+
+    return Variable(f"{address}.pose", A, (6,), POSE_UNIT, read, write)
+
+
+def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Variable:
+    def read(root: Context) -> float:
+        return float(actuator.rotor_inertia(plant.GetMyContextFromRoot(root)))
+
+    def write(root: Context, value: np.ndarray) -> None:
+        actuator.SetRotorInertia(plant.GetMyMutableContextFromRoot(root), float(value))
+
+    unit = "kg m^2" if actuator.joint().type_name() != "prismatic" else "kg"
+    return Variable(f"{address}.rotor_inertia", A, (), unit, read, write, bounds=(0.0, inf))

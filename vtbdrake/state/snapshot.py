@@ -1,0 +1,204 @@
+"""s(t) as named arrays: taken from a Context, saved, loaded, compared, applied to another Context."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, System
+
+from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
+from vtbdrake.state.systems import group_size, is_python, leaves, read_group, write_group
+from vtbdrake.state.variables import Variables
+
+FORMAT = "vtbdrake snapshot"
+VERSION = 1
+_HEADER = "header.json"
+
+
+class SnapshotError(ValueError):
+    """A snapshot that cannot be taken, read, or applied."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The state s(t) = [x, a] of a whole Diagram at one time.
+
+    Attributes:
+        time: t in seconds.
+        scenario: plain data that identifies what the snapshot belongs to; empty for a bare Diagram.
+        values: the addressed variables (derived ones left out), by address.
+        groups: every numeric group of every leaf system and, through its codec, every abstract state of our own
+            systems, under ``path/group/index`` and ``path/abstract/index/name``.
+
+    Arrays are read only. What Drake hides from Python (the last step's contact results of a discrete plant, the
+    generator of a RandomSource) is not part of it.
+    """
+
+    time: float
+    values: Mapping[str, np.ndarray]
+    groups: Mapping[str, np.ndarray]
+    scenario: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("values", "groups"):
+            arrays = {key: np.array(value) for key, value in getattr(self, name).items()}
+            for array in arrays.values():
+                array.flags.writeable = False
+            object.__setattr__(self, name, MappingProxyType(arrays))
+
+    def __getitem__(self, address: str) -> np.ndarray:
+        """The value of an addressed variable."""
+        return self.values[address]
+
+    def compare(self, other: Snapshot) -> dict[str, float]:
+        """Where two snapshots differ: the largest absolute difference by address or group.
+
+        ``inf`` stands where only one of them has the entry, or it has another shape; equal entries (NaN equals
+        NaN) are left out, so that ``not a.compare(b)`` says that they are identical.
+        """
+        differences = {} if self.time == other.time else {"time": abs(self.time - other.time)}
+        for mine, theirs in ((self.values, other.values), (self.groups, other.groups)):
+            for key in [*mine, *(key for key in theirs if key not in mine)]:
+                if key not in mine or key not in theirs or mine[key].shape != theirs[key].shape:
+                    differences[key] = np.inf
+                elif not np.array_equal(mine[key], theirs[key], equal_nan=mine[key].dtype.kind == "f"):
+                    differences[key] = _largest_difference(mine[key], theirs[key])
+        return differences
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes one file (a zip of .npy arrays and a JSON header), whole or not at all."""
+        header = {"format": FORMAT, "version": VERSION, "time": self.time, "scenario": dict(self.scenario)}
+        arrays = {f"values/{key}": value for key, value in self.values.items()}
+        arrays |= {f"groups/{key}": value for key, value in self.groups.items()}
+        target = Path(path)
+        partial = target.with_name(target.name + ".partial")
+        with zipfile.ZipFile(partial, "w") as archive:
+            archive.writestr(_HEADER, json.dumps(header))
+            for key, value in arrays.items():
+                with archive.open(f"{key}.npy", "w") as entry:
+                    np.lib.format.write_array(entry, value, allow_pickle=False)
+        partial.replace(target)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Snapshot:
+        """Reads what `save` wrote.
+
+        Raises:
+            SnapshotError: the file is not a snapshot, is damaged, or was written by a newer version.
+        """
+        try:
+            with zipfile.ZipFile(path) as archive:
+                header = json.loads(archive.read(_HEADER))
+                arrays: dict[str, dict[str, np.ndarray]] = {"values": {}, "groups": {}}
+                for name in archive.namelist():
+                    if name != _HEADER:
+                        part, key = name.removesuffix(".npy").split("/", 1)
+                        with archive.open(name) as entry:
+                            arrays[part][key] = np.lib.format.read_array(entry, allow_pickle=False)
+        except FileNotFoundError:
+            raise
+        except (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError) as error:
+            raise SnapshotError(f"{path} is not a snapshot, or it is damaged: {error}") from error
+        if header.get("format") != FORMAT or header.get("version") != VERSION:
+            raise SnapshotError(
+                f"{path} is a {header.get('format')!r} of version {header.get('version')!r}; "
+                f"this is what reads a {FORMAT!r} of version {VERSION}"
+            )
+        return cls(header["time"], arrays["values"], arrays["groups"], header["scenario"])
+
+
+def _largest_difference(a: np.ndarray, b: np.ndarray) -> float:
+    difference = np.abs(a.astype(float) - b.astype(float))
+    return float(np.where(np.isnan(difference), np.inf, difference).max())
+
+
+def take(
+    diagram: Diagram, context: Context, variables: Variables, *, scenario: Mapping[str, Any] | None = None
+) -> Snapshot:
+    """The snapshot of ``context``.
+
+    Raises:
+        SnapshotError: a system of ours has abstract state without a codec.
+    """
+    groups: dict[str, np.ndarray] = {}
+    for path, system in leaves(diagram):
+        leaf_context = system.GetMyContextFromRoot(context)
+        for group, index in numeric_groups(leaf_context):
+            groups[f"{path}/{group}/{index}"] = read_group(leaf_context, group, index)
+        for index, codec in _codecs(path, system, leaf_context).items():
+            state = leaf_context.get_abstract_state(index).get_value()
+            for name, array in codec.encode(state).items():
+                groups[f"{path}/abstract/{index}/{name}"] = np.asarray(array)
+    values = {v.address: np.asarray(v.get(context)) for v in variables.values() if not v.derived}
+    return Snapshot(context.get_time(), values, groups, scenario or {})
+
+
+def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Variables) -> None:
+    """Sets time, state and parameters of ``context`` from ``snapshot``.
+
+    Raises:
+        SnapshotError: the Diagram is built in another way than the one that the snapshot was taken from; the
+            context is unchanged.
+    """
+    expected = set()
+    for path, system in leaves(diagram):
+        leaf_context = system.GetMyContextFromRoot(context)
+        for group, index in numeric_groups(leaf_context):
+            key = f"{path}/{group}/{index}"
+            expected.add(key)
+            size = group_size(leaf_context, group, index)
+            if key not in snapshot.groups or snapshot.groups[key].size != size:
+                found = f"{snapshot.groups[key].size} entries" if key in snapshot.groups else "no such group"
+                raise SnapshotError(f"{key} has {size} entries in this testbed, but the snapshot has {found}")
+        expected |= {f"{path}/abstract/{index}" for index in _codecs(path, system, leaf_context)}
+    for key in snapshot.groups:
+        if (key.rsplit("/", 1)[0] if "/abstract/" in key else key) not in expected:
+            raise SnapshotError(f"the snapshot has a group {key}, which this testbed does not have")
+    hidden = [v for v in variables.values() if v.hidden and not v.derived]
+    for variable in hidden:
+        if variable.address not in snapshot.values:
+            raise SnapshotError(f"the snapshot has no value of {variable.address}, which this testbed has")
+    context.SetTime(snapshot.time)
+    for path, system in leaves(diagram):
+        leaf_context = system.GetMyMutableContextFromRoot(context)
+        for group, index in numeric_groups(leaf_context):
+            write_group(leaf_context, group, index, snapshot.groups[f"{path}/{group}/{index}"])
+        for index, codec in _codecs(path, system, leaf_context).items():
+            prefix = f"{path}/abstract/{index}/"
+            arrays = {k.removeprefix(prefix): v for k, v in snapshot.groups.items() if k.startswith(prefix)}
+            leaf_context.SetAbstractState(index, codec.decode(arrays))
+    for variable in hidden:
+        # Writing makes SceneGraph and cameras compute anew: only what differs.
+        if not np.array_equal(variable.get(context), snapshot.values[variable.address]):
+            variable.set(context, snapshot.values[variable.address])
+
+
+def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
+    """(group, index) of all numeric groups of a leaf context."""
+    if leaf_context.num_continuous_states():
+        yield CONTINUOUS, 0
+    for index in range(leaf_context.num_discrete_state_groups()):
+        yield DISCRETE, index
+    for index in range(leaf_context.num_numeric_parameter_groups()):
+        yield PARAMETER, index
+
+
+def _codecs(path: str, system: System, leaf_context: Context) -> dict[int, Codec]:
+    if not is_python(system):
+        return {}
+    codecs: dict[int, Codec] = dict(getattr(system, "codecs", {}))
+    for index in range(leaf_context.num_abstract_states()):
+        if index not in codecs:
+            raise SnapshotError(
+                f"{path} keeps abstract state {index} and declares no codec for it: give the system an attribute "
+                f"codecs = {{{index}: Codec(encode, decode)}}"
+            )
+    return codecs

@@ -1,0 +1,131 @@
+"""The variables of LeafSystems: declared ones by name, others by their numeric groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.sensors import RgbdSensor
+
+from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Element
+from vtbdrake.state.variable import A, Variable, X
+
+POSE_UNIT = "m, rad"
+
+
+def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
+    """All leaf systems below ``diagram`` with their dotted paths, in the Diagram's order."""
+    for system in diagram.GetSystems():
+        below = f"{path}.{system.get_name()}" if path else system.get_name()
+        if isinstance(system, Diagram):
+            yield from leaves(system, path=below)
+        else:
+            yield below, system
+
+
+def pose_to_array(X_PF: RigidTransform) -> np.ndarray:
+    """``[x, y, z, roll, pitch, yaw]``, in metres and radians, as in SDFormat's ``<pose>``."""
+    return np.concatenate([X_PF.translation(), RollPitchYaw(X_PF.rotation()).vector()])
+
+
+def pose_from_array(value: np.ndarray) -> RigidTransform:
+    """The inverse of `pose_to_array`."""
+    return RigidTransform(RollPitchYaw(value[3:]), value[:3])
+
+
+def leaf_variables(path: str, system: System) -> Iterator[Variable]:
+    """The variables of a leaf system that is neither a plant nor a SceneGraph."""
+    if isinstance(system, RgbdSensor):
+        yield _camera_pose(path, system)
+    for element in _elements(system):
+        address = f"{path}.{element.name}" if element.name else path
+        yield _numeric(address, system, element)
+
+
+def _elements(system: System) -> Iterator[Element]:
+    declared = getattr(system, "variables", None)
+    if declared is not None:
+        yield from declared
+        return
+    context = system.CreateDefaultContext()
+    n = context.num_continuous_states()
+    if n:
+        yield Element("continuous_state", CONTINUOUS, 0, (n,))
+    for i in range(context.num_discrete_state_groups()):
+        yield Element(f"discrete_state_{i}", DISCRETE, i, (context.get_discrete_state(i).size(),))
+    for i in range(context.num_numeric_parameter_groups()):
+        size = context.get_numeric_parameter(i).size()
+        # The value of a constant source is what it puts out.
+        name = "value" if isinstance(system, ConstantVectorSource) else f"parameter_{i}"
+        yield Element(name, PARAMETER, i, (size,))
+
+
+def group_size(context: Context, group: str, index: int) -> int:
+    """Entries of a numeric group of a leaf context; 0 if it has no such group."""
+    if group == CONTINUOUS:
+        return int(context.num_continuous_states())
+    if group == DISCRETE:
+        return int(context.get_discrete_state(index).size()) if index < context.num_discrete_state_groups() else 0
+    return int(context.get_numeric_parameter(index).size()) if index < context.num_numeric_parameter_groups() else 0
+
+
+def read_group(context: Context, group: str, index: int) -> np.ndarray:
+    """A copy of a numeric group of a leaf context."""
+    if group == CONTINUOUS:
+        return np.array(context.get_continuous_state_vector().CopyToVector())
+    if group == DISCRETE:
+        return np.array(context.get_discrete_state(index).value())
+    return np.array(context.get_numeric_parameter(index).value())
+
+
+def write_group(context: Context, group: str, index: int, value: np.ndarray) -> None:
+    """Writes a whole numeric group of a leaf context."""
+    if group == CONTINUOUS:
+        context.SetContinuousState(value)
+    elif group == DISCRETE:
+        context.SetDiscreteState(index, value)
+    else:
+        context.get_mutable_numeric_parameter(index).SetFromVector(value)
+
+
+def _numeric(address: str, system: System, element: Element) -> Variable:
+    size = int(np.prod(element.shape, dtype=int))
+    available = group_size(system.CreateDefaultContext(), element.group, element.index)
+    if element.start + size > available:
+        raise ValueError(
+            f"{address} is declared as entries {element.start} to {element.start + size - 1} of {element.group} "
+            f"group {element.index} of {system.get_name()}, which has {available} entries"
+        )
+    entries = slice(element.start, element.start + size)
+    whole = size == available
+
+    def read(root: Context) -> np.ndarray:
+        value = read_group(system.GetMyContextFromRoot(root), element.group, element.index)
+        return value[entries].reshape(element.shape)
+
+    def write(root: Context, value: np.ndarray) -> None:
+        context = system.GetMyMutableContextFromRoot(root)
+        group = np.empty(size) if whole else read_group(context, element.group, element.index)
+        group[entries] = value.ravel()
+        write_group(context, element.group, element.index, group)
+
+    kind = A if element.group == PARAMETER else X
+    return Variable(address, kind, element.shape, element.unit, read, write, bounds=element.bounds)
+
+
+def _camera_pose(path: str, camera: RgbdSensor) -> Variable:
+    def read(root: Context) -> np.ndarray:
+        return pose_to_array(camera.GetX_PB(camera.GetMyContextFromRoot(root)))
+
+    def write(root: Context, value: np.ndarray) -> None:
+        camera.SetX_PB(camera.GetMyMutableContextFromRoot(root), pose_from_array(value))
+
+    return Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, hidden=True)
+
+
+def is_python(system: System) -> bool:
+    """True for a system that is written in Python: it holds the interpreter lock while it computes."""
+    return not type(system).__module__.startswith("pydrake")
