@@ -19,7 +19,7 @@ def collect(
     diagram: Diagram,
     *,
     plant_prefix: Callable[[str, str], str] | None = None,
-    skip: Iterable[str] = (),
+    skip: Callable[[str], bool] = lambda path: False,
     extra: Iterable[Variable] = (),
 ) -> Variables:
     """The variables of every system of ``diagram``.
@@ -27,12 +27,11 @@ def collect(
     Args:
         plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to
             that instance. By default the path of the plant.
-        skip: paths of leaf systems whose variables are not listed.
+        skip: says of the path of a leaf system whether its variables are left out.
         extra: further variables of the diagram.
     """
     plant_prefix = plant_prefix or (lambda path, instance: path)
-    skipped = set(skip)
-    systems = [(path, system) for path, system in leaves(diagram) if path not in skipped]
+    systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
     scene_graph = next((system for _, system in systems if isinstance(system, SceneGraph)), None)
     listed: list[Variable] = list(extra)
     by_demand: dict[str, Callable[[], Variable]] = {}

@@ -17,6 +17,8 @@ from pydrake.multibody.tree import (
     RigidBody,
     SpatialInertia,
     UnitInertia,
+    default_model_instance,
+    world_model_instance,
 )
 from pydrake.systems.framework import Context
 
@@ -78,10 +80,14 @@ def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 def element_address(
     plant: MultibodyPlant, element: RigidBody | Joint | FixedOffsetFrame | JointActuator, prefix: Prefix
 ) -> str:
-    """``prefix.instance.element``; an element that bears its model instance's name is called by it alone."""
+    """``prefix.instance.element``, without an instance that Drake itself has named.
+
+    An element that bears its model instance's name is called by it alone.
+    """
     instance = plant.GetModelInstanceName(element.model_instance())
-    parts = [prefix(instance), instance.replace("::", ".")]
-    if element.name() != instance.split("::")[-1]:
+    named = element.model_instance() not in (world_model_instance(), default_model_instance())
+    parts = [prefix(instance), instance.replace("::", ".") if named else ""]
+    if not named or element.name() != instance.split("::")[-1]:
         parts.append(element.name())
     return ".".join(part for part in parts if part)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -36,11 +36,16 @@ def pose_from_array(value: np.ndarray) -> RigidTransform:
     return RigidTransform(RollPitchYaw(value[3:]), value[:3])
 
 
-def leaf_variables(path: str, system: System) -> Iterator[Variable]:
-    """The variables of a leaf system that is neither a plant nor a SceneGraph."""
+def leaf_variables(
+    path: str, system: System, *, declared: Iterable[Element] | None = None
+) -> Iterator[Variable]:
+    """The variables of a leaf system that is neither a plant nor a SceneGraph.
+
+    ``declared`` names its elements where the system itself, one of Drake's, cannot.
+    """
     if isinstance(system, RgbdSensor):
         yield _camera_pose(path, system)
-    for element in _elements(system):
+    for element in _elements(system) if declared is None else declared:
         address = f"{path}.{element.name}" if element.name else path
         yield _numeric(address, system, element)
 

@@ -1,0 +1,149 @@
+"""Small testbeds for the tests, on Drake's own example models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
+from pydrake.systems.primitives import Adder, Demultiplexer, Gain, MatrixGain, ZeroOrderHold
+
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+
+PENDULUM = "package://drake/examples/pendulum/Pendulum.urdf"
+ACROBOT = "package://drake/examples/acrobot/Acrobot.urdf"
+
+
+@dataclass
+class PendulumScenario(Scenario):
+    """Drake's pendulum, held at an angle by a PD law: C++ systems only, and no sampling.
+
+    With gains of zero it swings freely.
+    """
+
+    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-8, max_step_size=0.05))
+    stiffness: float = 0.0
+    damping: float = 0.0
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[Signal("joint_state", size=2, unit="rad, rad/s")],
+            act=[Signal("torque", size=1, unit="N m", idle=0.0)],
+            commands=[Signal("angle", size=1, unit="rad", lower=-np.pi, upper=np.pi)],
+        )
+
+    def make_dps(self) -> Diagram:
+        builder = DiagramBuilder()
+        split = builder.AddNamedSystem("sense", Demultiplexer(2, 1))
+        error = builder.AddNamedSystem("error", Adder(2, 1))
+        spring = builder.AddNamedSystem("spring", Gain(self.stiffness, 1))
+        damper = builder.AddNamedSystem("damper", Gain(-self.damping, 1))
+        minus = builder.AddNamedSystem("minus", Gain(-1.0, 1))
+        torque = builder.AddNamedSystem("act", Adder(2, 1))
+        builder.Connect(split.get_output_port(0), minus.get_input_port())
+        builder.Connect(minus.get_output_port(), error.get_input_port(0))
+        builder.Connect(error.get_output_port(), spring.get_input_port())
+        builder.Connect(split.get_output_port(1), damper.get_input_port())
+        builder.Connect(spring.get_output_port(), torque.get_input_port(0))
+        builder.Connect(damper.get_output_port(), torque.get_input_port(1))
+        builder.ExportInput(split.get_input_port(), "joint_state")
+        builder.ExportInput(error.get_input_port(1), "angle")
+        builder.ExportOutput(torque.get_output_port(), "torque")
+        return builder.Build()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(PlantFields())
+        Parser(plant).AddModelsFromUrl(PENDULUM)
+        plant.Finalize()
+        builder.sim_sensor("joint_state", plant.get_state_output_port())
+        builder.sim_actuator("torque", plant.get_actuation_input_port())
+
+
+class SampledFeedback(LeafSystem):
+    """Discrete state feedback with a counter, in Python.
+
+    .. pydrake_system::
+
+        name: SampledFeedback
+        input_ports:
+        - joint_state
+        output_ports:
+        - torque
+    """
+
+    def __init__(self, period: float) -> None:
+        super().__init__()
+        gain = self.DeclareNumericParameter(BasicVector([0.0, 0.0, -3.0, -1.0]))
+        torque = self.DeclareDiscreteState(1)
+        ticks = self.DeclareDiscreteState(1)
+        self._state = self.DeclareVectorInputPort("joint_state", 4)
+        self.DeclareVectorOutputPort(
+            "torque",
+            1,
+            lambda context, output: output.SetFromVector(context.get_discrete_state(0).value()),
+            prerequisites_of_calc={self.discrete_state_ticket(torque)},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.variables = (
+            parameter("gain", gain, shape=(4,), unit="N m/rad, N m s/rad", bounds=(-1e3, 1e3)),
+            discrete_state("torque", torque, unit="N m"),
+            discrete_state("ticks", ticks),
+        )
+
+    def _update(self, context: Context, discrete: object) -> None:
+        gain = context.get_numeric_parameter(0).value()
+        discrete.set_value(0, [gain @ self._state.Eval(context)])  # type: ignore[attr-defined]
+        discrete.set_value(1, context.get_discrete_state(1).value() + 1.0)  # type: ignore[attr-defined]
+
+
+@dataclass
+class AcrobotScenario(Scenario):
+    """Drake's acrobot with a sampled Python DPS; one joint sensor, held and thereby delayed by a period."""
+
+    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-6, max_step_size=0.05))
+    period: float = 0.02
+    time_step: float = 0.0
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[Signal("joint_state", size=4, unit="rad, rad/s", max_age=0.1)],
+            act=[Signal("torque", size=1, unit="N m", lower=-10.0, upper=10.0, idle=0.0)],
+        )
+
+    def make_dps(self) -> System:
+        return SampledFeedback(self.period)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(PlantFields(time_step=self.time_step))
+        Parser(plant).AddModelsFromUrl(ACROBOT)
+        plant.Finalize()
+        sensor = builder.add("sense", "joints", ZeroOrderHold(self.period, 4))
+        builder.builder.Connect(plant.get_state_output_port(), sensor.get_input_port())
+        builder.sim_sensor("joint_state", sensor.get_output_port())
+        builder.sim_actuator("torque", plant.get_actuation_input_port())
+
+
+class PoseRelay(LeafSystem):
+    """A DPS whose sensor signal and actuator signal are abstract: it commands the pose that it sees, mirrored.
+
+    .. pydrake_system::
+
+        name: PoseRelay
+        input_ports:
+        - seen
+        output_ports:
+        - commanded
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        seen = self.DeclareAbstractInputPort("seen", Value(RigidTransform()))
+
+        def calc(context: Context, output: Value) -> None:  # type: ignore[valid-type]
+            output.set_value(seen.Eval(context).inverse())  # type: ignore[attr-defined]
+
+        self.DeclareAbstractOutputPort("commanded", lambda: Value(RigidTransform()), calc)

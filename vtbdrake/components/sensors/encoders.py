@@ -1,0 +1,51 @@
+"""Joint encoders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint
+from pydrake.systems.framework import Context, DiscreteValues
+
+from vtbdrake.components.sensors.sampled import SampledSensor
+
+
+class JointEncoders(SampledSensor):
+    """Measures the positions of joints that have one degree of freedom.
+
+    .. pydrake_system::
+
+        name: JointEncoders
+        input_ports:
+        - state
+        output_ports:
+        - joint_encoders
+
+    ``state`` is the plant's [q; v]; ``joint_encoders`` holds one position (rad or m) per joint, in the order of ``joints``.
+    Before the first sample it shows the plant's default positions.
+    """
+
+    def __init__(self, plant: MultibodyPlant, joints: Sequence[Joint], *, period: float, stream: int = 1) -> None:
+        for joint in joints:
+            if joint.num_positions() != 1:
+                raise ValueError(
+                    f"Joint '{joint.name()}' has {joint.num_positions()} positions; "
+                    "JointEncoders measures joints with exactly one."
+                )
+        self._indices = np.array([joint.position_start() for joint in joints], dtype=int)
+        super().__init__(
+            "joint_encoders",
+            default=plant.GetDefaultPositions()[self._indices],
+            period=period,
+            unit="rad",
+            noise={"noise": (len(joints), "rad")},
+            stream=stream,
+        )
+        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        x: NDArray[np.float64] = self._state_port.Eval(context)
+        return x[self._indices]

@@ -1,0 +1,80 @@
+"""What all sensors share: they are sampled, and their output is their own state."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
+
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.components.sensors.noise import normal_noise
+
+
+class SampledSensor(LeafSystem):
+    """A sensor that measures at t = 0, T, 2 T, ... and holds its measurement y in between.
+
+    ``y = measurement + std * n(seed, stream, tick)`` with n independent and of N(0, 1). Until the first sample, y is
+    ``default``. A reader that is sampled at the same instants sees y one period late.
+
+    The input ports have the names of the plant's output ports that they belong to, see `connect_to_plant`.
+    """
+
+    def __init__(
+        self,
+        signal: str,
+        *,
+        default: ArrayLike,
+        period: float,
+        unit: str,
+        noise: Mapping[str, tuple[int, str]],
+        stream: int,
+    ) -> None:
+        """``noise`` names the standard deviations (all 0 by default): for how many entries of y, and their unit."""
+        super().__init__()
+        if not period > 0:
+            raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
+        self._period = float(period)
+        self._stream = int(stream)
+        y0 = np.asarray(default, dtype=float)
+        self._output = int(self.DeclareDiscreteState(y0))
+        self.DeclareStateOutputPort(signal, self._output)
+        self._parameter = int(self.DeclareNumericParameter(BasicVector(np.zeros(1 + len(noise)))))
+        self._counts = np.array([count for count, _ in noise.values()], dtype=int)
+        self.variables = (
+            discrete_state(signal, self._output, shape=y0.shape, unit=unit),
+            parameter("seed", self._parameter, start=0, bounds=(0.0, 2.0**53)),
+            *(
+                parameter(name, self._parameter, start=1 + k, unit=noise_unit, bounds=(0.0, np.inf))
+                for k, (name, (_, noise_unit)) in enumerate(noise.items())
+            ),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
+
+    @property
+    def period(self) -> float:
+        """The time between two samples (s)."""
+        return self._period
+
+    @abstractmethod
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        """The measurement without noise. ``state`` takes what has to be remembered until the next one."""
+
+    def _sample(self, context: Context, state: DiscreteValues) -> None:
+        y = self._measure(context, state)
+        seed, *stds = context.get_numeric_parameter(self._parameter).value().tolist()
+        if any(stds):
+            tick = round(context.get_time() / self._period)
+            noise = normal_noise(y.size, seed=int(seed), stream=self._stream, tick=tick)
+            y = y + np.repeat(stds, self._counts) * noise
+        state.set_value(self._output, y)
+
+
+def connect_to_plant(builder: DiagramBuilder, sensor: SampledSensor, plant: MultibodyPlant) -> None:
+    """Connects every input port of ``sensor`` to the plant's output port of the same name."""
+    for k in range(sensor.num_input_ports()):
+        port = sensor.get_input_port(k)
+        builder.Connect(plant.GetOutputPort(port.get_name()), port)

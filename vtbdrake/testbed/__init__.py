@@ -1,0 +1,22 @@
+"""Figure 4: signals, switches, the virtual testbed as a Diagram, scenarios that build one."""
+
+from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.config import PlantFields, SimulatorFields
+from vtbdrake.testbed.scenario import Scenario, ScenarioError, load_scenario
+from vtbdrake.testbed.signal import Interface, Signal, SignalError
+from vtbdrake.testbed.switch import Command
+from vtbdrake.testbed.testbed import VirtualTestbed
+
+__all__ = [
+    "Command",
+    "Interface",
+    "PlantFields",
+    "Scenario",
+    "ScenarioError",
+    "Signal",
+    "SignalError",
+    "SimulatorFields",
+    "VirtualTestbed",
+    "VirtualTestbedBuilder",
+    "load_scenario",
+]

@@ -1,0 +1,237 @@
+"""Builds a virtual testbed: the simulated world around a DPS, behind switches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+from numpy.typing import ArrayLike
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort, System
+from pydrake.systems.primitives import ConstantVectorSource
+
+from vtbdrake.state import Variable
+from vtbdrake.state.element import PARAMETER, Element
+from vtbdrake.state.systems import leaf_variables
+from vtbdrake.testbed.belief import Belief
+from vtbdrake.testbed.config import PlantFields, SimulatorFields
+from vtbdrake.testbed.signal import Interface, Signal, SignalError
+from vtbdrake.testbed.switch import ActSwitch, SenseSwitch, add_active_port
+from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
+
+if TYPE_CHECKING:
+    from vtbdrake.testbed.scenario import Scenario
+
+ROLES = ("sense", "sys", "act", "env")
+S = TypeVar("S", bound=System)
+
+
+class VirtualTestbedBuilder:
+    """Adds the parts of Figure 4 one by one; `build` puts the switches between them.
+
+    ``builder`` is the DiagramBuilder of the testbed: add and connect the inner parts of the simulated world there,
+    or with `add`, which names a system by its role.
+    """
+
+    def __init__(self, interface: Interface, *, simulator: SimulatorFields | None = None) -> None:
+        self.interface = interface
+        self.simulator = simulator or SimulatorFields()
+        self.builder = DiagramBuilder()
+        self.plant: MultibodyPlant | None = None
+        self.scene_graph: SceneGraph | None = None
+        self._dps: System | None = None
+        self._sensors: dict[str, OutputPort] = {}
+        self._actuators: dict[str, InputPort] = {}
+        self._commands: dict[str, OutputPort] = {}
+        self._places: dict[str, str] = {}
+        self._beliefs: list[Belief] = []
+        self._extra: list[Variable] = []
+
+    def add(self, role: str, name: str, system: S) -> S:
+        """Adds a part of the simulated world as ``sim.<role>.<name>``; role is sense, sys, act or env."""
+        if role not in ROLES:
+            raise ValueError(f"the role of {name} is one of {', '.join(ROLES)}, not {role!r}")
+        return self.builder.AddNamedSystem(f"sim.{role}.{name}", system)
+
+    def add_plant(self, fields: PlantFields | None = None) -> tuple[MultibodyPlant, SceneGraph]:
+        """Adds the MultibodyPlant, a direct child named ``plant`` as CENIC wants it, and its SceneGraph."""
+        self.plant, self.scene_graph = AddMultibodyPlant((fields or PlantFields()).config(), self.builder)
+        self.plant.set_name("plant")
+        self.scene_graph.set_name("scene_graph")
+        return self.plant, self.scene_graph
+
+    def place(self, instance: str, *, role: str) -> None:
+        """Says that a model instance of the plant belongs to ``sys`` or ``env``.
+
+        Without it, what is fixed to the world and has no joints belongs to the environment.
+        """
+        if role not in ("sys", "env"):
+            raise ValueError(f"model instance {instance} belongs to sys or env, not to {role!r}")
+        self._places[instance] = role
+
+    def sim_sensor(self, name: str, port: OutputPort) -> None:
+        """The simulated sensor signal ``name`` comes from ``port``."""
+        self._claim(self.interface.sense, name, "sensor", self._sensors).check_port(port, _owner(port))
+        self._sensors[name] = port
+
+    def sim_actuator(self, name: str, port: InputPort) -> None:
+        """The simulated actuator signal ``name`` goes to ``port``."""
+        self._claim(self.interface.act, name, "actuator", self._actuators).check_port(port, _owner(port))
+        self._actuators[name] = port
+
+    def command(self, name: str, port: OutputPort) -> None:
+        """The command ``name`` comes from ``port``, instead of a constant that is the variable ``u.<name>``."""
+        self._claim(self.interface.commands, name, "command", self._commands).check_port(port, _owner(port))
+        self._commands[name] = port
+
+    @staticmethod
+    def _claim(signals: Sequence[Signal], name: str, kind: str, taken: Mapping[str, object]) -> Signal:
+        known = {signal.name: signal for signal in signals}
+        if name not in known:
+            raise SignalError(f"the interface has no {kind} signal {name!r}; it has: {', '.join(known) or 'none'}")
+        if name in taken:
+            raise SignalError(f"two ports are given for the {kind} signal {name}")
+        return known[name]
+
+    def set_dps(self, dps: S) -> S:
+        """Adds the data processing system: one System whose ports bear the names of the interface's signals."""
+        if self._dps is not None:
+            raise SignalError("the testbed has a DPS already; put several parts into one Diagram")
+        self._check_ports(dps)
+        self._dps = self.builder.AddNamedSystem("dps", dps)
+        return dps
+
+    def _check_ports(self, dps: System) -> None:
+        inputs = {dps.get_input_port(i).get_name(): dps.get_input_port(i) for i in range(dps.num_input_ports())}
+        outputs = {dps.get_output_port(i).get_name(): dps.get_output_port(i) for i in range(dps.num_output_ports())}
+        for signal in [*self.interface.sense, *self.interface.commands]:
+            if signal.name not in inputs:
+                raise SignalError(f"the DPS has no input port {signal.name}; it has: {', '.join(inputs) or 'none'}")
+            signal.check_port(inputs.pop(signal.name), "the DPS")
+        for signal in self.interface.act:
+            if signal.name not in outputs:
+                raise SignalError(f"the DPS has no output port {signal.name}; it has: {', '.join(outputs) or 'none'}")
+            signal.check_port(outputs[signal.name], "the DPS")
+        if inputs:
+            raise SignalError(f"the interface has no signal for the DPS's input port {', '.join(inputs)}")
+
+    def believe(self, target: str, *, of: Sequence[str], by: Callable[..., ArrayLike] | None = None) -> None:
+        """Declares which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
+
+        Args:
+            target: address of the simulated variable.
+            of: addresses of the estimates.
+            by: makes the target's value of theirs; left out, the one estimate is the value.
+        """
+        self._beliefs.append(Belief(target, tuple(of), by))
+
+    def add_variable(self, variable: Variable) -> None:
+        """Lists a further variable, derived from others, say."""
+        self._extra.append(variable)
+
+    def build(
+        self, *, mode: str = "sim", scenario: Scenario | None = None, meshcat: Meshcat | None = None, prefix: str = ""
+    ) -> VirtualTestbed:
+        """Puts the switches between the parts and builds the Diagram.
+
+        Args:
+            mode: where the switches stand at first: sim, shadow, real or twin.
+            meshcat: draws the simulated world while it runs, under ``prefix``.
+
+        Raises:
+            SignalError: a signal of the interface is missing on one side.
+        """
+        check_mode(mode)
+        if self._dps is None:
+            raise SignalError("the testbed has no DPS: call set_dps")
+        for signal in self.interface.sense:
+            if signal.name not in self._sensors:
+                raise SignalError(f"no simulated sensor offers {signal.name}: call sim_sensor({signal.name!r}, port)")
+        for signal in self.interface.act:
+            if signal.name not in self._actuators:
+                raise SignalError(
+                    f"no simulated actuator takes {signal.name}: call sim_actuator({signal.name!r}, port)"
+                )
+        self._finish_plant()
+        sense_position, act_position = MODES[mode]
+        sense = {s.name: self._switch_sense(s, sense_position) for s in self.interface.sense}
+        act = {s.name: self._switch_act(s, act_position) for s in self.interface.act}
+        if act:
+            self.builder.ExportOutput(add_active_port(self.builder, list(act.values())), "real.act.active")
+        commands = [v for s in self.interface.commands for v in self._connect_command(s)]
+        if meshcat is not None:
+            if self.scene_graph is None:
+                raise ValueError("there is nothing to draw: the testbed has no plant with a SceneGraph")
+            parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
+            MeshcatVisualizer.AddToBuilder(self.builder, self.scene_graph, meshcat, parameters)
+        diagram = self.builder.Build()
+        diagram.set_name("vtb")
+        return VirtualTestbed(
+            diagram=diagram,
+            interface=self.interface,
+            dps=self._dps,
+            plant=self.plant,
+            scene_graph=self.scene_graph,
+            sense={name: switch.selector for name, switch in sense.items()},
+            act={name: switch.selector for name, switch in act.items()},
+            simulator=self.simulator,
+            scenario=scenario,
+            beliefs=tuple(self._beliefs),
+            extra_variables=(*commands, *self._extra),
+            plant_roles=self._plant_roles(),
+            visualized=meshcat is not None,
+        )
+
+    def _finish_plant(self) -> None:
+        if self.plant is not None and not self.plant.is_finalized():
+            self.plant.Finalize()
+
+    def _switch_sense(self, signal: Signal, position: str) -> SenseSwitch:
+        assert self._dps is not None
+        switch = SenseSwitch(self.builder, signal, position)
+        self.builder.Connect(self._sensors[signal.name], switch.sim_port)
+        self.builder.ExportInput(switch.real_port, f"real.sense.{signal.name}")
+        self.builder.Connect(switch.output_port, self._dps.GetInputPort(signal.name))
+        return switch
+
+    def _switch_act(self, signal: Signal, position: str) -> ActSwitch:
+        assert self._dps is not None
+        switch = ActSwitch(self.builder, signal, position, self._dps.GetOutputPort(signal.name))
+        self.builder.Connect(switch.sim_port, self._actuators[signal.name])
+        self.builder.ExportOutput(switch.real_port, f"real.act.{signal.name}")
+        return switch
+
+    def _connect_command(self, signal: Signal) -> list[Variable]:
+        assert self._dps is not None
+        if signal.name in self._commands:
+            self.builder.Connect(self._commands[signal.name], self._dps.GetInputPort(signal.name))
+            return []
+        default = signal.vector(0.0 if signal.default is None else signal.default)
+        source = self.builder.AddNamedSystem(f"u.{signal.name}", ConstantVectorSource(default))
+        self.builder.Connect(source.get_output_port(), self._dps.GetInputPort(signal.name))
+        shape = () if signal.size == 1 else (default.size,)
+        bounds = (float(signal.vector(signal.lower).min()), float(signal.vector(signal.upper).max()))
+        element = Element("", PARAMETER, 0, shape, unit=signal.unit, bounds=bounds)
+        return list(leaf_variables(source.get_name(), source, declared=[element]))
+
+    def _plant_roles(self) -> dict[str, str]:
+        if self.plant is None:
+            return {}
+        roles = {}
+        for index in range(self.plant.num_model_instances()):
+            instance = ModelInstanceIndex(index)
+            bodies = self.plant.GetBodyIndices(instance)
+            fixed = all(self.plant.IsAnchored(self.plant.get_body(body)) for body in bodies)
+            joints = self.plant.num_velocities(instance)
+            roles[self.plant.GetModelInstanceName(instance)] = "env" if fixed and not joints else "sys"
+        for name, role in self._places.items():
+            if name not in roles:
+                raise ValueError(f"the plant has no model instance {name}; it has: {', '.join(roles)}")
+            roles[name] = role
+        return roles
+
+
+def _owner(port: InputPort | OutputPort) -> str:
+    return str(port.get_system().get_name())

@@ -1,0 +1,184 @@
+"""Scenarios: plain data that builds a testbed, in this process or in another, from Python or from YAML."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import GetIntegrationSchemes
+from pydrake.systems.framework import System
+
+from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.config import SimulatorFields
+from vtbdrake.testbed.signal import Interface
+from vtbdrake.testbed.testbed import VirtualTestbed
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be found, read or built."""
+
+
+@dataclass
+class Scenario(ABC):
+    """A dataclass of plain types, with a default for every field, that builds a testbed.
+
+    A subclass adds its fields and says what the interface of the DPS is, what the DPS is, and what the simulated
+    world is. What sits in the Context (masses, gains, poses) is a variable of the testbed; what needs another Diagram
+    (geometry, gravity, a time step) is a field.
+    """
+
+    simulator: SimulatorFields = field(default_factory=SimulatorFields)
+
+    @abstractmethod
+    def interface(self) -> Interface:
+        """The DPS's signals."""
+
+    @abstractmethod
+    def make_dps(self) -> System:
+        """The data processing system; the same for the testbed, its mental copies and the robot."""
+
+    @abstractmethod
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        """Adds the simulated sensors, system, actuators and environment."""
+
+    def validate(self) -> None:
+        """Looks at the values as they are when the testbed is built.
+
+        Raises:
+            ScenarioError: a number is not finite, or the integration scheme is unknown. Subclasses add their own.
+        """
+        for name, value in _flat(asdict(self)):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ScenarioError(f"{type(self).__name__}.{name} must be finite, not {value}")
+        known = GetIntegrationSchemes()
+        if self.simulator.integration_scheme not in known:
+            raise ScenarioError(
+                f"{type(self).__name__}.simulator.integration_scheme is one of {', '.join(known)}, not "
+                f"{self.simulator.integration_scheme!r}"
+            )
+        if self.simulator.max_step_size <= 0 or self.simulator.accuracy <= 0:
+            raise ScenarioError(
+                f"{type(self).__name__}.simulator takes a positive max_step_size and accuracy, not "
+                f"{self.simulator.max_step_size} s and {self.simulator.accuracy}"
+            )
+
+    def build(self, *, mode: str = "sim", meshcat: Meshcat | None = None, prefix: str = "") -> VirtualTestbed:
+        """A new testbed.
+
+        Args:
+            mode: where the switches stand at first: sim, shadow, real or twin.
+            meshcat: draws the simulated world while it runs, under ``prefix``.
+
+        Raises:
+            ScenarioError: a field has a value that no testbed can be built with.
+            SignalError: the signals of DPS and world do not fit.
+        """
+        self.validate()
+        builder = VirtualTestbedBuilder(self.interface(), simulator=self.simulator)
+        builder.set_dps(self.make_dps())
+        self.add_world(builder)
+        return builder.build(mode=mode, scenario=self, meshcat=meshcat, prefix=prefix)
+
+    def name(self) -> str:
+        """``package.module:Class``."""
+        return f"{type(self).__module__}:{type(self).__qualname__}"
+
+    def record(self) -> dict[str, Any]:
+        """What identifies it, as plain data: its name and all fields, nested ones by dotted names."""
+        return {"scenario": self.name(), **dict(_flat(asdict(self)))}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a YAML file that `load_scenario` reads."""
+        Path(path).write_text(yaml_dump_typed(self, child_name=self.name()))
+
+
+S = TypeVar("S", bound=Scenario)
+
+
+def load_scenario(source: str | os.PathLike[str]) -> Scenario:
+    """The scenario that ``source`` names: ``package.module:Class``, or a YAML file that looks like ::
+
+        diagrams.space_climber:SpaceClimberScenario:
+          gravity: 3.71
+
+    Raises:
+        ScenarioError: the class or file does not exist, a key of the file is unknown or occurs twice, or a value has
+            the wrong type or is refused by the scenario.
+    """
+    text = os.fspath(source)
+    is_file = text.endswith((".yaml", ".yml"))
+    scenario = _load_yaml(Path(text)) if is_file else _scenario_class(text)()
+    scenario.validate()
+    return scenario
+
+
+def _scenario_class(name: str) -> type[Scenario]:
+    module_name, _, class_name = name.partition(":")
+    if not module_name or not class_name:
+        raise ScenarioError(f"a scenario is named package.module:Class, or by a .yaml file, not {name!r}")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ScenarioError(
+            f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
+        ) from error
+    found = getattr(module, class_name, None)
+    if not (isinstance(found, type) and issubclass(found, Scenario)):
+        known = [
+            k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and v is not Scenario
+        ]
+        raise ScenarioError(f"{module_name} has no scenario {class_name!r}; it has: {', '.join(known) or 'none'}")
+    return found
+
+
+def _load_yaml(path: Path) -> Scenario:
+    try:
+        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+    except FileNotFoundError as error:
+        raise ScenarioError(f"there is no scenario file {path}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path} is not YAML: {error}") from error
+    if not isinstance(document, yaml.MappingNode) or len(document.value) != 1:
+        raise ScenarioError(f"{path} must have one key, package.module:Class, with the scenario's fields below it")
+    _refuse_twins(document, path)
+    name = document.value[0][0].value
+    try:
+        return yaml_load_typed(schema=_scenario_class(name), filename=path, child_name=name)
+    except (RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, ScenarioError):
+            raise
+        raise ScenarioError(f"{path} does not fit {name}: {error}") from error
+
+
+def _refuse_twins(node: yaml.Node, path: Path) -> None:
+    # Of two equal keys, YAML readers silently keep the last.
+    if isinstance(node, yaml.MappingNode):
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise ScenarioError(f"{path} has the key {key!r} twice, near line {node.start_mark.line + 1}")
+        for _, value in node.value:
+            _refuse_twins(value, path)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            _refuse_twins(value, path)
+
+
+def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flat(item, f"{name}.{key}".lstrip("."))
+    elif isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            yield from _flat(item, f"{name}[{i}]")
+    else:
+        yield name, value
