@@ -67,7 +67,7 @@ class Imu(SampledSensor):
             discrete_state("last_velocity", self._memory, shape=(3,), start=1, unit="m/s"),
             discrete_state("last_orientation", self._memory, shape=(4,), start=4),
         )
-        self._floating = body.is_floating() and body.has_quaternion_dofs()
+        self._floating = body.is_floating_base_body() and body.has_quaternion_dofs()
         if self._floating:
             # [q; v] holds (wxyz, p_WB) and (w_WB, v_WB). Much cheaper than the poses of all bodies.
             start = body.floating_positions_start()

@@ -40,7 +40,7 @@ class SampledSensor(LeafSystem):
         self._period = float(period)
         self._stream = int(stream)
         y0 = np.asarray(default, dtype=float)
-        self._output = int(self.DeclareDiscreteState(y0))
+        self._output = self.DeclareDiscreteState(y0)
         self.DeclareStateOutputPort(signal, self._output)
         self._parameter = int(self.DeclareNumericParameter(BasicVector(np.zeros(1 + len(noise)))))
         self._counts = np.array([count for count, _ in noise.values()], dtype=int)
