@@ -1,0 +1,54 @@
+# `make demo` or `make test` on a fresh machine does all the set-up; a later run starts at once.
+PYTHON ?= python3
+VENV   ?= .venv
+
+RUN   := $(VENV)/bin/python
+STAMP := $(VENV)/.vtbdrake-installed
+
+# The stamp holds the checkout it belongs to. A moved checkout, an interpreter that is gone, or another PYTHON asked for
+# (not the default of this file) than the one it was made with: set up again.
+ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
+STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check answers bench clean stale
+
+help:
+	@echo "make demo                          the space climber, from the question to the answer"
+	@echo "make test [ARGS='-k name']         the tests"
+	@echo "make check                         ruff and mypy"
+	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
+	@echo "make bench [ONLY=name]             every benchmark; writes benchmarks/results.json"
+	@echo "make setup                         only the environment that the others need"
+	@echo "make clean                         remove environments, caches and results"
+	@echo
+	@echo "PYTHON=$(PYTHON) (3.11 or newer) and VENV=$(VENV) can be set on the command line."
+
+setup: $(STAMP)
+
+demo: $(STAMP)
+	$(RUN) -m diagrams.space_climber.demo
+
+test: $(STAMP)
+	$(RUN) -m pytest $(ARGS)
+
+check: $(STAMP)
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
+
+answers: $(STAMP)
+	$(RUN) -m diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)
+
+bench: $(STAMP)
+	$(RUN) -m benchmarks $(ONLY)
+
+$(STAMP): pyproject.toml $(wildcard constraints/*.txt) tools/setup.sh $(if $(STALE),stale)
+	@tools/setup.sh "$(VENV)" "$(PYTHON)"
+
+stale:
+
+clean:
+	rm -rf .venv .venv-* build dist out answers.json benchmarks/results.json
+	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
