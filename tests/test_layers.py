@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vtbdrake"
 
-# What each layer may import besides itself: state <- testbed <- rollout <- optimization <- reasoning; testbed <- control.
+# What each layer may import besides itself:
+# state <- testbed <- rollout <- optimization <- reasoning; testbed <- control.
 BELOW: dict[str, set[str]] = {
     "state": set(),
     "testbed": {"state"},
