@@ -24,24 +24,23 @@ class PerceivedEnvironment(LeafSystem):
 
         name: PerceivedEnvironment
         input_ports:
-        - imu
-        - joint_encoders
-        - foot_contact
+        - measurements
         output_ports:
-        - attitude
-        - position
+        - pose
 
-    ``attitude`` is (roll, pitch, yaw): R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. The angles integrate
-    the gyro's w; roll and pitch are drawn to the direction of the specific force f with the time constant tau:
+    ``measurements`` is [imu (6), joint_encoders (18), foot_contact (6)], ``pose`` is [roll, pitch, yaw, x, y, height],
+    the state of the last sample.
+
+    Attitude: R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. The angles integrate the gyro's w; roll and pitch
+    are drawn to the direction of the specific force f with the time constant tau:
 
         roll_f = atan2(f_y, f_z),   pitch_f = atan2(-f_x, |(f_y, f_z)|)
 
     Yaw starts where its state starts (0: the robot's own x axis) and drifts with the gyro. The first f that is
     not zero sets roll and pitch.
 
-    ``position`` is (x, y, height). Feet that are on the ground at two successive samples stand still, so the body moves
-    against their mean displacement; the height is that of the torso's centre over the feet's mean. Both outputs are
-    states of the last sample.
+    Position: feet that are on the ground at two successive samples stand still, so the body moves against their mean
+    displacement. The height is that of the torso's centre over the ground under the feet, on average.
     """
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
@@ -49,46 +48,41 @@ class PerceivedEnvironment(LeafSystem):
         self._period = period
         self._foot_radius = morphology.foot_radius
         self._legs = LegKinematics(morphology)
-        self._imu = self.DeclareVectorInputPort("imu", 6)
-        self._encoders = self.DeclareVectorInputPort("joint_encoders", 3 * len(LEGS))
-        self._contact = self.DeclareVectorInputPort("foot_contact", len(LEGS))
-        self._attitude = self.DeclareDiscreteState(np.zeros(3))
-        self._position = self.DeclareDiscreteState(np.array([0.0, 0.0, morphology.torso_clearance]))
-        # [attitude is set, foot on the ground (6), p_BF_W horizontally (6, 2)]
-        self._memory = self.DeclareDiscreteState(1 + 3 * len(LEGS))
-        self.DeclareStateOutputPort("attitude", self._attitude)
-        self.DeclareStateOutputPort("position", self._position)
-        self._time_constant = int(self.DeclareNumericParameter(BasicVector([2.0])))
+        legs = len(LEGS)
+        self._measurements = self.DeclareVectorInputPort("measurements", 6 + 4 * legs)
+        pose = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, morphology.torso_clearance]))
+        self.DeclareStateOutputPort("pose", pose)
+        self.DeclareDiscreteState(1 + 3 * legs)
+        self.DeclareNumericParameter(BasicVector([2.0]))
         self.variables = (
             *(
-                discrete_state(name, self._attitude, start=k, unit="rad", bounds=(-pi, pi))
+                discrete_state(name, 0, start=k, unit="rad", bounds=(-pi, pi))
                 for k, name in enumerate(("roll", "pitch", "yaw"))
             ),
-            discrete_state("position", self._position, shape=(3,), unit="m"),
-            discrete_state("attitude_known", self._memory, bounds=(0.0, 1.0)),
-            discrete_state("standing", self._memory, start=1, shape=(len(LEGS),), bounds=(0.0, 1.0)),
-            discrete_state("feet", self._memory, start=1 + len(LEGS), shape=(len(LEGS), 2), unit="m"),
-            parameter("time_constant", self._time_constant, unit="s", bounds=(0.0, 1e3)),
+            discrete_state("position", 0, start=3, shape=(3,), unit="m"),
+            discrete_state("attitude_known", 1, start=0, bounds=(0.0, 1.0)),
+            discrete_state("standing", 1, start=1, shape=(legs,), bounds=(0.0, 1.0)),
+            discrete_state("feet", 1, start=1 + legs, shape=(legs, 2), unit="m"),
+            parameter("time_constant", 0, unit="s", bounds=(0.0, 1e3)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        known, *memory = context.get_discrete_state(self._memory).value().tolist()
-        attitude = context.get_discrete_state(self._attitude).value().tolist()
-        imu = self._imu.Eval(context).tolist()
-        tau = context.get_numeric_parameter(self._time_constant)[0]
+        measurements = self._measurements.Eval(context).tolist()
+        imu, encoders, standing = measurements[:6], measurements[6:24], measurements[24:]
+        *attitude, x, y, height = context.get_discrete_state(0).value().tolist()
+        known, *memory = context.get_discrete_state(1).value().tolist()
         if any(imu[3:]):
+            tau = context.get_numeric_parameter(0)[0]
             trust = 1.0 - exp(-self._period / tau) if known and tau > 0.0 else 1.0
             attitude = complementary_filter(attitude, imu, period=self._period, trust=trust)
             known = 1.0
-        state.set_value(self._attitude, attitude)
 
-        feet = self._feet_in_world(attitude, self._encoders.Eval(context).tolist())
-        standing = self._contact.Eval(context).tolist()
-        x, y, height = context.get_discrete_state(self._position).value().tolist()
         dx = dy = drop = 0.0
         still = down = 0
-        for k, (foot_x, foot_y, foot_z) in enumerate(feet):
+        remembered = [known, *standing]
+        for k, (foot_x, foot_y, foot_z) in enumerate(self._feet_in_world(attitude, encoders)):
+            remembered += (foot_x, foot_y)
             if standing[k]:
                 down += 1
                 drop += foot_z
@@ -100,8 +94,8 @@ class PerceivedEnvironment(LeafSystem):
             x, y = x + dx / still, y + dy / still
         if down:
             height = self._foot_radius - drop / down
-        state.set_value(self._position, (x, y, height))
-        state.set_value(self._memory, (known, *standing, *(c for foot in feet for c in foot[:2])))
+        state.set_value(0, np.array((*attitude, x, y, height)))
+        state.set_value(1, np.array(remembered))
 
     def _feet_in_world(self, attitude: list[float], q: list[float]) -> list[tuple[float, float, float]]:
         """p_BF_W of the six feet."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from vtbdrake.state import parameter
 
 
 class ContactSensor(SampledSensor):
-    """Tells which bodies touch something: 1 where the sum of the normal contact forces exceeds a threshold, else 0.
+    """Tells which bodies touch something: 1 where its contact forces exceed a threshold, else 0.
 
     .. pydrake_system::
 
@@ -26,7 +27,8 @@ class ContactSensor(SampledSensor):
         output_ports:
         - foot_contact
 
-    ``foot_contact`` has one entry per body, in the order of ``bodies``. Point contact and hydroelastic contact both count.
+    ``foot_contact`` has one entry per body, in the order of ``bodies``; what counts is the sum of the magnitudes of the forces
+    of all its contacts. Point contact and hydroelastic contact both count.
     With a continuous plant the contact results follow from its state alone; with a discrete one they are those of its
     last step, and empty between a restore and the next step.
     """
@@ -39,7 +41,11 @@ class ContactSensor(SampledSensor):
             "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", noise={}, stream=stream
         )
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        self._slots = {body.index(): k for k, body in enumerate(bodies)}
+        # Where in the list of forces a body or geometry adds to; the last place is for all that are not asked for.
+        self._size = len(bodies) + 1
+        self._slots = [-1] * plant.num_bodies()
+        for k, body in enumerate(bodies):
+            self._slots[int(body.index())] = k
         self._geometry_slots = {
             geometry: k for k, body in enumerate(bodies) for geometry in plant.GetCollisionGeometriesForBody(body)
         }
@@ -48,20 +54,18 @@ class ContactSensor(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         results = self._results_port.Eval(context)
-        force = [0.0] * len(self._slots)
-        slots = self._slots
+        force = [0.0] * self._size
         for k in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(k)
-            normal = abs(float(info.contact_force() @ info.point_pair().nhat_BA_W))
-            for body in (info.bodyA_index(), info.bodyB_index()):
-                if body in slots:
-                    force[slots[body]] += normal
+            fx, fy, fz = info.contact_force().tolist()
+            magnitude = sqrt(fx * fx + fy * fy + fz * fz)
+            for slot in (self._slots[int(info.bodyA_index())], self._slots[int(info.bodyB_index())]):
+                force[slot] += magnitude
         for k in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(k)
             magnitude = float(np.linalg.norm(info.F_Ac_W().translational()))
             surface = info.contact_surface()
             for geometry in (surface.id_M(), surface.id_N()):
-                if geometry in self._geometry_slots:
-                    force[self._geometry_slots[geometry]] += magnitude
+                force[self._geometry_slots.get(geometry, -1)] += magnitude
         threshold = context.get_numeric_parameter(self._threshold)[0]
-        return np.array([1.0 if f > threshold else 0.0 for f in force])
+        return np.array([1.0 if f > threshold else 0.0 for f in force[:-1]])

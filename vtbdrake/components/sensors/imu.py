@@ -84,7 +84,7 @@ class Imu(SampledSensor):
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         q_WF, v_WF = self._motion(context)
         sampled, *memory = context.get_discrete_state(self._memory).value().tolist()
-        state.set_value(self._memory, (1.0, *v_WF, *q_WF))
+        state.set_value(self._memory, np.array((1.0, *v_WF, *q_WF)))
         gx, gy, gz = self._g_W
         if not sampled:
             return np.array((0.0, 0.0, 0.0, *_rotate_back(q_WF, (-gx, -gy, -gz))))
