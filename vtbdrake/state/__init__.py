@@ -1,5 +1,6 @@
 """s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
 
+from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.collect import collect
 from vtbdrake.state.element import Codec, Element, continuous_state, discrete_state, parameter
 from vtbdrake.state.snapshot import Snapshot, SnapshotError
@@ -8,6 +9,7 @@ from vtbdrake.state.variables import AddressError, Variables
 
 __all__ = [
     "AddressError",
+    "ArchiveError",
     "Codec",
     "Element",
     "Snapshot",

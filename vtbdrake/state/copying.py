@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context, Diagram, System
@@ -42,14 +44,19 @@ class StateCopier:
             if v.hidden and not v.derived and v.address in source_variables
         ]
 
-    def copy(self, source: Context, target: Context) -> None:
-        """Makes ``target`` continue as ``source`` would."""
+    def copy(self, source: Context, target: Context, *, hidden: Collection[str] | None = None) -> None:
+        """Makes ``target`` continue as ``source`` would.
+
+        ``hidden`` names the hidden variables that can differ; left out, all are compared.
+        """
         target.SetTime(source.get_time())
         for from_system, to_system in self._pairs:
             to_system.GetMyMutableContextFromRoot(target).SetStateAndParametersFrom(
                 from_system.GetMyContextFromRoot(source)
             )
         for from_variable, to_variable in self._hidden:
+            if hidden is not None and to_variable.address not in hidden:
+                continue
             value = np.asarray(from_variable.get(source))
             if not np.array_equal(to_variable.get(target), value):
                 to_variable.set(target, value)

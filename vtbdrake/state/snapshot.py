@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
+from vtbdrake.state.archive import read_archive, write_archive
 from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
 from vtbdrake.state.systems import group_size, is_python, leaves, read_group, write_group
 from vtbdrake.state.variables import Variables
 
-FORMAT = "vtbdrake snapshot"
+KIND = "vtbdrake snapshot"
 VERSION = 1
-_HEADER = "header.json"
 
 
 class SnapshotError(ValueError):
-    """A snapshot that cannot be taken, read, or applied."""
+    """A snapshot that cannot be taken or applied."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,9 @@ class Snapshot:
                 array.flags.writeable = False
             object.__setattr__(self, name, MappingProxyType(arrays))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Snapshot, (self.time, dict(self.values), dict(self.groups), dict(self.scenario))
+
     def __getitem__(self, address: str) -> np.ndarray:
         """The value of an addressed variable."""
         return self.values[address]
@@ -75,44 +75,24 @@ class Snapshot:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file (a zip of .npy arrays and a JSON header), whole or not at all."""
-        header = {"format": FORMAT, "version": VERSION, "time": self.time, "scenario": dict(self.scenario)}
         arrays = {f"values/{key}": value for key, value in self.values.items()}
         arrays |= {f"groups/{key}": value for key, value in self.groups.items()}
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with zipfile.ZipFile(partial, "w") as archive:
-            archive.writestr(_HEADER, json.dumps(header))
-            for key, value in arrays.items():
-                with archive.open(f"{key}.npy", "w") as entry:
-                    np.lib.format.write_array(entry, value, allow_pickle=False)
-        partial.replace(target)
+        header = {"time": self.time, "scenario": dict(self.scenario)}
+        write_archive(path, kind=KIND, version=VERSION, header=header, arrays=arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Snapshot:
         """Reads what `save` wrote.
 
         Raises:
-            SnapshotError: the file is not a snapshot, is damaged, or was written by a newer version.
+            ArchiveError: the file is not a snapshot, is damaged, or was written by another version.
         """
-        try:
-            with zipfile.ZipFile(path) as archive:
-                header = json.loads(archive.read(_HEADER))
-                arrays: dict[str, dict[str, np.ndarray]] = {"values": {}, "groups": {}}
-                for name in archive.namelist():
-                    if name != _HEADER:
-                        part, key = name.removesuffix(".npy").split("/", 1)
-                        with archive.open(name) as entry:
-                            arrays[part][key] = np.lib.format.read_array(entry, allow_pickle=False)
-        except FileNotFoundError:
-            raise
-        except (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError) as error:
-            raise SnapshotError(f"{path} is not a snapshot, or it is damaged: {error}") from error
-        if header.get("format") != FORMAT or header.get("version") != VERSION:
-            raise SnapshotError(
-                f"{path} is a {header.get('format')!r} of version {header.get('version')!r}; "
-                f"this is what reads a {FORMAT!r} of version {VERSION}"
-            )
-        return cls(header["time"], arrays["values"], arrays["groups"], header["scenario"])
+        header, arrays = read_archive(path, kind=KIND, version=VERSION)
+        parts: dict[str, dict[str, np.ndarray]] = {"values": {}, "groups": {}}
+        for name, array in arrays.items():
+            part, key = name.split("/", 1)
+            parts[part][key] = array
+        return cls(header["time"], parts["values"], parts["groups"], header["scenario"])
 
 
 def _largest_difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +21,12 @@ class AddressError(KeyError, ValueError):
         return str(self.args[0])
 
 
+# One entry of an array, in C order: ``address[3]``.
+_ENTRY = re.compile(r"(.+)\[(\d+)\]")
+
+
 class Variables(Mapping[str, Variable]):
-    """The variables of one Diagram, in the order of its systems.
+    """The variables of one Diagram, in the order of its systems; ``address[3]`` is one entry of an array.
 
     ``derived_by_demand`` gives, for an address that is not listed, a derived quantity that exists all the same
     (the height of any body, say), or None.
@@ -47,10 +53,16 @@ class Variables(Mapping[str, Variable]):
             return self._listed[address]
         if address in self._by_demand:
             return self._by_demand[address]()
+        entry = _ENTRY.fullmatch(address)
+        if entry and entry[1] in self:
+            return _entry(self[entry[1]], int(entry[2]))
         raise AddressError(f"there is no variable {address!r}{self.suggestion(address)}")
 
     def __contains__(self, address: object) -> bool:
-        return address in self._listed or address in self._by_demand
+        if address in self._listed or address in self._by_demand:
+            return True
+        entry = _ENTRY.fullmatch(address) if isinstance(address, str) else None
+        return entry is not None and entry[1] in self and int(entry[2]) < int(np.prod(self[entry[1]].shape, dtype=int))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._listed)
@@ -105,3 +117,27 @@ class Variables(Mapping[str, Variable]):
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
         return "\n".join(lines)
+
+
+def _entry(variable: Variable, index: int) -> Variable:
+    """One entry of an array variable as a scalar one."""
+    size = int(np.prod(variable.shape, dtype=int))
+    if not variable.shape or index >= size:
+        what = f"has {size} entries" if variable.shape else "is a scalar"
+        raise AddressError(f"there is no {variable.address}[{index}]: {variable.address} {what}")
+
+    def read(context: Context) -> float:
+        return float(np.ravel(variable.get(context))[index])
+
+    def write(context: Context, value: np.ndarray) -> None:
+        array = np.array(variable.get(context))
+        array.flat[index] = float(value)
+        variable.set(context, array)
+
+    return replace(
+        variable,
+        address=f"{variable.address}[{index}]",
+        shape=(),
+        read=read,
+        write=None if variable.derived else write,
+    )

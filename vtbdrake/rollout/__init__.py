@@ -1,0 +1,23 @@
+"""Gamma: one rollout, and many side by side."""
+
+from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, choose_executor, make_executor
+from vtbdrake.rollout.processes import ProcessExecutor, WorkerError
+from vtbdrake.rollout.quality import Quality, QualityError
+from vtbdrake.rollout.result import RolloutResult
+from vtbdrake.rollout.runner import RolloutRunner
+from vtbdrake.rollout.task import RolloutTask
+
+__all__ = [
+    "Executor",
+    "ProcessExecutor",
+    "Quality",
+    "QualityError",
+    "RolloutResult",
+    "RolloutRunner",
+    "RolloutTask",
+    "SerialExecutor",
+    "ThreadExecutor",
+    "WorkerError",
+    "choose_executor",
+    "make_executor",
+]

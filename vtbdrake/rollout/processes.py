@@ -1,0 +1,181 @@
+"""Worker processes, each with a testbed that it builds once and keeps."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import cloudpickle
+import numpy as np
+
+from vtbdrake.rollout.executor import Executor, Parameters, _checked
+from vtbdrake.rollout.result import FAILED, RolloutResult
+from vtbdrake.rollout.task import RolloutTask
+
+_log = logging.getLogger(__name__)
+
+
+class WorkerError(RuntimeError):
+    """Worker processes cannot do what they are asked for."""
+
+
+class _Worker:
+    """A fresh interpreter at the other end of a socket. It does not import the main module again."""
+
+    def __init__(self) -> None:
+        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.rollout.worker import main; main()"
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", program, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+            )
+            self.connection = Connection(ours.detach())
+        self._ready = False
+        self.task: bytes | None = None
+        self.job: int | None = None
+        self.deadline = float("inf")
+
+    def give(self, task: bytes, index: int, parameters: Parameters, *, time_limit: float) -> None:
+        if not self._ready:
+            self._await_ready()
+        if self.task is not task:
+            self.connection.send_bytes(b"T" + task)
+            self.task = task
+        self.connection.send_bytes(b"R" + pickle.dumps(dict(parameters)))
+        self.job = index
+        self.deadline = time.monotonic() + time_limit
+
+    def _await_ready(self) -> None:
+        try:
+            self.connection.recv_bytes()
+        except (EOFError, OSError) as error:
+            code = self.process.wait()
+            raise WorkerError(
+                f"a worker process does not start (exit code {code}); the reason stands in its output above"
+            ) from error
+        self._ready = True
+
+    def kill(self) -> None:
+        self.connection.close()
+        self.process.kill()
+        self.process.wait()
+
+
+class ProcessExecutor(Executor):
+    """Processes that keep their testbed from rollout to rollout; for testbeds with systems in Python.
+
+    A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
+    more by another worker, and is then a failed result.
+
+    Args:
+        workers: how many; the number of cores if left out.
+        time_limit: in seconds of wall time for one rollout.
+    """
+
+    def __init__(self, workers: int | None = None, *, time_limit: float = float("inf")) -> None:
+        if not time_limit > 0.0:
+            raise ValueError(f"the time limit must be positive, not {time_limit} s")
+        self._count = _checked(workers)
+        self._time_limit = time_limit
+        self._workers: list[_Worker] = []
+
+    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        """See `Executor.run`.
+
+        Raises:
+            WorkerError: the task cannot be sent to another process, or cannot be built there.
+        """
+        blob = _pickled(task)
+        waiting = deque(range(len(points)))
+        losses: dict[int, str] = {}
+        while len(self._workers) < min(self._count, len(points)):
+            self._workers.append(_Worker())
+        try:
+            while waiting or any(worker.job is not None for worker in self._workers):
+                self._hand_out(blob, waiting, points)
+                for worker, reply in self._replies():
+                    index = worker.job
+                    assert index is not None
+                    worker.job = None
+                    if isinstance(reply, RolloutResult):
+                        yield index, reply
+                    elif isinstance(reply, str):
+                        self._replace(worker)
+                        if index in losses:
+                            yield index, _lost(points[index], f"{losses[index]}; then {reply}")
+                        else:
+                            _log.warning("rollout %d is tried again: %s", index, reply)
+                            losses[index] = reply
+                            waiting.append(index)
+                    else:
+                        raise reply
+        finally:
+            # After an error or an interruption, what still works works for nothing.
+            for worker in [worker for worker in self._workers if worker.job is not None]:
+                self._workers.remove(worker)
+                worker.kill()
+
+    def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
+        for worker in list(self._workers):
+            if worker.job is None and waiting:
+                index = waiting.popleft()
+                try:
+                    worker.give(task, index, points[index], time_limit=self._time_limit)
+                except OSError:  # It died while it was idle.
+                    waiting.appendleft(index)
+                    self._replace(worker)
+
+    def _replies(self) -> list[tuple[_Worker, Any]]:
+        """What came in: a result, an exception to raise, or, as a string, how the worker was lost."""
+        busy = {worker.connection: worker for worker in self._workers if worker.job is not None}
+        if not busy:
+            return []
+        first = min(worker.deadline for worker in busy.values())
+        ready = wait(list(busy), None if first == float("inf") else max(0.0, first - time.monotonic()))
+        replies: list[tuple[_Worker, Any]] = []
+        for connection, worker in busy.items():
+            if connection in ready:
+                try:
+                    replies.append((worker, pickle.loads(connection.recv_bytes())))
+                except (EOFError, OSError):
+                    code = worker.process.wait()
+                    replies.append((worker, f"its worker process died (exit code {code})"))
+            elif time.monotonic() >= worker.deadline:
+                replies.append((worker, f"it took longer than its time limit of {self._time_limit:g} s"))
+        return replies
+
+    def _replace(self, worker: _Worker) -> None:
+        worker.kill()
+        self._workers[self._workers.index(worker)] = _Worker()
+
+    def close(self) -> None:
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
+
+
+def _pickled(task: RolloutTask) -> bytes:
+    try:
+        # cloudpickle also takes functions and scenarios that are defined in a notebook or a script.
+        return bytes(cloudpickle.dumps(task))
+    except Exception as error:
+        raise WorkerError(
+            f"the problem cannot be sent to another process ({type(error).__name__}: {error}): use executor='threads' "
+            "or 'serial', or keep what cannot be pickled out of its quality function and scenario"
+        ) from error
+
+
+def _lost(parameters: Parameters, message: str) -> RolloutResult:
+    return RolloutResult(
+        parameters=dict(parameters), end=FAILED, message=message, times=np.array([]), quality=np.array([])
+    )

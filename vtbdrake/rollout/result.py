@@ -1,0 +1,81 @@
+"""What a rollout returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.rollout.quality import exceedances
+from vtbdrake.state import Snapshot
+
+THRESHOLD = "threshold"
+HORIZON = "horizon"
+TERMINATED = "terminated"
+FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class RolloutResult:
+    """The outcome of one rollout.
+
+    Attributes:
+        parameters: what was set in s0, by address.
+        end: why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
+            the testbed asked for the end) or ``failed``.
+        message: the reason of a failure or termination.
+        t_star: t* in seconds from t0, equation (16); NaN if the rollout failed or had no quality.
+        h: f'(s^0, t*), equation (17); NaN as t_star.
+        threshold: f_m.
+        times: sample times from t0, in seconds, shape (n,).
+        quality: the quality trajectory f' at ``times``, equation (13), shape (n,).
+        record: by address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
+        state: s(t*) if it was asked for.
+        wall_time: seconds it took.
+    """
+
+    parameters: Mapping[str, Any]
+    end: str
+    times: np.ndarray
+    quality: np.ndarray
+    t_star: float = nan
+    h: float = nan
+    threshold: float = inf
+    message: str = ""
+    record: Mapping[str, Any] = field(default_factory=dict)
+    state: Snapshot | None = None
+    wall_time: float = nan
+
+    @property
+    def failed(self) -> bool:
+        return self.end == FAILED
+
+    @property
+    def exceedances(self) -> np.ndarray:
+        """G1, equation (14); all of it only if the rollout was asked to run on."""
+        return exceedances(self.times[: self.quality.size], self.quality, threshold=self.threshold)
+
+    def identical(self, other: RolloutResult) -> bool:
+        """True if nothing but the wall time differs, to the last bit."""
+        return (
+            (self.end, self.message) == (other.end, other.message)
+            and self.parameters.keys() == other.parameters.keys()
+            and all(np.array_equal(v, other.parameters[k]) for k, v in self.parameters.items())
+            and _same(self.t_star, other.t_star)
+            and _same(self.h, other.h)
+            and _same(self.times, other.times)
+            and _same(self.quality, other.quality)
+            and self.record.keys() == other.record.keys()
+            and all(_same(value, other.record[key]) for key, value in self.record.items())
+            and (self.state is None) == (other.state is None)
+            and (self.state is None or other.state is None or not self.state.compare(other.state))
+        )
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, list):
+        return bool(a == b)
+    return bool(np.array_equal(a, b, equal_nan=True))

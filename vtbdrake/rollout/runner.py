@@ -1,0 +1,215 @@
+"""Gamma: simulates one testbed again and again, from any s0, always alike."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
+from pydrake.systems.framework import Context
+
+from vtbdrake.rollout.quality import best_sample
+from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
+from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.testbed import VirtualTestbed
+
+
+class SimulationError(Exception):
+    """A simulation that cannot go on; it becomes the outcome of its rollout."""
+
+
+class CancelledError(Exception):
+    """The rollout was told to stop; it has no outcome."""
+
+
+class RolloutRunner:
+    """Runs the rollouts of one task on one testbed, one after another; every thread needs its own.
+
+    Args:
+        task: what the rollouts have in common.
+        testbed: built from the task's scenario; several runners may share one. Left out, it is built.
+
+    Raises:
+        ValueError: the testbed draws, or the task asks for an address that the testbed does not have.
+    """
+
+    def __init__(self, task: RolloutTask, testbed: VirtualTestbed | None = None) -> None:
+        self.task = task
+        self.testbed = testbed if testbed is not None else task.scenario.build()
+        if self.testbed.visualized:
+            raise ValueError("a rollout does not draw: build the scenario without meshcat")
+        self._variables = self.testbed.variables()
+        self._quality_readers = [self.testbed.reader(a) for a in (task.quality.of if task.quality else ())]
+        self._recorders = {address: self.testbed.reader(address) for address in task.record}
+        self._times = task.sample_times()
+        self._s0 = self.testbed.default_context()
+        if task.start is not None:
+            self.testbed.restore(self._s0, task.start)
+        self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
+        self._context = self._simulator.get_mutable_context()
+        self._config = self.testbed.simulator_fields.config()
+        self._copier = self.testbed.copier_from(self.testbed)
+        # Which hidden variables differ from s0: at first, those of a snapshot may.
+        self._changed: set[str] | None = None
+
+    def run(self, parameters: Mapping[str, Any], *, cancel: threading.Event | None = None) -> RolloutResult:
+        """One rollout from s0 with ``parameters`` (address -> value) set in it.
+
+        Raises:
+            QualityError: f raises, is negative or NaN.
+            CancelledError: ``cancel`` was set meanwhile.
+        """
+        begin = time.perf_counter()
+        samples = _Samples(self)
+        end, message = HORIZON, ""
+        try:
+            self._reset(parameters)
+            for t in self._times:
+                if cancel is not None and cancel.is_set():
+                    raise CancelledError
+                status = self._advance(t)
+                if samples.take(t) and not self.task.run_on:
+                    break
+                if status is not None and status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                    end, message = TERMINATED, status.FormatMessage()
+                    break
+        except SimulationError as failure:
+            end, message = FAILED, str(failure)
+        return samples.result(dict(parameters), end, message, begin)
+
+    def state(self, parameters: Mapping[str, Any], t: float) -> Any:
+        """s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
+
+        Raises:
+            ValueError: ``t`` is not a sample time.
+            RuntimeError: the simulation fails before.
+        """
+        last = int(np.argmin(np.abs(self._times - t)))
+        if abs(self._times[last] - t) > 1e-9:
+            raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
+        try:
+            self._reset(parameters)
+            for time_ in self._times[: last + 1]:
+                self._advance(time_)
+        except SimulationError as failure:
+            raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
+        return self.testbed.snapshot(self._context)
+
+    def _reset(self, parameters: Mapping[str, Any]) -> None:
+        # A new integrator: the step memory of a used one would be part of the trajectory. Its config sets the time.
+        ApplySimulatorConfig(self._config, self._simulator)
+        self._copier.copy(self._s0, self._context, hidden=self._changed)
+        self._changed = {a.partition("[")[0] for a in parameters if self._variables[a].hidden}
+        restored = self.task.start is not None
+        with _FailuresAsOutcomes():
+            self._variables.write(self._context, parameters)
+            before = self._variables.read(self._context, list(parameters))
+            # Initialization events make s0 of the defaults; to a restored s0 they have happened before.
+            self._simulator.Initialize(InitializeParams(suppress_initialization_events=restored))
+        for address, value in before.items():
+            after = self._variables[address].get(self._context)
+            if not np.array_equal(after, value):
+                raise ValueError(
+                    f"{address} was set to {value}, but an initialization event of the testbed has made {after} of "
+                    "it: vary what that event reads"
+                )
+
+    def _advance(self, t: float) -> SimulatorStatus | None:
+        if t == 0.0:
+            return None
+        with _FailuresAsOutcomes():
+            status = self._simulator.AdvanceTo(self._s0.get_time() + t)
+        self._refuse_nonfinite(t)
+        return status
+
+    def _refuse_nonfinite(self, t: float) -> None:
+        # A DPS may mark what it does not know by NaN; the simulated world may not.
+        x = self._context.get_continuous_state_vector().CopyToVector()
+        plant = self.testbed.plant
+        if plant is not None and plant.time_step() > 0.0:
+            x = plant.GetPositionsAndVelocities(plant.GetMyContextFromRoot(self._context))
+        if not np.isfinite(x).all():
+            raise SimulationError(f"the state is not finite at t = {t:g} s: the simulation diverged")
+
+    @property
+    def context(self) -> Context:
+        """The context of the last rollout, at its end."""
+        return self._context
+
+
+class _FailuresAsOutcomes:
+    """Turns what comes out of a simulation that goes wrong into SimulationError.
+
+    A failed assertion inside Drake arrives as SystemExit.
+    """
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception | SystemExit):
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise SimulationError(f"{type(error).__name__}: {text}") from error
+
+
+class _Samples:
+    """The samples of the rollout that is running."""
+
+    def __init__(self, runner: RolloutRunner) -> None:
+        self._runner = runner
+        self._times: list[float] = []
+        self._quality: list[float] = []
+        self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
+
+    def take(self, t: float) -> bool:
+        """Reads f' and what is to be recorded; says whether the threshold is exceeded."""
+        runner, task = self._runner, self._runner.task
+        with _FailuresAsOutcomes():
+            values = [read(runner.context) for read in runner._quality_readers]
+            recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
+        if not all(np.isfinite(value).all() for value in values):
+            raise SimulationError(f"a quality variable is not finite at t = {t:g} s")
+        quality = task.quality(values, time=t) if task.quality is not None else None
+        self._times.append(float(t))
+        for address, value in recorded.items():
+            self._record[address].append(value)
+        if quality is None:
+            return False
+        self._quality.append(quality)
+        return quality > task.threshold
+
+    def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
+        task = self._runner.task
+        quality = np.array(self._quality)
+        t_star, h, state = np.nan, np.nan, None
+        above = bool((quality > task.threshold).any())
+        if above:
+            # t* = min G1 stands, whatever happens to a rollout that runs on.
+            end = THRESHOLD
+        if quality.size and end != FAILED:
+            best = best_sample(quality, threshold=task.threshold)
+            t_star, h = self._times[best], float(quality[best])
+            if task.keep_state:
+                at_end = best == len(self._times) - 1
+                runner = self._runner
+                state = runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
+        return RolloutResult(
+            parameters=parameters,
+            end=end,
+            message=message,
+            t_star=t_star,
+            h=h,
+            threshold=task.threshold,
+            times=np.array(self._times),
+            quality=quality,
+            record={address: _stack(values) for address, values in self._record.items()},
+            state=state,
+            wall_time=time.perf_counter() - begin,
+        )
+
+
+def _stack(values: list[Any]) -> Any:
+    return np.array(values) if all(isinstance(value, float | np.ndarray) for value in values) else values

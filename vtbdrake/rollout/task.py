@@ -1,0 +1,58 @@
+"""What all rollouts of one problem have in common, as plain data that travels to any worker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, isfinite, isnan
+
+import numpy as np
+
+from vtbdrake.rollout.quality import Quality
+from vtbdrake.state import Snapshot
+from vtbdrake.testbed import Scenario
+
+
+@dataclass(frozen=True)
+class RolloutTask:
+    """A rollout s(t) = Gamma(s0, t), equation (7), up to what is set in s0.
+
+    Attributes:
+        scenario: builds the testbed.
+        horizon: t_m in seconds from t0.
+        quality: f and its variables; None for a rollout that only records.
+        threshold: f_m: the first sample above it, strictly, ends the rollout.
+        sample_period: in seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
+            error control is part of the trajectory.
+        record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
+        run_on: simulate to t_m although the threshold was exceeded.
+        start: s0 from a snapshot; None takes the scenario's defaults.
+        keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
+    """
+
+    scenario: Scenario
+    horizon: float
+    quality: Quality | None = None
+    threshold: float = inf
+    sample_period: float = 0.05
+    record: tuple[str, ...] = ()
+    run_on: bool = False
+    start: Snapshot | None = None
+    keep_state: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "record", tuple(self.record))
+        if not (isfinite(self.horizon) and self.horizon > 0.0):
+            raise ValueError(f"the horizon t_m must be positive and finite, not {self.horizon} s")
+        if not (isfinite(self.sample_period) and 0.0 < self.sample_period <= self.horizon):
+            raise ValueError(
+                f"the sample period must be positive and at most the horizon of {self.horizon:g} s, not "
+                f"{self.sample_period} s"
+            )
+        if isnan(self.threshold) or self.threshold < 0.0:
+            raise ValueError(f"the threshold f_m must not be negative, as f is not, but it is {self.threshold}")
+
+    def sample_times(self) -> np.ndarray:
+        """From 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
+        times = np.arange(np.floor(self.horizon / self.sample_period * (1.0 + 1e-12)) + 1.0) * self.sample_period
+        rest = self.horizon - times[-1]
+        return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
