@@ -5,19 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import Box, ProximityProperties, RoleAssign, SceneGraph
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from diagrams.space_climber.dps import make_dps
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.model import CLIMBER_SDF, PAYLOAD_SDF
 from diagrams.space_climber.morphology import DEFAULT_FRICTION, FOOT_LINKS, JOINT_NAMES, LUNAR_GRAVITY, Morphology
+from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, connect_to_plant
 
 
@@ -48,27 +45,23 @@ def build_plain_climber(
     heading: float = 0.0,
     walk: float = 1.0,
     payload: bool = False,
+    joint_stops: bool = False,
     period: float = 0.02,
 ) -> PlainClimber:
     """The robot in its stance on flat ground, z up. ``time_step`` 0 is a continuous plant, for CENIC."""
     morphology = Morphology()
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step), builder)
-    (climber,) = Parser(plant).AddModels(str(CLIMBER_SDF))
+    climber = add_climber(plant, morphology=morphology, joint_stops=joint_stops)
     if payload:
-        (cube,) = Parser(plant).AddModels(str(PAYLOAD_SDF))
-        plant.WeldFrames(plant.GetFrameByName("attachment", climber), plant.GetBodyByName("payload", cube).body_frame())
+        add_payload(plant, climber)
     contact = CoulombFriction(friction, friction)
     X_WG = RigidTransform([0.0, 0.0, -0.5])
     plant.RegisterCollisionGeometry(plant.world_body(), X_WG, Box(200.0, 200.0, 1.0), "ground", contact)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -gravity])
-    gains = PdControllerGains(p=morphology.joint_stiffness, d=morphology.joint_damping)
-    for name in JOINT_NAMES:
-        plant.GetJointActuatorByName(name, climber).set_controller_gains(gains)
     plant.Finalize()
     feet = [plant.GetBodyByName(name, climber) for name in FOOT_LINKS]
-    set_friction(plant, scene_graph, friction)
-    set_stance(plant, morphology)
+    set_foot_friction(plant, scene_graph, climber, friction)
 
     imu = builder.AddNamedSystem("imu", Imu(plant, plant.GetFrameByName("imu", climber), period=period))
     joints = [plant.GetJointByName(name, climber) for name in JOINT_NAMES]
@@ -87,21 +80,3 @@ def build_plain_climber(
     builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(climber))
     return PlainClimber(builder.Build(), plant)
 
-
-def set_friction(plant: MultibodyPlant, scene_graph: SceneGraph, friction: float) -> None:
-    """Static and dynamic friction of all feet; equal frictions of foot and ground are the pair's friction."""
-    inspector = scene_graph.model_inspector()
-    for name in FOOT_LINKS:
-        for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name)):
-            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
-            properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(friction, friction))
-            scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
-
-
-def set_stance(plant: MultibodyPlant, morphology: Morphology) -> None:
-    """Makes the nominal stance, feet on the ground z = 0, the plant's default."""
-    angles = LegKinematics(morphology).inverse(morphology.stance).ravel()
-    for name, angle in zip(JOINT_NAMES, angles, strict=True):
-        plant.GetJointByName(name).set_default_angle(angle)
-    base = plant.GetBodyByName("base")
-    plant.SetDefaultFloatingBaseBodyPose(base, RigidTransform([0.0, 0.0, morphology.torso_clearance]))
