@@ -5,8 +5,8 @@ VENV   ?= .venv
 RUN   := $(VENV)/bin/python
 STAMP := $(VENV)/.vtbdrake-installed
 
-# The stamp holds the checkout it belongs to. A moved checkout, an interpreter that is gone, or another PYTHON asked for
-# (not the default of this file) than the one it was made with: set up again.
+# The stamp names the checkout and the PYTHON it was made for. Set up again when the checkout has moved, the interpreter is
+# gone, or another PYTHON is asked for explicitly.
 ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
