@@ -9,7 +9,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
-from pydrake.systems.primitives import Adder, Demultiplexer, Gain, MatrixGain, ZeroOrderHold
+from pydrake.systems.primitives import Adder, Demultiplexer, Gain, ZeroOrderHold
 
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
@@ -25,7 +25,7 @@ class PendulumScenario(Scenario):
     With gains of zero it swings freely.
     """
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-8, max_step_size=0.05))
+    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-6, max_step_size=0.05))
     stiffness: float = 0.0
     damping: float = 0.0
 

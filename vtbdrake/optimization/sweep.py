@@ -80,9 +80,7 @@ class Sweep:
         for point, h in zip(self.points, self.h, strict=True):
             scores.setdefault(tuple(point), []).append(h)
         finished = {
-            point: min(hs)
-            for point, hs in scores.items()
-            if len(hs) == len(self.conditions) and not np.isnan(hs).any()
+            point: min(hs) for point, hs in scores.items() if len(hs) == len(self.conditions) and not np.isnan(hs).any()
         }
         if not finished:
             raise ValueError("no point of the sweep has a quality under all conditions" + self._first_failure())

@@ -37,9 +37,7 @@ def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix
             yield _friction(element_address(plant, body, prefix), plant, scene_graph, geometries)
 
 
-def _friction(
-    address: str, plant: MultibodyPlant, scene_graph: SceneGraph, geometries: list[GeometryId]
-) -> Variable:
+def _friction(address: str, plant: MultibodyPlant, scene_graph: SceneGraph, geometries: list[GeometryId]) -> Variable:
     """Static and dynamic coefficient alike; what is read is the dynamic one, which Drake's discrete and convex
     contact models use."""
 

@@ -36,9 +36,7 @@ def pose_from_array(value: np.ndarray) -> RigidTransform:
     return RigidTransform(RollPitchYaw(value[3:]), value[:3])
 
 
-def leaf_variables(
-    path: str, system: System, *, declared: Iterable[Element] | None = None
-) -> Iterator[Variable]:
+def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | None = None) -> Iterator[Variable]:
     """The variables of a leaf system that is neither a plant nor a SceneGraph.
 
     ``declared`` names its elements where the system itself, one of Drake's, cannot.

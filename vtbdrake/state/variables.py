@@ -56,7 +56,7 @@ class Variables(Mapping[str, Variable]):
         entry = _ENTRY.fullmatch(address)
         if entry and entry[1] in self:
             return _entry(self[entry[1]], int(entry[2]))
-        raise AddressError(f"there is no variable {address!r}{self.suggestion(address)}")
+        raise AddressError(f"there is no variable {address!r}{suggestion(address, [*self._listed, *self._by_demand])}")
 
     def __contains__(self, address: object) -> bool:
         if address in self._listed or address in self._by_demand:
@@ -69,15 +69,6 @@ class Variables(Mapping[str, Variable]):
 
     def __len__(self) -> int:
         return len(self._listed)
-
-    def suggestion(self, address: str) -> str:
-        """What to tell someone who asked for an address that does not exist."""
-        known = [*self._listed, *self._by_demand]
-        near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
-        if near:
-            return "; did you mean " + " or ".join(near) + "?"
-        tops = sorted({".".join(name.split(".")[:2]) for name in known})
-        return "; addresses begin with " + ", ".join(tops) if tops else ""
 
     def read(self, context: Context, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
         """sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``."""
@@ -117,6 +108,16 @@ class Variables(Mapping[str, Variable]):
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
         return "\n".join(lines)
+
+
+def suggestion(address: str, known: Iterable[str]) -> str:
+    """What to tell someone who asked for an address that is not among those ``known``."""
+    known = list(known)
+    near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
+    if near:
+        return "; did you mean " + " or ".join(near) + "?"
+    tops = sorted({".".join(name.split(".")[:2]) for name in known})
+    return "; addresses begin with " + ", ".join(tops) if tops else ""
 
 
 def _entry(variable: Variable, index: int) -> Variable:

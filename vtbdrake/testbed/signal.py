@@ -78,6 +78,7 @@ class Signal:
 
     def vector(self, value: ArrayLike) -> np.ndarray:
         """``value`` (a scalar or one per entry) as an array of shape (size,)."""
+        assert self.size is not None
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), (self.size,)))
 
     def abstract_value(self) -> AbstractValue:

@@ -188,9 +188,7 @@ class ActSwitch:
     def _add_active(self, builder: DiagramBuilder, name: str) -> OutputPort:
         """1 while the signal commands the real actuator, else 0."""
         flag = Signal("active", size=1)
-        (on_sim, on_real, on_twin), active = _add_switch(
-            builder, f"{name}.active", flag, self.selector, ACT_POSITIONS
-        )
+        (on_sim, on_real, on_twin), active = _add_switch(builder, f"{name}.active", flag, self.selector, ACT_POSITIONS)
         yes = _add_constant(builder, f"{name}.active.yes", flag, 1.0)
         builder.Connect(_add_constant(builder, f"{name}.active.no", flag, 0.0), on_sim)
         builder.Connect(yes, on_real)

@@ -17,6 +17,7 @@ from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variable import X
+from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
@@ -139,7 +140,7 @@ class VirtualTestbed:
             return self._variables[address].get
         if address in self._ports:
             return _port_reader(*self._ports[address])
-        hint = Variables((), derived_by_demand=dict.fromkeys([*self._variables, *self._ports])).suggestion(address)
+        hint = suggestion(address, [*self._variables, *self._ports])
         raise AddressError(f"there is no variable and no output port {address!r}{hint}")
 
     @cached_property
