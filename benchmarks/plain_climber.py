@@ -42,13 +42,17 @@ def build_plain_climber(
     gravity: float = LUNAR_GRAVITY,
     friction: float = DEFAULT_FRICTION,
     time_step: float = 0.0,
+    slope: float = 0.0,
     heading: float = 0.0,
     walk: float = 1.0,
     payload: bool = False,
     joint_stops: bool = False,
     period: float = 0.02,
 ) -> PlainClimber:
-    """The robot in its stance on flat ground, z up. ``time_step`` 0 is a continuous plant, for CENIC."""
+    """The robot in its stance on flat ground, the plane z = 0.
+
+    ``time_step`` 0 is a continuous plant, for CENIC. On a ``slope`` (rad) x points uphill: gravity leans back by it.
+    """
     morphology = Morphology()
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step), builder)
@@ -58,7 +62,7 @@ def build_plain_climber(
     contact = CoulombFriction(friction, friction)
     X_WG = RigidTransform([0.0, 0.0, -0.5])
     plant.RegisterCollisionGeometry(plant.world_body(), X_WG, Box(200.0, 200.0, 1.0), "ground", contact)
-    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -gravity])
+    plant.mutable_gravity_field().set_gravity_vector([-gravity * np.sin(slope), 0.0, -gravity * np.cos(slope)])
     plant.Finalize()
     feet = [plant.GetBodyByName(name, climber) for name in FOOT_LINKS]
     set_foot_friction(plant, scene_graph, climber, friction)
@@ -79,4 +83,3 @@ def build_plain_climber(
     builder.Connect(dps.GetOutputPort("joint_position"), desired.get_input_port())
     builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(climber))
     return PlainClimber(builder.Build(), plant)
-

@@ -21,10 +21,10 @@ SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": 
 def make_dps(gait: str = "tripod", *, period: float = 0.02, morphology: Morphology | None = None) -> Diagram:
     """The DPS: ``sense`` calibrates and filters, ``env`` perceives, ``impl`` walks, ``act`` limits.
 
-    Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the torso's),
-    ``joint_encoders`` (18, rad), ``foot_contact`` (6, 0 or 1) and the commands ``heading`` (the yaw to walk towards, rad,
-    in the world) and ``walk`` (0 stands, 1 walks the full stroke). Output port: ``joint_position`` (18 targets, rad, in the
-    order of JOINT_NAMES, which is that of the model's actuators).
+    Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the
+    torso's), ``joint_encoders`` (18, rad), ``foot_contact`` (6, 0 or 1) and the commands ``heading`` (the yaw to walk
+    towards, rad, in the world) and ``walk`` (0 stands, 1 walks the full stroke). Output port: ``joint_position`` (18
+    targets, rad, in the order of JOINT_NAMES, which is that of the model's actuators).
 
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through, and what the sensors see
     reaches the command four periods later.
@@ -72,9 +72,9 @@ class Calibration(LeafSystem):
         output_ports:
         - measurements
 
-    Both ports are [imu (6), joint_encoders (18), foot_contact (6)]. The gyro's bias and the encoders' offsets are subtracted;
-    then the IMU's values pass a first-order low-pass with the time constant tau, ``y += (1 - exp(-T / tau)) (u - y)``. The
-    output is the state of the last sample.
+    Both ports are [imu (6), joint_encoders (18), foot_contact (6)]. The IMU's biases and the encoders' offsets are
+    subtracted; then the IMU's values pass a first-order low-pass with the time constant tau,
+    ``y += (1 - exp(-T / tau)) (u - y)``. The output is the state of the last sample.
     """
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:

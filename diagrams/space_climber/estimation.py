@@ -31,8 +31,8 @@ class PerceivedEnvironment(LeafSystem):
     ``measurements`` is [imu (6), joint_encoders (18), foot_contact (6)], ``pose`` is [roll, pitch, yaw, x, y, height],
     the state of the last sample.
 
-    Attitude: R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. The angles integrate the gyro's w; roll and pitch
-    are drawn to the direction of the specific force f with the time constant tau:
+    Attitude: R_WB = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down. The angles integrate the gyro's w; roll and
+    pitch are drawn to the direction of the specific force f with the time constant tau:
 
         roll_f = atan2(f_y, f_z),   pitch_f = atan2(-f_x, |(f_y, f_z)|)
 

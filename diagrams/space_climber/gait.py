@@ -2,8 +2,9 @@ r"""Gaits of a six-legged robot, as pure functions.
 
 A gait is a duty factor beta (the fraction of a cycle that a leg spends on the ground) and a delay per leg, in cycles.
 At the gait's phase phi the leg with delay d has the phase frac(phi - d): it stands while that is less than beta, and
-swings for the rest of the cycle. All standing feet move with the twist that is opposite to the body's: they do not slip
-against each other, whatever the speed and however it changes. With one stroke per stance and the period P the body speed is
+swings for the rest of the cycle. All standing feet move with the twist that is opposite to the body's: they do not
+slip against each other, whatever the speed and however it changes. With one stroke per stance and the period P the body
+speed is
 
     v = stroke / (beta P).
 
@@ -78,7 +79,7 @@ def advance(
     """
     dx, dy, turn = step
     half = 0.5 * stance_steps
-    moved = []
+    moved: list[float] = []
     legs = zip(gait.leg_phases(phase), gait.leg_phases(next_phase), nominal, strict=True)
     for k, (before, after, (nx, ny)) in enumerate(legs):
         x, y = feet[2 * k], feet[2 * k + 1]

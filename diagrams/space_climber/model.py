@@ -63,7 +63,9 @@ def _torso(model: ET.Element, m: Morphology) -> None:
         _visual(base, f"rib_{k}", _box(0.12, m.torso_width, m.torso_height * 0.7), f"{_text(x)} 0 0 0 0 0", _DARK)
     top = m.torso_height / 2
     _visual(base, "deck", _box(m.torso_length * 0.8, 0.14, 0.02), f"0 0 {_text(top + 0.01)} 0 0 0", _ORANGE)
-    _visual(base, "head", _box(0.08, 0.10, 0.07), f"{_text(m.torso_length / 2 - 0.05)} 0 {_text(top + 0.035)} 0 0 0", _DARK)
+    _visual(
+        base, "head", _box(0.08, 0.10, 0.07), f"{_text(m.torso_length / 2 - 0.05)} 0 {_text(top + 0.035)} 0 0 0", _DARK
+    )
     for side, y in (("left", 0.03), ("right", -0.03)):
         at = f"{_text(m.torso_length / 2)} {y} {_text(top + 0.04)} {_ALONG_X}"
         _visual(base, f"camera_{side}", _cylinder(0.014, 0.03), at, _BLACK)
@@ -144,7 +146,9 @@ def _joint(
     axis = ET.SubElement(joint, "axis")
     ET.SubElement(axis, "xyz").text = axis_J
     limit = ET.SubElement(axis, "limit")
-    for tag, value in zip(("lower", "upper", "velocity", "effort"), (*limits, m.joint_speed, m.joint_torque), strict=True):
+    for tag, value in zip(
+        ("lower", "upper", "velocity", "effort"), (*limits, m.joint_speed, m.joint_torque), strict=True
+    ):
         ET.SubElement(limit, tag).text = _text(value)
 
 

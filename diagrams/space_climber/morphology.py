@@ -31,10 +31,11 @@ LUNAR_GRAVITY = 1.62
 DEFAULT_FRICTION = 0.8
 """Coulomb friction of foot and ground, static and dynamic.
 
-A foot on regolith slips when the soil under it shears, so the soil's friction angle bounds it. Boulder tracks on the moon
-gave 24 to 47 deg, 37 deg on average ("Boulder tracks and nature of lunar soil", The Moon 6, 1973): a coefficient of 0.45 to
-1.07, 0.75 on average. Measurements of the Apollo missions are commonly summarized as 30 to 50 deg (Carrier, Olhoeft, Mendell,
-"Physical Properties of the Lunar Surface", Lunar Sourcebook, chapter 9, 1991), whose middle is 0.84. 0.8 lies between.
+A foot on regolith slips when the soil under it shears, so the soil's friction angle bounds it. Boulder tracks on the
+moon gave 24 to 47 deg, 37 deg on average (abstract of "Boulder tracks and nature of lunar soil", 1973, NASA NTRS
+19730039283): a coefficient of 0.45 to 1.07, 0.75 on average. Measurements of the Apollo missions are commonly summarized
+as 30 to 50 deg (see Carrier, Olhoeft, Mendell, "Physical Properties of the Lunar Surface", Lunar Sourcebook, chapter 9,
+1991), whose middle is 0.84. 0.8 lies between.
 """
 
 
@@ -79,8 +80,8 @@ class Morphology:
     basal_range: tuple[float, float] = (-1.6, 1.2)  # [A]
     distal_range: tuple[float, float] = (0.0, 2.8)  # [A] the knee never bends backwards
     joint_speed: float = 4.0  # [A]
-    # [D] On earth the middle leg of a tripod carries half the weight, 132 N, at 0.19 m from its basal axis: 25 N m. Twice
-    # that for a stroke's lever and for acceleration, rounded up.
+    # [D] On earth the middle leg of a tripod carries half the weight, 132 N, at 0.19 m from its basal axis: 25 N m.
+    # Twice that for a stroke's lever and for acceleration, rounded up.
     joint_torque: float = 60.0
 
     # [A] Position servo of each joint. Under the 25 N m above it gives way by 1.4 deg; well damped for a leg's inertia.

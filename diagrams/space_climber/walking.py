@@ -30,8 +30,8 @@ class GaitGenerator(LeafSystem):
       1 / ``ramp_time``; standing is a level of 0 with a phase that rests.
     * Heading: the robot walks along its own x axis and turns at ``heading_gain * (heading - yaw)``, within
       +- ``yaw_rate_limit``.
-    * Posture: the plane of the feet's heights leans against the torso's tilt. The lean grows with ``posture_gain`` times
-      (roll, pitch), within +- ``lean_limit``.
+    * Posture: the plane of the feet's heights leans against the torso's tilt. The lean grows with ``posture_gain``
+      times (roll, pitch), within +- ``lean_limit``.
 
     ``joint_position`` is a state: the inverse kinematics of the feet, as of the last sample.
     """

@@ -24,8 +24,8 @@ class JointEncoders(SampledSensor):
         output_ports:
         - joint_encoders
 
-    ``state`` is the plant's [q; v]; ``joint_encoders`` holds one position (rad or m) per joint, in the order of ``joints``.
-    Before the first sample it shows the plant's default positions.
+    ``state`` is the plant's [q; v]; ``joint_encoders`` holds one position (rad or m) per joint, in the order of
+    ``joints``. Before the first sample it shows the plant's default positions.
     """
 
     def __init__(self, plant: MultibodyPlant, joints: Sequence[Joint], *, period: float, stream: int = 1) -> None:

@@ -27,19 +27,17 @@ class ContactSensor(SampledSensor):
         output_ports:
         - foot_contact
 
-    ``foot_contact`` has one entry per body, in the order of ``bodies``; what counts is the sum of the magnitudes of the forces
-    of all its contacts. Point contact and hydroelastic contact both count.
-    With a continuous plant the contact results follow from its state alone; with a discrete one they are those of its
-    last step, and empty between a restore and the next step.
+    ``foot_contact`` has one entry per body, in the order of ``bodies``; what counts is the sum of the magnitudes of the
+    forces of all its contacts, in point contact and hydroelastic contact. With a continuous plant the contact results
+    follow from its state; with a discrete one they are those of its last step, and empty between a restore and the next
+    step.
     """
 
     def __init__(
-        self, plant: MultibodyPlant, bodies: Sequence[RigidBody], *, threshold: float = 1.0, period: float, stream: int = 2
+        self, plant: MultibodyPlant, bodies: Sequence[RigidBody], *, period: float, threshold: float = 1.0
     ) -> None:
         """``threshold`` is a force (N), and a parameter of the Context."""
-        super().__init__(
-            "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", noise={}, stream=stream
-        )
+        super().__init__("foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", noise={}, stream=0)
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Where in the list of forces a body or geometry adds to; the last place is for all that are not asked for.
         self._size = len(bodies) + 1

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
 
-from vtbdrake.state import discrete_state, parameter
 from vtbdrake.components.sensors.noise import normal_noise
+from vtbdrake.state import discrete_state, parameter
 
 
 class SampledSensor(LeafSystem):

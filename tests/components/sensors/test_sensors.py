@@ -1,0 +1,198 @@
+"""Sensors against rigid-body motions that are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.geometry import Box, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, SampledSensor, connect_to_plant, normal_noise
+
+PERIOD = 0.01
+G = 9.81
+X_BF = RigidTransform(RollPitchYaw(0.3, -0.5, 0.9), [0.1, -0.2, 0.3])
+
+
+def free_body() -> tuple[DiagramBuilder, MultibodyPlant]:
+    """A ball that flies."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.AddFrame(FixedOffsetFrame("F", body.body_frame(), X_BF))
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, -G])
+    return builder, plant
+
+
+def add(builder: DiagramBuilder, plant: MultibodyPlant, sensor: SampledSensor) -> Diagram:
+    builder.AddSystem(sensor)
+    connect_to_plant(builder, sensor, plant)
+    return builder.Build()
+
+
+def reading(sensor: SampledSensor, simulator: Simulator) -> np.ndarray:
+    return sensor.get_output_port().Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
+
+
+def test_imu_in_free_fall_feels_its_turn_but_no_force() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetBodyByName("body").body_frame(), period=PERIOD)
+    diagram = add(builder, plant, imu)
+    simulator = Simulator(diagram)
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    w = np.array([0.5, -1.0, 2.0])
+    plant.SetFreeBodySpatialVelocity(context, plant.GetBodyByName("body"), SpatialVelocity(w, [1.0, 2.0, 3.0]))
+    simulator.AdvanceTo(0.205)
+    # A ball's angular velocity is constant, and the same in the body as in the world.
+    np.testing.assert_allclose(reading(imu, simulator), [*w, 0, 0, 0], atol=2e-3)
+
+
+def test_imu_off_centre_feels_the_centripetal_force() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
+    diagram = add(builder, plant, imu)
+    simulator = Simulator(diagram)
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    w = np.array([0.0, 0.0, 2.0])
+    plant.SetFreeBodySpatialVelocity(context, plant.GetBodyByName("body"), SpatialVelocity(w, [0.0, 0.0, 0.0]))
+    simulator.AdvanceTo(0.205)
+    R_FB = X_BF.rotation().matrix().T
+    expected = R_FB @ np.cross(w, np.cross(w, X_BF.translation()))
+    y = reading(imu, simulator)
+    np.testing.assert_allclose(y[:3], R_FB @ w, atol=1e-3)
+    np.testing.assert_allclose(y[3:], expected, atol=2e-3 * np.linalg.norm(expected) + 1e-3)
+
+
+def arm(*, angle: float, rate: float = 0.0, discrete: bool = False) -> tuple[DiagramBuilder, MultibodyPlant]:
+    """A link that turns about the world's y axis without gravity's torque: its mass is on the axis."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001 if discrete else 0.0)
+    link = plant.AddRigidBody("link", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    joint = RevoluteJoint("joint", plant.world_frame(), link.body_frame(), [0, 1, 0], damping=0)
+    joint.set_default_angle(angle)
+    plant.AddJoint(joint)
+    plant.AddFrame(FixedOffsetFrame("F", link.body_frame(), X_BF))
+    plant.mutable_gravity_field().set_gravity_vector([0, 0, -G])
+    plant.Finalize()
+    return builder, plant
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_imu_at_rest_shows_gravity_from_the_start(discrete: bool) -> None:
+    builder, plant = arm(angle=0.7, discrete=discrete)
+    imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
+    diagram = add(builder, plant, imu)
+    simulator = Simulator(diagram)
+    R_WF = RotationMatrix.MakeYRotation(0.7) @ X_BF.rotation()
+    expected = [0, 0, 0, *(R_WF.matrix().T @ [0, 0, G])]
+    np.testing.assert_allclose(reading(imu, simulator), expected, atol=1e-12)
+    for k in range(4):
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        np.testing.assert_allclose(reading(imu, simulator), expected, atol=1e-9)
+
+
+def test_first_sample_takes_the_pose_but_no_velocity_difference() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetBodyByName("body").body_frame(), period=PERIOD)
+    diagram = add(builder, plant, imu)
+    simulator = Simulator(diagram)
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    body = plant.GetBodyByName("body")
+    R_WB = RotationMatrix(RollPitchYaw(0.2, 0.4, 0.0))
+    plant.SetFreeBodyPose(context, body, RigidTransform(R_WB, [0, 0, 0]))
+    plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity([0, 0, 1.0], [5.0, 0, 0]))
+    simulator.AdvanceTo(0.5 * PERIOD)
+    np.testing.assert_allclose(reading(imu, simulator), [0, 0, 0, *(R_WB.matrix().T @ [0, 0, G])], atol=1e-12)
+
+
+def test_encoders_show_a_constant_rate_sampled() -> None:
+    builder, plant = arm(angle=0.1)
+    encoders = JointEncoders(plant, [plant.GetJointByName("joint")], period=PERIOD)
+    diagram = add(builder, plant, encoders)
+    simulator = Simulator(diagram)
+    assert reading(encoders, simulator) == pytest.approx([0.1])  # the default position, before the first sample
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    plant.SetVelocities(context, [2.0])
+    simulator.AdvanceTo(5.7 * PERIOD)
+    assert reading(encoders, simulator) == pytest.approx([0.1 + 2.0 * 5 * PERIOD], abs=1e-6)
+
+
+def test_encoders_refuse_a_floating_base() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    del builder
+    with pytest.raises(ValueError, match="7 positions"):
+        JointEncoders(plant, [plant.GetJointByName("body")], period=PERIOD)
+
+
+def noisy_readings(*, seed: float, stream: int, std: float, start: float = 0.0) -> list[float]:
+    builder, plant = arm(angle=0.0)
+    encoders = JointEncoders(plant, [plant.GetJointByName("joint")], period=PERIOD, stream=stream)
+    diagram = add(builder, plant, encoders)
+    context = diagram.CreateDefaultContext()
+    encoders.GetMyContextFromRoot(context).get_mutable_numeric_parameter(0).SetFromVector([seed, std])
+    context.SetTime(start)
+    simulator = Simulator(diagram, context)
+    values = []
+    for k in range(20):
+        simulator.AdvanceTo(start + (k + 0.5) * PERIOD)
+        values.append(float(reading(encoders, simulator)[0]))
+    return values
+
+
+def test_noise_repeats_and_depends_on_seed_stream_and_tick() -> None:
+    noise = noisy_readings(seed=3, stream=1, std=0.1)
+    assert noise == noisy_readings(seed=3, stream=1, std=0.1)
+    assert len(set(noise)) == 20
+    assert not set(noise) & set(noisy_readings(seed=4, stream=1, std=0.1))
+    assert not set(noise) & set(noisy_readings(seed=3, stream=2, std=0.1))
+    assert noise[10:] == noisy_readings(seed=3, stream=1, std=0.1, start=10 * PERIOD)[:10]
+    assert noisy_readings(seed=3, stream=1, std=0.0) == [0.0] * 20
+
+
+def test_noise_is_standard_normal_and_ticks_are_independent() -> None:
+    samples = np.array([normal_noise(40, seed=1, stream=2, tick=tick) for tick in range(1000)])
+    assert samples.mean() == pytest.approx(0.0, abs=0.02)
+    assert samples.std() == pytest.approx(1.0, abs=0.02)
+    assert np.corrcoef(samples[:-1].ravel(), samples[1:].ravel())[0, 1] == pytest.approx(0.0, abs=0.02)
+    assert np.unique(samples).size == samples.size
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.001])
+def test_contact_sensor_feels_weight_above_its_threshold(time_step: float) -> None:
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
+    balls = []
+    for name, mass, height in (("light", 0.2, 0.1), ("heavy", 2.0, 0.1), ("high", 2.0, 1.0)):
+        ball = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(mass, 0.1))
+        friction = CoulombFriction(1, 1)
+        plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(0.1), name, friction)
+        joint = PrismaticJoint(name, plant.world_frame(), ball.body_frame(), [0, 0, 1])
+        joint.set_default_translation(height)
+        plant.AddJoint(joint)
+        balls.append(ball)
+    ground = RigidTransform([0, 0, -0.5])
+    plant.RegisterCollisionGeometry(plant.world_body(), ground, Box(10, 10, 1), "ground", CoulombFriction(1, 1))
+    plant.Finalize()
+    sensor = ContactSensor(plant, balls, threshold=5.0, period=PERIOD)  # between the weights 1.96 N and 19.6 N
+    diagram = add(builder, plant, sensor)
+    simulator = Simulator(diagram)
+    if time_step == 0.0:
+        config = SimulatorConfig(integration_scheme="cenic", accuracy=1e-3, max_step_size=0.01, use_error_control=True)
+        ApplySimulatorConfig(config, simulator)
+    simulator.AdvanceTo(0.3)
+    np.testing.assert_array_equal(reading(sensor, simulator), [0.0, 1.0, 0.0])
+
+
+def test_period_must_be_positive() -> None:
+    _, plant = arm(angle=0.0)
+    with pytest.raises(ValueError, match="positive"):
+        JointEncoders(plant, [plant.GetJointByName("joint")], period=0.0)
