@@ -7,9 +7,9 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, get_type_hints
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -98,10 +98,8 @@ class Scenario(ABC):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a YAML file that `load_scenario` reads."""
+        _resolve_types(type(self))
         Path(path).write_text(yaml_dump_typed(self, child_name=self.name()))
-
-
-S = TypeVar("S", bound=Scenario)
 
 
 def load_scenario(source: str | os.PathLike[str]) -> Scenario:
@@ -152,11 +150,22 @@ def _load_yaml(path: Path) -> Scenario:
     _refuse_twins(document, path)
     name = document.value[0][0].value
     try:
-        return yaml_load_typed(schema=_scenario_class(name), filename=path, child_name=name)
+        schema = _scenario_class(name)
+        _resolve_types(schema)
+        return yaml_load_typed(schema=schema, filename=path, child_name=name)
     except (RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, ScenarioError):
             raise
         raise ScenarioError(f"{path} does not fit {name}: {error}") from error
+
+
+def _resolve_types(schema: type) -> None:
+    # Drake's reader wants the types of fields; `from __future__ import annotations` leaves their names.
+    hints = get_type_hints(schema)
+    for item in fields(schema):
+        item.type = hints[item.name]
+        if is_dataclass(item.type):
+            _resolve_types(item.type)  # type: ignore[arg-type]
 
 
 def _refuse_twins(node: yaml.Node, path: Path) -> None:

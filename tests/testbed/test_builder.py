@@ -1,0 +1,184 @@
+"""What does not fit is refused when the testbed is built, by name."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
+
+from tests.testbeds import PoseRelay
+from vtbdrake.state import VariableError, discrete_state
+from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed.signal import SignalError
+
+SENSE = Signal("y", size=2)
+ACT = Signal("u", size=2, idle=0.0)
+
+
+def _relay(input_name="y", output_name="u", size=2):
+    builder = DiagramBuilder()
+    system = builder.AddNamedSystem("impl", PassThrough(size))
+    builder.ExportInput(system.get_input_port(), input_name)
+    builder.ExportOutput(system.get_output_port(), output_name)
+    return builder.Build()
+
+
+def _world(builder, sensor=None, actuator=None):
+    sensor = sensor or ConstantVectorSource([1.0, 2.0])
+    builder.sim_sensor("y", builder.add("sense", "y", sensor).get_output_port())
+    builder.sim_actuator("u", builder.add("act", "u", actuator or PassThrough(2)).get_input_port())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Interface([SENSE, SENSE], [ACT]), "these occur twice: y"),
+        (lambda: Interface([SENSE], [ACT], [Signal("y", size=1)]), "these occur twice: y"),
+        (lambda: Interface([SENSE], [Signal("u", size=2)]), "u has no idle command"),
+        (lambda: Interface([SENSE], [ACT], [Signal("mode", model_value="walk")]), "command mode is abstract"),
+        (lambda: Signal("y"), "either a vector .give size=. or abstract"),
+        (lambda: Signal("y", size=2, model_value=1), "either a vector"),
+        (lambda: Signal("y", size=0), "at least one entry, not 0"),
+        (lambda: Signal("a.b", size=1), "one word"),
+        (lambda: Signal("y", size=2, lower=[0.0, 0.0, 0.0]), r"2 entries, but its lower has shape \(3,\)"),
+        (lambda: Signal("y", size=2, lower=1.0, upper=0.0), "lower limit 1.0 lies above"),
+        (lambda: Signal("y", size=2, rate=0.0), "rate limit must be positive"),
+        (lambda: Signal("y", size=2, idle=float("nan")), "its idle has a NaN"),
+        (lambda: Signal("y", size=2, max_age=0.0), "max_age must be positive"),
+    ],
+)
+def test_an_interface_that_makes_no_sense_is_refused(make, message):
+    with pytest.raises(SignalError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("dps", "message"),
+    [
+        (lambda: _relay(input_name="x"), "the DPS has no input port y; it has: x"),
+        (lambda: _relay(output_name="x"), "the DPS has no output port u; it has: x"),
+        (lambda: _relay(size=3), "signal y has 2 entries, but the port y of the DPS has 3"),
+        (PoseRelay, "the DPS has no input port y; it has: seen"),
+    ],
+)
+def test_a_dps_that_does_not_fit_is_refused(dps, message):
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    with pytest.raises(SignalError, match=message):
+        builder.set_dps(dps())
+
+
+def test_an_input_of_the_dps_that_is_no_signal_is_refused():
+    builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=RigidTransform())], []))
+    builder.set_dps(PoseRelay())
+    other = VirtualTestbedBuilder(Interface([], []))
+    with pytest.raises(SignalError, match="no signal for the DPS's input port seen"):
+        other.set_dps(PoseRelay())
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"sensor": ConstantVectorSource([1.0])}, "signal y has 2 entries, but the port y0 of sim.sense.y has 1"),
+        ({"sensor": ConstantValueSource(Value("a"))}, "signal y is vector, but the port y0 of sim.sense.y is abstract"),
+        ({"actuator": PassThrough(4)}, "signal u has 2 entries, but the port u of sim.act.u has 4"),
+    ],
+)
+def test_a_world_that_does_not_fit_is_refused(parts, message):
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    with pytest.raises(SignalError, match=message):
+        _world(builder, **parts)
+
+
+def test_an_abstract_signal_of_another_type_is_refused():
+    builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=RigidTransform())], []))
+    source = builder.add("sense", "seen", ConstantValueSource(Value("a pose")))
+    with pytest.raises(SignalError, match="seen carries a RigidTransform, but the port y0 of sim.sense.seen carries a str"):
+        builder.sim_sensor("seen", source.get_output_port())
+
+
+def test_what_is_missing_is_named():
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    with pytest.raises(SignalError, match="no DPS"):
+        builder.build()
+    builder.set_dps(_relay())
+    with pytest.raises(SignalError, match="no simulated sensor offers y"):
+        builder.build()
+    builder.sim_sensor("y", builder.add("sense", "y", ConstantVectorSource([1.0, 2.0])).get_output_port())
+    with pytest.raises(SignalError, match="no simulated actuator takes u"):
+        builder.build()
+    with pytest.raises(SignalError, match="two ports are given for the sensor signal y"):
+        builder.sim_sensor("y", builder.add("sense", "y2", ConstantVectorSource([1.0, 2.0])).get_output_port())
+    with pytest.raises(SignalError, match="no actuator signal 'v'; it has: u"):
+        builder.sim_actuator("v", builder.add("act", "v", PassThrough(2)).get_input_port())
+    with pytest.raises(SignalError, match="has a DPS already"):
+        builder.set_dps(_relay())
+    with pytest.raises(ValueError, match="one of sense, sys, act, env, not 'world'"):
+        builder.add("world", "w", PassThrough(2))
+
+
+def test_a_command_is_a_variable_with_the_signals_limits():
+    builder = VirtualTestbedBuilder(
+        Interface([], [ACT], [Signal("y", size=2, unit="m", lower=-1.0, upper=1.0, default=[0.1, 0.2])])
+    )
+    builder.set_dps(_relay())
+    builder.sim_actuator("u", builder.add("act", "u", PassThrough(2)).get_input_port())
+    testbed = builder.build()
+    context = testbed.default_context()
+    assert testbed.read(context, "dps.u").tolist() == [0.1, 0.2]
+    testbed.write(context, {"u.y": [0.5, -0.5]})
+    assert testbed.read(context, "dps.u").tolist() == [0.5, -0.5]
+    with pytest.raises(VariableError, match=r"must lie in \[-1, 1\] m"):
+        testbed.write(context, {"u.y": [0.5, -1.5]})
+
+
+def test_a_command_can_come_from_a_system():
+    builder = VirtualTestbedBuilder(Interface([], [ACT], [Signal("y", size=2)]))
+    builder.set_dps(_relay())
+    builder.sim_actuator("u", builder.add("act", "u", PassThrough(2)).get_input_port())
+    builder.command("y", builder.builder.AddNamedSystem("plan", ConstantVectorSource([3.0, 4.0])).get_output_port())
+    testbed = builder.build()
+    assert testbed.read(testbed.default_context(), "dps.u").tolist() == [3.0, 4.0]
+    assert "u.y" not in testbed.variables()
+
+
+class Estimator(LeafSystem):
+    """A DPS that believes something."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("y", 2)
+        self.DeclareStateOutputPort("u", self.DeclareDiscreteState(np.array([0.4, 0.6])))
+        self.variables = (discrete_state("estimate", 0, shape=(2,)),)
+
+
+def _believing(target="sim.sense.y.value", of=("dps.estimate",), by=None):
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    builder.set_dps(Estimator())
+    _world(builder)
+    builder.believe(target, of=of, by=by)
+    return builder
+
+
+def test_belief_sets_the_simulated_world():
+    testbed = _believing(by=lambda estimate: 10.0 * estimate).build()
+    context = testbed.default_context()
+    testbed.start_from_belief(context)
+    assert testbed.read(context, "sim.sense.y.value").tolist() == [4.0, 6.0]
+
+
+def test_a_belief_goes_from_dps_to_sim():
+    with pytest.raises(ValueError, match="not dps.estimate"):
+        _believing(target="dps.estimate").build()
+    with pytest.raises(ValueError, match="which the DPS does not hold"):
+        _believing(of=("sim.sense.y.value",)).build()
+    with pytest.raises(ValueError, match="did you mean dps.estimate"):
+        _believing(of=("dps.estimates",)).build()
+    with pytest.raises(ValueError, match="say with by= how"):
+        _believing(of=("dps.estimate", "dps.estimate"))
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    builder.set_dps(_relay())
+    _world(builder)
+    testbed = builder.build()
+    with pytest.raises(ValueError, match="does not declare"):
+        testbed.start_from_belief(testbed.default_context())

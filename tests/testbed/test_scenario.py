@@ -1,0 +1,73 @@
+"""Scenarios travel as plain data; a file that does not fit is refused with the reason."""
+
+import pickle
+
+import pytest
+
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.state import AddressError
+from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
+
+NAME = "tests.testbeds:AcrobotScenario"
+
+
+def test_a_scenario_survives_file_and_pickle(tmp_path):
+    scenario = AcrobotScenario(period=0.05, simulator=SimulatorFields(integration_scheme="cenic", accuracy=1e-3))
+    scenario.save(tmp_path / "s.yaml")
+    assert load_scenario(tmp_path / "s.yaml") == scenario
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+
+
+def test_a_file_names_its_class_and_what_differs(tmp_path):
+    (tmp_path / "s.yaml").write_text(f"{NAME}:\n  period: 0.1\n  simulator:\n    accuracy: 1.0e-3\n")
+    scenario = load_scenario(tmp_path / "s.yaml")
+    assert isinstance(scenario, AcrobotScenario)
+    assert (scenario.period, scenario.simulator.accuracy, scenario.time_step) == (0.1, 1e-3, 0.0)
+    assert load_scenario(NAME) == AcrobotScenario()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{NAME}:\n  perod: 0.1\n", "perod"),
+        (f"{NAME}:\n  simulator:\n    acuracy: 0.1\n", "acuracy"),
+        (f"{NAME}:\n  period: 0.1\n  period: 0.2\n", "the key 'period' twice"),
+        (f"{NAME}:\n  period: fast\n", "fast"),
+        (f"{NAME}:\n  period: .nan\n", "period must be finite"),
+        (f"{NAME}:\n  simulator:\n    integration_scheme: magic\n", "is one of bogacki_shampine3, cenic"),
+        (f"{NAME}:\n  simulator:\n    accuracy: 0.0\n", "positive max_step_size and accuracy"),
+        ("tests.testbeds:Nothing:\n  period: 0.1\n", "no scenario 'Nothing'; it has: .*AcrobotScenario"),
+        ("nowhere.at.all:Nothing:\n  period: 0.1\n", "cannot import nowhere.at.all"),
+        ("period: 0.1\nother: 1\n", "must have one key"),
+        ("[1, 2", "is not YAML"),
+        ("", "must have one key"),
+    ],
+)
+def test_a_bad_file_is_refused(tmp_path, text, message):
+    (tmp_path / "s.yaml").write_text(text)
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario(tmp_path / "s.yaml")
+
+
+def test_a_scenario_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ScenarioError, match="there is no scenario file"):
+        load_scenario(tmp_path / "missing.yaml")
+    with pytest.raises(ScenarioError, match=r"named package.module:Class"):
+        load_scenario("AcrobotScenario")
+
+
+def test_ports_and_variables_are_read_by_address():
+    testbed = PendulumScenario(stiffness=2.0).build()
+    context = testbed.default_context()
+    testbed.write(context, {"u.angle": 0.25})
+    assert testbed.read(context, "dps.torque") == pytest.approx([0.5])
+    assert testbed.read(context, "plant.state").tolist() == [0.0, 0.0]
+    assert testbed.read(context, "time") == 0.0
+    with pytest.raises(AddressError, match="no variable and no output port 'dps.torqe'; did you mean dps.torque"):
+        testbed.read(context, "dps.torqe")
+
+
+def test_what_is_fixed_to_the_world_is_environment():
+    addresses = set(PendulumScenario().build().variables())
+    assert "sim.sys.Pendulum.arm.mass" in addresses
+    assert not any(address.startswith("plant") for address in addresses)
