@@ -1,0 +1,123 @@
+"""Equations (12) to (17) on trajectories made by hand, and through a simulation."""
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.testbeds import AcrobotScenario
+from vtbdrake.rollout import Quality, QualityError, RolloutRunner, RolloutTask
+from vtbdrake.rollout.quality import best_sample, exceedances
+
+PERIOD = 0.1
+
+
+def _roll(trajectory, *, threshold=inf, **options):
+    """A rollout whose f' is ``trajectory`` at the sample times."""
+    quality = Quality(lambda t: trajectory[round(t / PERIOD)], "time")
+    horizon = PERIOD * (len(trajectory) - 1)
+    task = RolloutTask(AcrobotScenario(), horizon, quality, threshold, sample_period=PERIOD, **options)
+    runner = RolloutRunner(task)
+    return runner.run({}), runner
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "threshold", "t_star", "h", "end"),
+    [
+        # Two crossings: the first counts (Figure 5, f1).
+        ([0.0, 0.5, 2.0, 0.5, 3.0], 1.0, 0.2, 2.0, "threshold"),
+        # Never reached: the maximum (Figure 5, f2).
+        ([0.0, 0.5, 0.9, 0.5, 0.3], 1.0, 0.2, 0.9, "horizon"),
+        # Strictly greater: touching the threshold is not exceeding it.
+        ([0.0, 1.0, 0.5, 1.0, 0.2], 1.0, 0.1, 1.0, "horizon"),
+        # A plateau and a tie: the first maximum wins.
+        ([0.2, 0.7, 0.7, 0.1, 0.7], 1.0, 0.1, 0.7, "horizon"),
+        # The maximum at t = 0 counts, and so does a threshold exceeded there.
+        ([0.9, 0.5, 0.2, 0.1, 0.0], 1.0, 0.0, 0.9, "horizon"),
+        ([1.5, 0.5, 9.0, 0.1, 0.0], 1.0, 0.0, 1.5, "threshold"),
+        # The last sample counts too.
+        ([0.0, 0.0, 0.0, 0.0, 4.0], 1.0, 0.4, 4.0, "threshold"),
+        # No threshold; a quality that is nowhere positive.
+        ([0.0, 0.0, 0.0, 0.0, 0.0], inf, 0.0, 0.0, "horizon"),
+        # A threshold of zero is exceeded by anything positive.
+        ([0.0, 0.0, 1e-9, 5.0, 0.0], 0.0, 0.2, 1e-9, "threshold"),
+    ],
+)
+def test_t_star_and_h(trajectory, threshold, t_star, h, end):
+    result, runner = _roll(trajectory, threshold=threshold)
+    assert (result.end, result.h) == (end, h)
+    assert result.t_star == pytest.approx(t_star)
+    # Early stop: no step after t*.
+    stop = t_star if end == "threshold" else 0.4
+    assert runner.context.get_time() == pytest.approx(stop)
+    np.testing.assert_array_equal(result.quality, trajectory[: round(stop / PERIOD) + 1])
+
+
+def test_a_rollout_that_runs_on_knows_all_of_g1_and_the_same_t_star():
+    result, runner = _roll([0.0, 2.0, 0.5, 3.0, 0.0], threshold=1.0, run_on=True)
+    assert result.exceedances == pytest.approx([0.1, 0.3])
+    assert (result.end, result.t_star, result.h) == ("threshold", pytest.approx(0.1), 2.0)
+    assert runner.context.get_time() == pytest.approx(0.4)
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 2.0]), min_size=1, max_size=20),
+    st.sampled_from([0.0, 0.25, 0.5, 1.5, inf]),
+)
+def test_the_definitions_word_by_word(values, threshold):
+    times = range(len(values))
+    g1 = {t for t in times if values[t] > threshold}
+    g2 = {t for t in times if all(values[t] >= values[s] for s in times)}
+    assert best_sample(np.array(values), threshold=threshold) == (min(g1) if g1 else min(g2))
+    assert set(exceedances(np.arange(len(values)), np.array(values), threshold=threshold)) == g1
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (lambda t: -0.1, "is -0.1, but a quality is finite and not negative"),
+        (lambda t: nan, "is nan, but"),
+        (lambda t: inf, "is inf, but"),
+        (lambda t: 1 / 0, "raises ZeroDivisionError: division by zero"),
+        (lambda t: "good", "raises ValueError"),
+        (lambda t, pitch: 1.0, "raises TypeError"),
+    ],
+)
+def test_what_is_not_a_quality_is_an_error_that_says_when_and_where(f, message):
+    task = RolloutTask(AcrobotScenario(), 0.2, Quality(f, "time"))
+    with pytest.raises(QualityError, match=f"at t = 0 s, time = 0.0, {message}"):
+        RolloutRunner(task).run({})
+
+
+def test_a_quality_is_a_function_of_something():
+    with pytest.raises(QualityError, match="not 3"):
+        Quality(3, "time")
+    with pytest.raises(QualityError, match="at least one quality variable"):
+        Quality(abs, [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"horizon": 0.0}, "horizon t_m must be positive"),
+        ({"horizon": -1.0}, "horizon t_m must be positive"),
+        ({"horizon": inf}, "horizon t_m must be positive and finite"),
+        ({"horizon": 1.0, "sample_period": 0.0}, "sample period must be positive"),
+        ({"horizon": 1.0, "sample_period": 2.0}, "at most the horizon of 1 s, not 2.0 s"),
+        ({"horizon": 1.0, "threshold": nan}, "threshold f_m"),
+        ({"horizon": 1.0, "threshold": -1.0}, "threshold f_m"),
+    ],
+)
+def test_a_task_that_makes_no_sense_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        RolloutTask(AcrobotScenario(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "period", "expected"),
+    [(0.3, 0.1, [0, 0.1, 0.2, 0.3]), (0.25, 0.1, [0, 0.1, 0.2, 0.25]), (0.1, 0.1, [0, 0.1])],
+)
+def test_samples_are_the_multiples_of_the_period_and_the_horizon(horizon, period, expected):
+    np.testing.assert_allclose(RolloutTask(AcrobotScenario(), horizon, sample_period=period).sample_times(), expected)

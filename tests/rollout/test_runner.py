@@ -1,0 +1,261 @@
+"""Gamma: the same s0 gives the same trajectory, to the last bit, and a physical one."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+from scipy.special import ellipk
+
+from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+from vtbdrake.rollout import Quality, RolloutRunner, RolloutTask
+from vtbdrake.testbed import SimulatorFields
+
+THETA = "sim.sys.Pendulum.theta.position"
+DAMPING = "sim.sys.Pendulum.theta.damping"
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+CENIC = SimulatorFields(integration_scheme="cenic", accuracy=1e-4, max_step_size=0.05)
+
+
+def _angle(theta):
+    return abs(theta)
+
+
+TASKS = {
+    # Error control, and a DPS that does not sample: the steps are the integrator's own.
+    "pendulum": (RolloutTask(PendulumScenario(stiffness=2.0), 2.0, Quality(_angle, THETA)), THETA),
+    "acrobot": (RolloutTask(AcrobotScenario(), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
+    "cenic": (RolloutTask(AcrobotScenario(simulator=CENIC), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
+    "discrete": (RolloutTask(AcrobotScenario(time_step=0.005), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_used_runner_repeats_a_new_one_bit_for_bit(name):
+    task, address = TASKS[name]
+    task = RolloutTask(task.scenario, task.horizon, task.quality, keep_state=True)
+    new, used = RolloutRunner(task), RolloutRunner(task)
+    friction = next(a for a in used.testbed.variables() if a.endswith(".friction"))
+    # Rollouts that leave traces: other state, other parameters, hidden ones, and one that fails.
+    used.run({address: 2.9, friction: 0.1})
+    used.run({address: 1.0, next(a for a in used.testbed.variables() if a.endswith(".mass")): 40.0})
+    first, second = new.run({address: 0.3}), used.run({address: 0.3})
+    assert first.identical(second)
+    assert not first.identical(used.run({address: 0.3001}))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_recording_and_running_on_do_not_change_the_trajectory(name):
+    task, address = TASKS[name]
+    plain = RolloutRunner(task).run({address: 0.3})
+    recorded = RolloutRunner(RolloutTask(task.scenario, task.horizon, task.quality, record=(address, "plant.state")))
+    result = recorded.run({address: 0.3})
+    np.testing.assert_array_equal(plain.quality, result.quality)
+    np.testing.assert_array_equal(np.abs(result.record[address]), plain.quality)
+    assert result.record["plant.state"].shape[0] == plain.times.size
+
+
+def test_it_is_the_simulation_that_drake_would_do():
+    task, address = TASKS["acrobot"]
+    testbed = AcrobotScenario().build()
+    context = testbed.default_context()
+    testbed.write(context, {address: 0.3})
+    simulator = testbed.simulator(context)
+    expected = [0.3]
+    for t in task.sample_times()[1:]:
+        simulator.AdvanceTo(t)
+        expected.append(abs(testbed.read(context, address)))
+    np.testing.assert_array_equal(RolloutRunner(task).run({address: 0.3}).quality, expected)
+
+
+def test_an_undamped_pendulum_has_the_period_of_theory():
+    accurate = SimulatorFields(accuracy=1e-9, max_step_size=0.05)
+    task = RolloutTask(PendulumScenario(simulator=accurate), 4.0, sample_period=0.005, record=(THETA,))
+    runner = RolloutRunner(task)
+    testbed = runner.testbed
+    amplitude = 2.0
+    result = runner.run({THETA: amplitude, DAMPING: 0.0})
+    # Of the linearized pendulum about its rest, from the plant: I qddot = -k q.
+    context = testbed.default_context()
+    plant_context = testbed.plant.GetMyContextFromRoot(context)
+    inertia = testbed.plant.CalcMassMatrix(plant_context)[0, 0]
+    testbed.write(context, {THETA: np.pi / 2})
+    gravity = -testbed.plant.CalcGravityGeneralizedForces(plant_context)[0]
+    period = 4.0 * np.sqrt(inertia / gravity) * ellipk(np.sin(amplitude / 2) ** 2)
+    angle = result.record[THETA]
+    falling = np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
+    crossings = result.times[falling] + 0.005 * angle[falling] / (angle[falling] - angle[falling + 1])
+    assert crossings[1] - crossings[0] == pytest.approx(period, rel=1e-5)
+
+
+def test_state_at_t_star_is_the_state_at_t_star():
+    task = RolloutTask(PendulumScenario(), 2.0, Quality(lambda q: max(0.0, -q), THETA), keep_state=True)
+    runner = RolloutRunner(task)
+    result = runner.run({THETA: 1.0, DAMPING: 0.0})
+    assert 0.0 < result.t_star < 2.0
+    assert result.state.time == result.t_star
+    assert -result.state[THETA] == result.h
+    assert not runner.state({THETA: 1.0, DAMPING: 0.0}, result.t_star).compare(result.state)
+    with pytest.raises(ValueError, match="not a sample time; the nearest is 0.3 s"):
+        runner.state({THETA: 1.0}, 0.31)
+
+
+def test_a_rollout_from_a_snapshot_continues_the_original_bit_for_bit():
+    scenario = AcrobotScenario()
+    long = RolloutTask(scenario, 2.0, Quality(_angle, SHOULDER))
+    whole = RolloutRunner(long).run({SHOULDER: 0.3})
+    start = RolloutRunner(long).state({SHOULDER: 0.3}, 1.0)
+    rest = RolloutRunner(RolloutTask(scenario, 1.0, Quality(_angle, SHOULDER), start=start)).run({})
+    # Time counts from t0; at the fork both take a new integrator, so the sampled original is met to its accuracy.
+    np.testing.assert_allclose(rest.times, whole.times[20:] - 1.0, atol=1e-12)
+    np.testing.assert_allclose(rest.quality, whole.quality[20:], atol=1e-4)
+    assert rest.identical(RolloutRunner(RolloutTask(scenario, 1.0, Quality(_angle, SHOULDER), start=start)).run({}))
+
+
+class Exploding(LeafSystem):
+    """xdot = x^2 goes to infinity at t = 1 / x(0)."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("joint_state", 4)
+        self.DeclareContinuousState(1)
+        self.DeclareVectorOutputPort("torque", 1, lambda c, y: y.SetFromVector([0.0]))
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        x = context.get_continuous_state_vector()[0]
+        derivatives.get_mutable_vector().SetFromVector([x * x])
+
+
+class Raising(SampledFeedback):
+    """Raises what it is told to when the clock passes 0.5 s."""
+
+    def __init__(self, error):
+        super().__init__(0.02)
+        self._error = error
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._maybe)
+
+    def _maybe(self, context, state):
+        if context.get_time() > 0.5:
+            raise self._error
+
+
+@dataclass
+class BrokenScenario(AcrobotScenario):
+    simulator: SimulatorFields = field(
+        default_factory=lambda: SimulatorFields("explicit_euler", 0.01, use_error_control=False)
+    )
+    kind: str = "explodes"
+
+    def make_dps(self):
+        kinds = {
+            "explodes": Exploding,
+            "raises": lambda: Raising(RuntimeError("out of cheese")),
+            "exits": lambda: Raising(SystemExit("condition 'x > 0' failed")),
+        }
+        return kinds[self.kind]()
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "message"),
+    [
+        ("explodes", {"dps.continuous_state[0]": 4.0}, "not finite"),
+        ("raises", {}, "RuntimeError: out of cheese"),
+        ("exits", {}, "SystemExit: condition 'x > 0' failed"),
+    ],
+)
+def test_a_simulation_that_fails_is_an_outcome(kind, parameters, message):
+    task = RolloutTask(BrokenScenario(kind=kind), 2.0, Quality(_angle, SHOULDER))
+    runner = RolloutRunner(task)
+    result = runner.run(parameters)
+    assert result.failed
+    assert message in result.message
+    assert np.isnan(result.h)
+    assert np.isnan(result.t_star)
+    assert 0 < result.times.size < task.sample_times().size
+    # The next one is not touched by it.
+    if kind == "explodes":
+        assert runner.run({}).identical(RolloutRunner(task).run({}))
+
+
+def test_a_failed_assertion_of_drake_is_an_outcome():
+    # A mass matrix that is not positive definite.
+    task = RolloutTask(AcrobotScenario(), 0.5)
+    masses = {a: 0.0 for a in RolloutRunner(task).testbed.variables() if a.endswith(("link.mass",))}
+    result = RolloutRunner(task).run(masses)
+    assert result.failed
+    assert result.message
+
+
+def test_the_threshold_counts_although_the_simulation_fails_later():
+    task = RolloutTask(BrokenScenario(kind="raises"), 2.0, Quality(lambda t: t, "time"), threshold=0.2, run_on=True)
+    result = RolloutRunner(task).run({})
+    assert (result.end, result.t_star) == ("threshold", pytest.approx(0.25))
+    assert "out of cheese" in result.message
+
+
+class Terminating(SampledFeedback):
+    """Ends the simulation when it has had enough."""
+
+    def __init__(self):
+        super().__init__(0.02)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._enough)
+
+    def _enough(self, context, state):
+        from pydrake.systems.framework import EventStatus
+
+        return (
+            EventStatus.ReachedTermination(self, "had enough")
+            if context.get_time() > 0.5
+            else EventStatus.Succeeded()
+        )
+
+
+@dataclass
+class TerminatingScenario(AcrobotScenario):
+    def make_dps(self):
+        return Terminating()
+
+
+def test_a_system_may_end_the_rollout():
+    result = RolloutRunner(RolloutTask(TerminatingScenario(), 2.0, Quality(lambda t: t, "time"))).run({})
+    assert result.end == "terminated"
+    assert "had enough" in result.message
+    assert 0.5 < result.h < 0.7
+
+
+class SelfWilled(SampledFeedback):
+    """Sets its own gain when it is initialized."""
+
+    def __init__(self):
+        super().__init__(0.02)
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
+
+    def _initialize(self, context, state):
+        state.get_mutable_discrete_state(0).SetFromVector([7.0])
+
+
+@dataclass
+class SelfWilledScenario(AcrobotScenario):
+    def make_dps(self):
+        return SelfWilled()
+
+
+def test_what_an_initialization_event_overwrites_cannot_be_varied():
+    runner = RolloutRunner(RolloutTask(SelfWilledScenario(), 0.1, record=("dps.torque",)))
+    assert runner.run({}).record["dps.torque"][0] == 7.0
+    with pytest.raises(ValueError, match="dps.torque was set to 1.0, but an initialization event .* has made 7.0"):
+        runner.run({"dps.torque": 1.0})
+
+
+def test_hidden_variables_come_back():
+    runner = RolloutRunner(RolloutTask(AcrobotScenario(), 0.1, record=("sim.sys.Acrobot.lower_link.friction",)))
+    changed = runner.run({"sim.sys.Acrobot.lower_link.friction": 0.123})
+    assert changed.record["sim.sys.Acrobot.lower_link.friction"][-1] == pytest.approx(0.123)
+    assert runner.run({}).record["sim.sys.Acrobot.lower_link.friction"][-1] == pytest.approx(1.0)
+
+
+def test_an_unknown_address_is_an_error_before_anything_runs():
+    with pytest.raises(ValueError, match="did you mean"):
+        RolloutRunner(RolloutTask(AcrobotScenario(), 0.1, Quality(_angle, "sim.sys.Acrobot.sholder.position")))
+    with pytest.raises(ValueError, match="did you mean dps.torque"):
+        RolloutRunner(RolloutTask(AcrobotScenario(), 0.1, record=("dps.torqe",)))
