@@ -33,9 +33,9 @@ DEFAULT_FRICTION = 0.8
 
 A foot on regolith slips when the soil under it shears, so the soil's friction angle bounds it. Boulder tracks on the
 moon gave 24 to 47 deg, 37 deg on average (abstract of "Boulder tracks and nature of lunar soil", 1973, NASA NTRS
-19730039283): a coefficient of 0.45 to 1.07, 0.75 on average. Measurements of the Apollo missions are commonly summarized
-as 30 to 50 deg (see Carrier, Olhoeft, Mendell, "Physical Properties of the Lunar Surface", Lunar Sourcebook, chapter 9,
-1991), whose middle is 0.84. 0.8 lies between.
+19730039283): a coefficient of 0.45 to 1.07, 0.75 on average. Measurements of the Apollo missions are commonly
+summarized as 30 to 50 deg (see Carrier, Olhoeft, Mendell, "Physical Properties of the Lunar Surface", Lunar Sourcebook,
+chapter 9, 1991), whose middle is 0.84. 0.8 lies between.
 """
 
 

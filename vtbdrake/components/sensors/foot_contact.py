@@ -37,7 +37,7 @@ class ContactSensor(SampledSensor):
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], *, period: float, threshold: float = 1.0
     ) -> None:
         """``threshold`` is a force (N), and a parameter of the Context."""
-        super().__init__("foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", noise={}, stream=0)
+        super().__init__("foot_contact", default=np.zeros(len(bodies)), period=period, unit="1")
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Where in the list of forces a body or geometry adds to; the last place is for all that are not asked for.
         self._size = len(bodies) + 1

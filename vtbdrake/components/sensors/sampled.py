@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
 
 from vtbdrake.components.sensors.noise import normal_noise
-from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state import Element, discrete_state, parameter
 
 
 class SampledSensor(LeafSystem):
@@ -30,11 +30,12 @@ class SampledSensor(LeafSystem):
         default: ArrayLike,
         period: float,
         unit: str,
-        noise: Mapping[str, tuple[int, str]],
-        stream: int,
+        noise: Mapping[str, tuple[int, str]] | None = None,
+        stream: int = 0,
     ) -> None:
         """``noise`` names the standard deviations (all 0 by default): for how many entries of y, and their unit."""
         super().__init__()
+        noise = noise or {}
         if not period > 0:
             raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
         self._period = float(period)
@@ -42,16 +43,17 @@ class SampledSensor(LeafSystem):
         y0 = np.asarray(default, dtype=float)
         self._output = self.DeclareDiscreteState(y0)
         self.DeclareStateOutputPort(signal, self._output)
-        self._parameter = int(self.DeclareNumericParameter(BasicVector(np.zeros(1 + len(noise)))))
         self._counts = np.array([count for count, _ in noise.values()], dtype=int)
-        self.variables = (
-            discrete_state(signal, self._output, shape=y0.shape, unit=unit),
-            parameter("seed", self._parameter, start=0, bounds=(0.0, 2.0**53)),
-            *(
-                parameter(name, self._parameter, start=1 + k, unit=noise_unit, bounds=(0.0, np.inf))
-                for k, (name, (_, noise_unit)) in enumerate(noise.items())
-            ),
-        )
+        self.variables: tuple[Element, ...] = (discrete_state(signal, self._output, shape=y0.shape, unit=unit),)
+        if noise:
+            self._noise = int(self.DeclareNumericParameter(BasicVector(np.zeros(1 + len(noise)))))
+            self.variables += (
+                parameter("seed", self._noise, start=0, bounds=(0.0, 2.0**53)),
+                *(
+                    parameter(name, self._noise, start=1 + k, unit=noise_unit, bounds=(0.0, np.inf))
+                    for k, (name, (_, noise_unit)) in enumerate(noise.items())
+                ),
+            )
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
 
     @property
@@ -65,11 +67,12 @@ class SampledSensor(LeafSystem):
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)
-        seed, *stds = context.get_numeric_parameter(self._parameter).value().tolist()
-        if any(stds):
-            tick = round(context.get_time() / self._period)
-            noise = normal_noise(y.size, seed=int(seed), stream=self._stream, tick=tick)
-            y = y + np.repeat(stds, self._counts) * noise
+        if self._counts.size:
+            seed, *stds = context.get_numeric_parameter(self._noise).value().tolist()
+            if any(stds):
+                tick = round(context.get_time() / self._period)
+                noise = normal_noise(y.size, seed=int(seed), stream=self._stream, tick=tick)
+                y = y + np.repeat(stds, self._counts) * noise
         state.set_value(self._output, y)
 
 
