@@ -1,0 +1,225 @@
+"""Executors differ in nothing but time; what goes wrong in one rollout stays there."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+from vtbdrake.rollout import (
+    ProcessExecutor,
+    Quality,
+    QualityError,
+    RolloutTask,
+    SerialExecutor,
+    ThreadExecutor,
+    WorkerError,
+    choose_executor,
+    make_executor,
+)
+from vtbdrake.rollout.many import run_rollouts
+
+ROOT = Path(__file__).resolve().parents[2]
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+THETA = "sim.sys.Pendulum.theta.position"
+
+
+def _angle(theta):
+    return abs(theta)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "address"), [(PendulumScenario(stiffness=1.0), THETA), (AcrobotScenario(), SHOULDER)]
+)
+def test_all_executors_give_identical_results(scenario, address):
+    task = RolloutTask(
+        scenario, 1.0, Quality(_angle, address), threshold=2.0, record=("plant.state",), keep_state=True
+    )
+    points = [{address: value} for value in np.linspace(0.1, 2.5, 9)]
+    results = []
+    for executor in (SerialExecutor(), ThreadExecutor(2), ProcessExecutor(2)):
+        with executor:
+            results.append(run_rollouts(executor, task, points, progress=False))
+            # Used a second time, it gives the same.
+            again = run_rollouts(executor, task, points, progress=False)
+            assert all(a.identical(b) for a, b in zip(results[-1], again, strict=True))
+    serial, threads, processes = results
+    assert all(a.identical(b) and a.identical(c) for a, b, c in zip(serial, threads, processes, strict=True))
+    assert {result.end for result in serial} == {"horizon", "threshold"}
+
+
+def test_threads_suit_drakes_systems_and_processes_suit_python():
+    assert choose_executor(PendulumScenario().build()) == "threads"
+    assert choose_executor(AcrobotScenario().build()) == "processes"
+    with pytest.raises(ValueError, match="auto, serial, threads, processes, or an Executor, not 'gpu'"):
+        make_executor("gpu", testbed=PendulumScenario().build(), rollouts=3)
+    with pytest.raises(ValueError, match="at least one worker"):
+        ThreadExecutor(0)
+    with pytest.raises(ValueError, match="time limit must be positive"):
+        ProcessExecutor(1, time_limit=0.0)
+
+
+def _bad_at_half(t):
+    return -1.0 if t > 0.5 else 0.0
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+def test_an_error_in_the_quality_reaches_the_user_as_itself(make):
+    task = RolloutTask(AcrobotScenario(), 1.0, Quality(_bad_at_half, "time"))
+    with make() as executor, pytest.raises(QualityError, match="_bad_at_half at t = 0.55 s"):
+        run_rollouts(executor, task, [{}] * 4, progress=False)
+
+
+def test_what_cannot_travel_is_an_error_with_the_remedy():
+    lock = threading.Lock()
+    task = RolloutTask(AcrobotScenario(), 1.0, Quality(lambda t: float(lock.locked()), "time"))
+    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
+        run_rollouts(executor, task, [{}], progress=False)
+
+
+class Treacherous(SampledFeedback):
+    """Kills or stops its process when its gain says so, but only as long as a file is there."""
+
+    def __init__(self, fuse):
+        super().__init__(0.02)
+        self._fuse = Path(fuse)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._betray)
+
+    def _betray(self, context, state):
+        how = context.get_numeric_parameter(0).value()[0]
+        if how and self._fuse.exists():
+            if how > 0:
+                self._fuse.unlink()  # Once only: the second try works.
+            os.kill(os.getpid(), signal.SIGKILL if abs(how) == 1 else signal.SIGSTOP)
+
+
+@dataclass
+class TreacherousScenario(AcrobotScenario):
+    fuse: str = ""
+
+    def make_dps(self):
+        return Treacherous(self.fuse)
+
+
+@pytest.mark.parametrize(("how", "kind"), [(1.0, "died"), (2.0, "time limit")])
+def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp_path, caplog):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(_angle, SHOULDER))
+    points = [{SHOULDER: value, "dps.gain[0]": 0.0} for value in np.linspace(0.1, 0.8, 8)]
+    with SerialExecutor() as executor:
+        expected = run_rollouts(executor, task, points, progress=False)
+    points[3]["dps.gain[0]"] = how
+    with ProcessExecutor(2, time_limit=10.0 if how == 1.0 else 3.0) as executor:
+        results = run_rollouts(executor, task, points, progress=False)
+    assert kind in caplog.text
+    assert not any(result.failed for result in results)
+    assert all(a.identical(b) for i, (a, b) in enumerate(zip(results, expected, strict=True)) if i != 3)
+
+
+def test_a_rollout_that_kills_every_worker_fails_alone(tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(_angle, SHOULDER))
+    points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": -1.0}, {"dps.gain[0]": 0.0}]
+    with ProcessExecutor(2) as executor:
+        results = run_rollouts(executor, task, points, progress=False)
+    assert [result.failed for result in results] == [False, True, False]
+    assert results[1].message.count("died (exit code -9)") == 2
+
+
+def test_a_script_without_a_main_guard_and_with_its_own_functions_uses_processes(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent("""
+            from dataclasses import dataclass
+            from tests.testbeds import AcrobotScenario
+            from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask
+            from vtbdrake.rollout.many import run_rollouts
+
+            @dataclass
+            class Mine(AcrobotScenario):
+                period: float = 0.04
+
+            def f(theta):
+                return theta ** 2
+
+            task = RolloutTask(Mine(), 0.5, Quality(f, "sim.sys.Acrobot.shoulder.position"))
+            with ProcessExecutor(2) as executor:
+                points = [{"sim.sys.Acrobot.shoulder.position": x} for x in (0.5, 1.0)]
+                print([r.quality[0] for r in run_rollouts(executor, task, points)])
+        """)
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert eval(done.stdout.replace("np.float64", "")) == [0.25, 1.0]
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
+def test_ctrl_c_keeps_what_is_finished(executor, tmp_path):
+    """A real SIGINT to a whole group of processes, as a terminal sends it."""
+    script = tmp_path / "sweep.py"
+    script.write_text(
+        textwrap.dedent(f"""
+            import logging
+            from tests.testbeds import AcrobotScenario
+            import vtbdrake as vtb
+            from vtbdrake.rollout import make_executor
+
+            logging.basicConfig()
+            shoulder = "sim.sys.Acrobot.shoulder.position"
+            problem = vtb.Problem(
+                scenario=AcrobotScenario(),
+                parameters=[vtb.Parameter(shoulder, 0.0, 1.0)],
+                quality=vtb.Quality(abs, shoulder),
+                horizon=5.0,
+            )
+
+            class Telling:
+                def __init__(self, inner):
+                    self.inner = inner
+                def run(self, task, points):
+                    for i, item in enumerate(self.inner.run(task, points)):
+                        print("finished", i, flush=True)
+                        yield item
+
+            from vtbdrake.rollout import Executor
+            Executor.register(Telling)
+            inner = make_executor({executor!r}, testbed=problem.testbed, rollouts=1000, workers=2)
+            sweep = problem.sweep(points=1000, executor=Telling(inner))
+            inner.close()
+            print("kept", len(sweep), sweep.complete, sweep.h[0] >= 0.0, flush=True)
+        """)
+    )
+    with subprocess.Popen(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        for _ in range(4):
+            assert process.stdout.readline().startswith("finished")
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    kept, count, complete, positive = out.splitlines()[-1].split()
+    assert (kept, complete, positive) == ("kept", "False", "True")
+    # The fourth may have been on its way from the executor to the sweep.
+    assert 3 <= int(count) < 1000
+    assert "interrupted" in err
