@@ -1,0 +1,126 @@
+"""Everything that a user can get wrong is one line on stderr, and an exit code."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE
+from vtbdrake.cli import main
+
+VARY = ["--vary", f"{ANGLE}=0:1:2", "--horizon", "1"]
+SWEEP = ["sweep", PENDULUM, *VARY, "--quality", RATE]
+ROLLOUT = ["rollout", ACROBOT, "--horizon", "0.1"]
+BOUNDARY = ["boundary", PENDULUM, "--vary", f"{ANGLE}=0:1", "--horizon", "1", "--quality", RATE, "--threshold", "1"]
+
+
+def negative(_: float) -> float:
+    """No quality."""
+    return -1.0
+
+
+def error_of(arguments: list[str], code: int = 2) -> str:
+    result = CliRunner().invoke(main, arguments, prog_name="vtbdrake")
+    assert result.exit_code == code, result.output
+    assert result.stderr.startswith("Error: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["variables", "nowhere.at_all:Scenario"], "cannot import nowhere.at_all"),
+        (["variables", "tests.testbeds:Pendulum"], "it has: PendulumScenario"),
+        (["variables", "tests.testbeds"], "package.module:Class"),
+        (["variables", "none.yaml"], "no scenario file none.yaml"),
+        (["variables", PENDULUM, "--match", "thetta"], "no address contains 'thetta'"),
+        (["variable", PENDULUM], "No such command 'variable'"),
+        ([*ROLLOUT, "--set", "dps.gian=1"], "did you mean dps.gain"),
+        ([*ROLLOUT, "--set", "dps.gain=[1,2]"], "has shape (4,)"),
+        ([*ROLLOUT, "--set", "dps.gain=[1,2,3,NaN]"], "must be finite"),
+        ([*ROLLOUT, "--set", "dps.gain=stiff"], "a number or a JSON list of numbers, not 'stiff'"),
+        ([*ROLLOUT, "--set", "dps.ticks=true"], "a number or a JSON list of numbers, not 'true'"),
+        ([*ROLLOUT, "--set", "dps.gain"], "ADDRESS=VALUE, not 'dps.gain'"),
+        ([*ROLLOUT, "--set", "dps.ticks=1", "--set", "dps.ticks=2"], "dps.ticks is set twice"),
+        ([*ROLLOUT, "--set", "time=1"], "derived"),
+        ([*ROLLOUT, "--set", "sim.sys.Acrobot.upper_link.mass=-1"], "must lie in [0, inf] kg"),
+        ([*ROLLOUT, "--record", "dps.torqe"], "did you mean dps.torque"),
+        ([*ROLLOUT, "--record", "plant.body_poses", "--save", "a.csv"], "plant.body_poses is not numeric"),
+        ([*ROLLOUT, "--save", "a.csv"], "nothing is recorded"),
+        ([*ROLLOUT, "--record", "dps.torque", "--save", "a.txt"], ".csv or .npz"),
+        ([*ROLLOUT, "--snapshot", "no/such/folder/s"], "a folder that does not exist"),
+        ([*ROLLOUT, "--snapshot", "."], "is a folder"),
+        ([*ROLLOUT, "--start", "none.vtb"], "none.vtb: No such file"),
+        ([*ROLLOUT, "--sample-period", "1"], "at most the horizon"),
+        (["rollout", ACROBOT, "--horizon", "-1"], "the horizon t_m must be positive"),
+        (["rollout", ACROBOT], "Missing option '--horizon'"),
+        (["rollout", "--horizon", "1"], "Missing argument 'SCENARIO'"),
+        ([*SWEEP, "--threshold", "-1"], "must not be negative"),
+        ([*SWEEP, "--executor", "cluster"], "'auto', 'serial', 'threads', 'processes'"),
+        ([*SWEEP, "--executor", "serial", "--workers", "2"], "--workers has no meaning"),
+        ([*SWEEP, "--workers", "0"], "x>=1"),
+        ([*SWEEP, "--of", RATE], "--of belongs to a quality module:function"),
+        ([*SWEEP, "--vary", f"{ANGLE}=0:2:2"], "a parameter is given twice"),
+        ([*SWEEP, "--set", f"{ANGLE}=1"], "no condition can set it"),
+        ([*SWEEP, "--condition", f"{RATE}=1;{RATE}=2"], "is set twice"),
+        ([*SWEEP, "--set", f"{RATE}=1", "--condition", f"{RATE}=2"], "is set twice"),
+        ([*SWEEP, "--plot", "a.txt"], ".png or .svg or .pdf"),
+        (["sweep", PENDULUM, *VARY, "--quality", "math:hypo", "--of", RATE], "math has no function 'hypo'"),
+        (["sweep", PENDULUM, *VARY, "--quality", "nowhere:f", "--of", RATE], "cannot import nowhere"),
+        (["sweep", PENDULUM, *VARY, "--quality", "math:hypot"], "say with --of ADDRESS"),
+        (["sweep", PENDULUM, *VARY, "--quality", "sim.sys.Pendulum.theta.velocty"], "did you mean"),
+        (["sweep", PENDULUM, *VARY, "--quality", f"{__name__}:negative", "--of", RATE], "finite and not negative"),
+        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1"], "LOWER:UPPER:POINTS"),
+        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=a:1:2"], "in numbers"),
+        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=1:0:2"], "lower < upper"),
+        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1:1"], "at least two points"),
+        ([*BOUNDARY, "--resolution", "0.5", "--coarse", "0.1"], "0 < resolution <= coarse"),
+        ([*BOUNDARY, "--resolution", "0.5"], "Missing option '--coarse'"),
+        (["diagram", PENDULUM, "--mode", "dream"], "'sim', 'shadow', 'real', 'twin'"),
+        (["diagram", PENDULUM, "--format", "png"], "'mermaid', 'svg'"),
+    ],
+)
+def test_bad_input(arguments: list[str], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert expected in error_of(arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:
+    path = tmp_path / "typo.yaml"
+    path.write_text(f"{PENDULUM}:\n  stiffnes: 3.0\n")
+    assert "stiffnes" in error_of(["variables", str(path)])
+
+
+def test_snapshot_of_another_scenario(tmp_path: Path) -> None:
+    path = str(tmp_path / "s")
+    assert CliRunner().invoke(main, [*ROLLOUT, "--snapshot", path]).exit_code == 0
+    assert "of another scenario" in error_of(["rollout", PENDULUM, "--horizon", "1", "--start", path])
+
+
+def test_damaged_snapshot(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    path.write_bytes(b"PK\x03\x04 and no more")
+    assert "damaged" in error_of([*ROLLOUT, "--start", str(path)])
+
+
+def test_sweep_without_a_success_has_exit_code_1() -> None:
+    vary = ["--vary", "sim.sys.Acrobot.elbow.position=0:1:2", "--set", "sim.sys.Acrobot.lower_link.mass=0"]
+    error = error_of(["sweep", ACROBOT, *vary, "--quality", "dps.torque", "--horizon", "1"], code=1)
+    assert "all 2 rollouts failed; the first: RuntimeError: An internal mass matrix" in error
+
+
+def test_failures_are_listed_below_the_table_once() -> None:
+    vary = ["--vary", "sim.sys.Acrobot.lower_link.mass=0:1:2", "--quality", "dps.torque", "--horizon", "0.1"]
+    result = CliRunner().invoke(main, ["sweep", ACROBOT, *vary])
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert [line.split()[-1] for line in lines[2:4]] == ["failed", "horizon"]
+    assert lines[4].startswith("failed (1): RuntimeError: An internal mass matrix")
+    assert lines[-1] == "best: h = 0 at sim.sys.Acrobot.lower_link.mass = 1"
+
+
+def test_traceback_on_request() -> None:
+    result = CliRunner().invoke(main, ["--traceback", "variables", "none.yaml"])
+    assert type(result.exception).__name__ == "ScenarioError"

@@ -1,0 +1,79 @@
+"""The program's frame: the group of commands, and what becomes of errors."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Any
+
+import click
+
+from vtbdrake.rollout import WorkerError
+
+BAD_INPUT = 2
+FAILED = 1
+
+# What vtbdrake raises about what it was given: all its own errors about input are ValueErrors. An extra that is not
+# installed is a ModuleNotFoundError that names it.
+EXPECTED = (ValueError, OSError, ModuleNotFoundError)
+
+
+class BadInputError(click.ClickException):
+    """The program was given something that it cannot use."""
+
+    exit_code = BAD_INPUT
+
+
+class FailedError(click.ClickException):
+    """What was asked for was tried, and failed."""
+
+    exit_code = FAILED
+
+
+class Commands(click.Group):
+    """A group that reports every expected error as one line ``Error: ...``; see `BAD_INPUT` and `FAILED`."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except click.UsageError as error:
+            path = error.ctx.command_path if error.ctx is not None else ctx.command_path
+            raise BadInputError(one_line(f"{error.format_message()} ('{path} --help' shows an example)")) from error
+        except WorkerError as error:
+            _reraise_if_asked(ctx)
+            raise FailedError(one_line(error)) from error
+        except EXPECTED as error:
+            _reraise_if_asked(ctx)
+            raise BadInputError(one_line(error)) from error
+
+
+def one_line(error: object) -> str:
+    """The text of an error, without its line breaks."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _reraise_if_asked(ctx: click.Context) -> None:
+    if ctx.params["traceback"]:
+        raise
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--traceback", is_flag=True, help="Show where in the code an error comes from.")
+@click.version_option(package_name="vtbdrake")
+def main(traceback: bool) -> None:
+    """Virtual testbeds on Drake: look at one, simulate it, ask it questions.
+
+    A SCENARIO is package.module:Class, found from the current directory, or a YAML file that names one.
+
+    \b
+    Example:
+      vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match mass
+    """
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    # As `python -m` does, and the installed program does not.
+    here = os.getcwd()
+    if here not in sys.path and "" not in sys.path:
+        sys.path.insert(0, here)

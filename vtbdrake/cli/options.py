@@ -1,0 +1,126 @@
+"""What the commands take: scenarios, settings, ranges and files, checked before anything long begins."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from vtbdrake.optimization import Parameter
+from vtbdrake.state import Snapshot
+from vtbdrake.testbed import load_scenario
+
+# (address, value)
+Setting = tuple[str, float | list[Any]]
+
+
+def converted(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """A callback that makes of the text of an option, or of each of its texts, what the command takes."""
+
+    def convert(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        if ctx.resilient_parsing or value is None:
+            return None
+        return tuple(parse(text) for text in value) if isinstance(value, tuple) else parse(value)
+
+    return convert
+
+
+def parse_setting(text: str) -> Setting:
+    """``ADDRESS=VALUE``, the value a number or a JSON list of numbers."""
+    address, equals, value = (part.strip() for part in text.partition("="))
+    if not (address and equals and value):
+        raise click.BadParameter(f"it takes ADDRESS=VALUE, not {text!r}")
+    try:
+        number = json.loads(value)
+    except json.JSONDecodeError:
+        number = None
+    if isinstance(number, bool) or not isinstance(number, int | float | list):
+        raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
+    return address, number
+
+
+def parse_condition(text: str) -> dict[str, Any]:
+    """Settings that hold together: ``ADDRESS=VALUE[;ADDRESS=VALUE...]``."""
+    return settings(parse_setting(part) for part in text.split(";"))
+
+
+def parse_range(text: str) -> Parameter:
+    """``ADDRESS=LOWER:UPPER``."""
+    (lower, upper), address = _numbers(text, (float, float), "ADDRESS=LOWER:UPPER")
+    return Parameter(address, lower, upper)
+
+
+def parse_grid(text: str) -> tuple[Parameter, int]:
+    """``ADDRESS=LOWER:UPPER:POINTS``."""
+    (lower, upper, points), address = _numbers(text, (float, float, int), "ADDRESS=LOWER:UPPER:POINTS")
+    return Parameter(address, lower, upper), points
+
+
+def _numbers(text: str, kinds: Sequence[Callable[[str], Any]], form: str) -> tuple[list[Any], str]:
+    address, _, values = text.rpartition("=")
+    parts = values.split(":")
+    if not address.strip() or len(parts) != len(kinds):
+        raise click.BadParameter(f"it takes {form}, not {text!r}")
+    try:
+        return [kind(part) for kind, part in zip(kinds, parts, strict=True)], address.strip()
+    except ValueError as error:
+        raise click.BadParameter(f"it takes {form} in numbers, not {text!r}: {error}") from error
+
+
+def output(*suffixes: str) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """A callback that checks a file to be written: its folder exists, and its name ends as one of ``suffixes``."""
+
+    def parse(text: str) -> Path:
+        path = Path(text)
+        if suffixes and path.suffix not in suffixes:
+            raise click.BadParameter(f"the name of the file ends in {' or '.join(suffixes)}, unlike {text!r}")
+        if path.is_dir():
+            raise click.BadParameter(f"{path} is a folder")
+        if not path.parent.is_dir():
+            raise click.BadParameter(f"{path} lies in a folder that does not exist")
+        return path
+
+    return converted(parse)
+
+
+scenario_argument = click.argument("scenario", callback=converted(load_scenario))
+set_option = click.option(
+    "--set",
+    "values",
+    callback=converted(parse_setting),
+    multiple=True,
+    metavar="ADDRESS=VALUE",
+    help="Set a variable in s0: a number, or a JSON list. May be repeated.",
+)
+horizon_option = click.option("--horizon", type=float, required=True, metavar="S", help="t_m, in seconds.")
+sample_period_option = click.option(
+    "--sample-period",
+    type=float,
+    default=0.05,
+    show_default=True,
+    metavar="S",
+    help="Time between two samples, in seconds.",
+)
+start_option = click.option(
+    "--start",
+    callback=converted(Snapshot.load),
+    metavar="SNAPSHOT",
+    help="Take s0 from this file instead of the defaults.",
+)
+
+
+def settings(pairs: Iterable[Setting]) -> dict[str, Any]:
+    """Address -> value.
+
+    Raises:
+        click.UsageError: an address is set twice.
+    """
+    values: dict[str, Any] = {}
+    for address, value in pairs:
+        if address in values:
+            raise click.UsageError(f"{address} is set twice")
+        values[address] = value
+    return values
