@@ -39,9 +39,7 @@ def _angle(theta):
     ("scenario", "address"), [(PendulumScenario(stiffness=1.0), THETA), (AcrobotScenario(), SHOULDER)]
 )
 def test_all_executors_give_identical_results(scenario, address):
-    task = RolloutTask(
-        scenario, 1.0, Quality(_angle, address), threshold=2.0, record=("plant.state",), keep_state=True
-    )
+    task = RolloutTask(scenario, 1.0, Quality(_angle, address), threshold=2.0, record=("plant.state",), keep_state=True)
     points = [{address: value} for value in np.linspace(0.1, 2.5, 9)]
     results = []
     for executor in (SerialExecutor(), ThreadExecutor(2), ProcessExecutor(2)):

@@ -204,9 +204,7 @@ class Terminating(SampledFeedback):
         from pydrake.systems.framework import EventStatus
 
         return (
-            EventStatus.ReachedTermination(self, "had enough")
-            if context.get_time() > 0.5
-            else EventStatus.Succeeded()
+            EventStatus.ReachedTermination(self, "had enough") if context.get_time() > 0.5 else EventStatus.Succeeded()
         )
 
 

@@ -93,7 +93,9 @@ def test_a_world_that_does_not_fit_is_refused(parts, message):
 def test_an_abstract_signal_of_another_type_is_refused():
     builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=RigidTransform())], []))
     source = builder.add("sense", "seen", ConstantValueSource(Value("a pose")))
-    with pytest.raises(SignalError, match="seen carries a RigidTransform, but the port y0 of sim.sense.seen carries a str"):
+    with pytest.raises(
+        SignalError, match="seen carries a RigidTransform, but the port y0 of sim.sense.seen carries a str"
+    ):
         builder.sim_sensor("seen", source.get_output_port())
 
 

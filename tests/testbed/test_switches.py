@@ -53,7 +53,9 @@ class PoseCounter(LeafSystem):
     def _update(self, context, discrete):
         memory = context.get_discrete_state(0).value()
         pose, distance = self._pose.Eval(context), self._range.Eval(context)
-        discrete.set_value(0, 0.7 * memory + pose.translation() * distance[0] + pose.rotation().matrix()[0] * distance[1])
+        discrete.set_value(
+            0, 0.7 * memory + pose.translation() * distance[0] + pose.rotation().matrix()[0] * distance[1]
+        )
 
     def _look(self, context, output):
         output.set_value(self._pose.Eval(context).inverse() @ RigidTransform(context.get_discrete_state(0).value()))
@@ -118,7 +120,10 @@ finite = st.floats(-10.0, 10.0)
 def test_any_linear_dps_gives_identical_bytes_from_either_side(data, discrete):
     matrix = st.lists(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=2), min_size=2, max_size=2).map(np.array)
     A, B, C, D = (data.draw(matrix) for _ in range(4))
-    samples = [{"y": np.array(v)} for v in data.draw(st.lists(st.lists(finite, min_size=2, max_size=2), min_size=2, max_size=6))]
+    samples = [
+        {"y": np.array(v)}
+        for v in data.draw(st.lists(st.lists(finite, min_size=2, max_size=2), min_size=2, max_size=6))
+    ]
 
     def dps():
         builder = DiagramBuilder()
@@ -134,9 +139,7 @@ def test_any_linear_dps_gives_identical_bytes_from_either_side(data, discrete):
 @settings(max_examples=15, deadline=None)
 @given(poses=st.lists(st.lists(finite, min_size=8, max_size=8), min_size=2, max_size=5))
 def test_abstract_signals_give_identical_bytes_from_either_side(poses):
-    samples = [
-        {"pose": RigidTransform(RollPitchYaw(v[:3]), v[3:6]), "range": np.array(v[6:])} for v in poses
-    ]
+    samples = [{"pose": RigidTransform(RollPitchYaw(v[:3]), v[3:6]), "range": np.array(v[6:])} for v in poses]
     sense = [Signal("pose", model_value=RigidTransform()), Signal("range", size=2)]
     act = [Signal("look", model_value=RigidTransform(), idle=RigidTransform()), Signal("speed", size=3, idle=0.0)]
     assert _record(PoseCounter, sense, act, samples, "sim") == _record(PoseCounter, sense, act, samples, "real")

@@ -36,7 +36,7 @@ class Boundary:
     unit: str
     lower: float
     upper: float
-    by_condition: np.ndarray
+    by_condition: np.ndarray = field(compare=False)
     safe_beyond: tuple[float, ...] = ()
     undecided: tuple[float, ...] = ()
     sweep: Sweep | None = field(default=None, repr=False, compare=False)
@@ -82,14 +82,14 @@ def boundary_of(sweep: Sweep) -> Boundary:
 
 
 class Refinement:
-    """Which values to examine: a coarse grid, then every fine value below each condition's first failure.
+    """Which values to examine: a coarse grid, then every fine value around each condition's first failure.
 
-    Near the boundary the outcome is not monotonic in the parameter, so that bisection can be fooled. Here, below the
-    first failure found, every value of the fine grid is examined over ``margin`` coarse steps; a failure found there
-    moves the margin down with it, until there is none.
+    Near the boundary the outcome is not monotonic in the parameter, so that bisection can be fooled. Here every value
+    of the fine grid is examined in the coarse cell that ends in the first failure or contains it, and in the cell
+    below; a failure found there moves both down with it, until there is none.
     """
 
-    def __init__(self, lower: float, upper: float, *, resolution: float, coarse: float, margin: int = 2) -> None:
+    def __init__(self, lower: float, upper: float, *, resolution: float, coarse: float) -> None:
         if not 0.0 < resolution <= coarse <= upper - lower:
             raise ValueError(
                 f"it takes 0 < resolution <= coarse <= {upper - lower:g}, the width of the range, not a resolution of "
@@ -99,7 +99,6 @@ class Refinement:
         self._count = int(np.ceil((upper - lower) / resolution - 1e-9))
         self._resolution = resolution
         self._coarse = max(1, round(coarse / resolution))
-        self._margin = margin * self._coarse
 
     def value(self, index: int) -> float:
         """The fine grid's value ``index``; its last is the end of the range."""
@@ -115,7 +114,8 @@ class Refinement:
         if not failures:
             return []
         first = min(failures)
-        return [index for index in range(max(0, first - self._margin), first) if index not in examined]
+        cell = (first - 1) // self._coarse * self._coarse
+        return [index for index in range(max(0, cell - self._coarse), first) if index not in examined]
 
 
 def find_boundary(

@@ -1,0 +1,183 @@
+"""Problem (18) on pendulums whose answer is known from their energy."""
+
+from math import inf
+
+import numpy as np
+import pytest
+
+import vtbdrake as vtb
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.state import ArchiveError
+
+THETA = "sim.sys.Pendulum.theta.position"
+OMEGA = "sim.sys.Pendulum.theta.velocity"
+DAMPING = "sim.sys.Pendulum.theta.damping"
+
+
+def _angle(theta):
+    return abs(theta)
+
+
+def _problem(**changes):
+    arguments = dict(
+        scenario=PendulumScenario(simulator=vtb.SimulatorFields(accuracy=1e-6, max_step_size=0.05)),
+        parameters=[vtb.Parameter(OMEGA, 0.0, 8.0)],
+        quality=vtb.Quality(_angle, THETA),
+        horizon=3.0,
+        threshold=1.0,
+        sample_period=0.005,
+        conditions=[{DAMPING: 0.0}],
+    )
+    return vtb.Problem(**{**arguments, **changes})
+
+
+def _speed_to_reach(angle):
+    """From conservation of energy, with inertia and gravity torque read from the plant."""
+    testbed = PendulumScenario().build()
+    context = testbed.default_context()
+    plant_context = testbed.plant.GetMyContextFromRoot(context)
+    inertia = testbed.plant.CalcMassMatrix(plant_context)[0, 0]
+    rest = testbed.plant.CalcPotentialEnergy(plant_context)
+    testbed.write(context, {THETA: angle})
+    return np.sqrt(2.0 * (testbed.plant.CalcPotentialEnergy(plant_context) - rest) / inertia)
+
+
+def test_boundary_of_a_swing_is_that_of_its_energy():
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 0.0, THETA: 0.2}])
+    boundary = problem.boundary(resolution=0.05, coarse=1.0, executor="threads", progress=False)
+    assert boundary.by_condition[0, 0] <= _speed_to_reach(1.0) <= boundary.by_condition[0, 1]
+    # Starting at 0.2 rad, the energy to get there need not be given.
+    less = np.sqrt(_speed_to_reach(1.0) ** 2 - _speed_to_reach(0.2) ** 2)
+    assert boundary.by_condition[1, 0] <= less <= boundary.by_condition[1, 1]
+    assert (boundary.lower, boundary.upper) == tuple(boundary.by_condition[1])
+    # Few rollouts: the coarse grid and two refined cells for each condition.
+    assert len(boundary.sweep) <= 2 * (9 + 2 * 19)
+
+
+def test_sweep_finds_the_best_point_and_stops_where_the_threshold_is_exceeded():
+    sweep = _problem().sweep(points=9, executor="serial", progress=False)
+    speeds = sweep.points[:, 0]
+    np.testing.assert_array_equal(speeds, np.arange(9.0))
+    reached = speeds > _speed_to_reach(1.0)
+    np.testing.assert_array_equal(sweep.exceeded, reached)
+    assert (sweep.t_star[reached] < 3.0).all()
+    # Below the threshold, h is the amplitude.
+    for speed, h in zip(speeds[~reached], sweep.h[~reached], strict=True):
+        assert _speed_to_reach(h) == pytest.approx(speed, rel=2e-4, abs=1e-6)
+    point, best = sweep.best()
+    assert best == sweep.h.max()
+    assert point == {OMEGA: speeds[int(np.argmax(sweep.h))]}
+
+
+def test_two_parameters_make_a_grid():
+    problem = _problem(
+        parameters=[vtb.Parameter(OMEGA, 0.0, 2.0), vtb.Parameter(THETA, 0.0, 0.5)], threshold=inf, horizon=2.0
+    )
+    sweep = problem.sweep(points=(3, 2), executor="serial", progress=False)
+    np.testing.assert_array_equal(sweep.points, [[0, 0], [0, 0.5], [1, 0], [1, 0.5], [2, 0], [2, 0.5]])
+    # h is the amplitude: energies add up.
+    for (omega, theta), h in zip(sweep.points, sweep.h, strict=True):
+        expected = np.sqrt(omega**2 + _speed_to_reach(theta) ** 2)
+        assert _speed_to_reach(h) == pytest.approx(expected, rel=2e-3, abs=1e-6)
+    assert sweep.best()[0] == {OMEGA: 2.0, THETA: 0.5}
+
+
+def test_the_worst_condition_counts_for_the_best_point():
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}], threshold=inf)
+    sweep = problem.sweep(values=[1.0, 2.0], executor="serial", progress=False)
+    assert sweep.condition.tolist() == [0, 1, 0, 1]
+    assert sweep.best()[1] == sweep.h[3] < sweep.h[2]
+
+
+def test_a_sweep_survives_its_file(tmp_path):
+    sweep = _problem().sweep(points=3, executor="serial", record=[THETA, "plant.state"], progress=False)
+    sweep.save(tmp_path / "sweep.vtb")
+    loaded = vtb.Sweep.load(tmp_path / "sweep.vtb")
+    assert all(a.identical(b) for a, b in zip(sweep.rollouts, loaded.rollouts, strict=True))
+    assert loaded.boundary() == sweep.boundary()
+    assert loaded.parameters == sweep.parameters
+    assert loaded.scenario == sweep.scenario
+    (tmp_path / "half.vtb").write_bytes((tmp_path / "sweep.vtb").read_bytes()[:1000])
+    with pytest.raises(ArchiveError, match="damaged"):
+        vtb.Sweep.load(tmp_path / "half.vtb")
+
+
+def test_a_sweep_is_a_table():
+    sweep = _problem(conditions=[{}, {THETA: 0.1}]).sweep(points=2, executor="serial", progress=False)
+    frame = sweep.to_dataframe()
+    assert list(frame.columns) == [OMEGA, "condition", "h", "t_star", "end", "message", "wall_time"]
+    np.testing.assert_array_equal(frame["h"], sweep.h)
+    assert frame[OMEGA].tolist() == [0.0, 0.0, 8.0, 8.0]
+
+
+def test_a_single_rollout_has_its_state_at_t_star():
+    rollout = _problem().rollout([5.0])
+    assert rollout.end == "threshold"
+    assert rollout.state.time == rollout.t_star
+    assert abs(rollout.state[THETA]) == rollout.h > 1.0
+    by_address = _problem().rollout({OMEGA: 5.0})
+    assert by_address.identical(rollout)
+    assert _problem().rollout([5.0], run_on=True).exceedances[0] == rollout.t_star
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1.0, 1.0), (2.0, 1.0), (0.0, inf), (float("nan"), 1.0)])
+def test_a_range_that_is_empty_or_reversed_is_refused(lower, upper):
+    with pytest.raises(ValueError, match="must be finite and not empty"):
+        vtb.Parameter(OMEGA, lower, upper)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"parameters": [vtb.Parameter("sim.sys.Pendulum.arm.mas", 0.0, 1.0)]},
+            "did you mean sim.sys.Pendulum.arm.mass",
+        ),
+        ({"parameters": [vtb.Parameter(DAMPING, -1.0, 1.0)]}, r"exceeds its bounds \[0, inf\] N m s/rad"),
+        ({"parameters": [vtb.Parameter("time", 0.0, 1.0)]}, "is derived"),
+        ({"parameters": [vtb.Parameter("sim.sys.Pendulum.arm.inertia", 0.0, 1.0)]}, "inertia.0., say"),
+        ({"parameters": [vtb.Parameter(OMEGA, 0.0, 1.0)] * 2}, "given twice"),
+        ({"conditions": []}, "at least one condition"),
+        ({"conditions": [{OMEGA: 1.0}]}, "no condition can set it"),
+        ({"conditions": [{DAMPING: -1.0}]}, "must lie in"),
+        ({"quality": vtb.Quality(_angle, "sim.sys.Pendulum.thta.position")}, "did you mean"),
+        ({"horizon": -1.0}, "horizon t_m must be positive"),
+    ],
+)
+def test_a_problem_that_makes_no_sense_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _problem(**changes)
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda p: p.rollout([9.0]), r"lies outside its range \[0, 8\]"),
+        (lambda p: p.rollout([1.0, 2.0]), r"has 1 entries, but the one given has shape \(2,\)"),
+        (lambda p: p.rollout({THETA: 1.0}), "wrong about"),
+        (lambda p: p.sweep(), "either the number of points"),
+        (lambda p: p.sweep(points=1), "at least two points"),
+        (lambda p: p.sweep(points=3, executor="gpu"), "not 'gpu'"),
+        (lambda p: p.boundary(resolution=2.0, coarse=1.0), "0 < resolution <= coarse"),
+        (lambda p: _problem(threshold=inf).boundary(resolution=1.0, coarse=1.0), "finite threshold"),
+        (lambda p: _problem(parameters=[]).sweep(points=3), "one or two parameters, not 0"),
+    ],
+)
+def test_a_question_that_makes_no_sense_is_refused(ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask(_problem())
+
+
+def test_a_sweep_of_failures_has_no_best_point():
+    scenario = AcrobotScenario(simulator=vtb.SimulatorFields("explicit_euler", 0.05, use_error_control=False))
+    problem = vtb.Problem(
+        scenario=scenario,
+        parameters=[vtb.Parameter("dps.gain[2]", 100.0, 1000.0)],
+        quality=vtb.Quality(_angle, "sim.sys.Acrobot.elbow.position"),
+        horizon=20.0,
+        conditions=[{"sim.sys.Acrobot.shoulder.position": 1.0}],
+    )
+    sweep = problem.sweep(points=2, executor="serial", progress=False)
+    assert sweep.failed.all()
+    with pytest.raises(ValueError, match="no point .* the first failure: "):
+        sweep.best()
