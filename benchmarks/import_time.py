@@ -1,0 +1,56 @@
+"""What ``import vtbdrake`` costs."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+from benchmarks.measure import LOWER, Benchmark, interleaved_values, ratio, spread
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Timed inside a new interpreter, so that its own start does not count.
+_PROGRAM = "import time; begin = time.perf_counter(); {}; print(time.perf_counter() - begin)"
+
+# What a user of vtbdrake gets, whether it is loaded on import or when it is first asked for.
+EVERYTHING = "from vtbdrake import *"
+
+
+def import_time(repeats: int = 9) -> list[Benchmark]:
+    """``import vtbdrake`` against ``import pydrake``; and, printed only, all public names against the parts of pydrake
+    that they stand on, and against ``import pydrake.all``."""
+    parts = f"import {', '.join(pydrake_modules())}"
+    comparisons = {
+        "import_time": ("import vtbdrake", "import pydrake", 1.2),
+        "import_time_names": (EVERYTHING, parts, None),
+        "import_time_all": (EVERYTHING, "import pydrake.all", None),
+    }
+    rows = []
+    for name, (ours, theirs, goal) in comparisons.items():
+        a, b = interleaved_values(partial(timed, ours), partial(timed, theirs), repeats=repeats)
+        against = theirs if theirs != parts else "import of the modules of pydrake that vtbdrake loads"
+        note = f"{ours}: {spread(a)}; {against}: {spread(b)}"
+        rows.append(
+            Benchmark(name=name, value=ratio(a, b), unit="1", goal=goal, better=LOWER, against=against, note=note)
+        )
+    return rows
+
+
+def timed(statement: str) -> float:
+    """Seconds that ``statement`` takes in a new interpreter."""
+    return float(_run(_PROGRAM.format(statement)))
+
+
+def pydrake_modules() -> list[str]:
+    """The modules of pydrake that are loaded with all public names of vtbdrake."""
+    found = _run(f"{EVERYTHING}; import sys; print(sorted(m for m in sys.modules if m.split('.')[0] == 'pydrake'))")
+    modules: list[str] = ast.literal_eval(found)
+    return [module for module in modules if not any(part.startswith("_") for part in module.split("."))]
+
+
+def _run(program: str) -> str:
+    # Run from the checkout's folder, `import vtbdrake` finds it before an installed one.
+    return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True).stdout

@@ -1,0 +1,99 @@
+"""How speed is measured: what is compared runs in turns, in one run, and medians are compared."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+HIGHER, LOWER = "higher", "lower"
+_MEETS: dict[str, Callable[[float, float], bool]] = {
+    HIGHER: lambda v, goal: v >= goal,
+    LOWER: lambda v, goal: v <= goal,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """One measured number.
+
+    Attributes:
+        name: of the row.
+        value: measured; infinite where a target was not reached.
+        unit: SI, or ``"1"`` for a ratio.
+        goal: None if the number is only printed.
+        better: ``"higher"`` or ``"lower"``.
+        against: what it was measured beside, in the same run.
+        holds: whether the goal is reached; left out, ``value`` against ``goal`` (equal is good enough).
+        note: spread, conditions, or what else belongs to the number.
+
+    Raises:
+        ValueError: ``better`` is neither.
+    """
+
+    name: str
+    value: float
+    unit: str
+    goal: float | None
+    better: str
+    against: str
+    holds: bool | None = None
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if self.better not in _MEETS:
+            raise ValueError(f"{self.name}: better is one of {', '.join(_MEETS)}, not {self.better!r}")
+        if self.holds is None and self.goal is not None:
+            object.__setattr__(self, "holds", bool(_MEETS[self.better](self.value, self.goal)))
+
+
+def interleaved(
+    a: Callable[[], Any], b: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Wall times of ``a`` and ``b`` in seconds, each of shape (repeats,).
+
+    They run in turns, a b, b a, a b, ..., so that what else the machine does meets both alike.
+
+    Args:
+        warm_up: runs of each that are not counted.
+
+    Raises:
+        ValueError: there are no repeats.
+    """
+    return interleaved_values(lambda: seconds(a), lambda: seconds(b), repeats=repeats, warm_up=warm_up)
+
+
+def interleaved_values(
+    a: Callable[[], float], b: Callable[[], float], *, repeats: int = 5, warm_up: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `interleaved`, of functions that measure themselves and return the number."""
+    if repeats < 1:
+        raise ValueError(f"it takes at least one repeat, not {repeats}")
+    for _ in range(warm_up):
+        a()
+        b()
+    values: dict[int, list[float]] = {0: [], 1: []}
+    for i in range(repeats):
+        for which in ((0, 1), (1, 0))[i % 2]:
+            values[which].append((a, b)[which]())
+    return np.array(values[0]), np.array(values[1])
+
+
+def seconds(function: Callable[[], Any]) -> float:
+    """Wall time of one call, in seconds."""
+    begin = time.perf_counter()
+    function()
+    return time.perf_counter() - begin
+
+
+def ratio(of: np.ndarray, to: np.ndarray) -> float:
+    """The median of one over the median of the other."""
+    return float(np.median(of) / np.median(to))
+
+
+def spread(values: np.ndarray, *, unit: str = "s") -> str:
+    """Median and extremes, to be read."""
+    return f"{np.median(values):.3g} {unit} ({np.min(values):.3g} to {np.max(values):.3g}, n = {values.size})"

@@ -1,0 +1,69 @@
+"""Which benchmarks there are, and the table of their results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import Benchmark
+from diagrams.tables import Crash, Registry, chosen, run, write_json
+from vtbdrake.cli.text import number, table
+
+# Name -> function () -> Benchmark or list of them; the first bears the name, the others are printed beside it.
+BENCHMARKS: Registry = {
+    "import_time": "benchmarks.import_time:import_time",
+    "testbed_overhead": "benchmarks.space_climber:testbed_overhead",
+    "sweep_speedup": "benchmarks.space_climber:sweep_speedup",
+    "rollout_rtf": "benchmarks.space_climber:rollout_rtf",
+}
+
+FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
+
+_VERDICTS = {True: "yes", False: "NO", None: ""}
+_SIGNS = {"higher": ">=", "lower": "<="}
+
+
+def benchmark_all(
+    only: Sequence[str] = (), *, registry: Registry = BENCHMARKS, echo: Callable[[str], Any] = print
+) -> list[Benchmark | Crash]:
+    """Runs the benchmarks named, or all. One that raises is a `Crash`, and the others still run.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    results: list[Benchmark | Crash] = []
+    for name in chosen(registry, only):
+        echo(f"{name} ...")
+        found = run(registry, name)
+        results += found if isinstance(found, list) else [found]
+    return results
+
+
+def results_table(results: Sequence[Benchmark | Crash]) -> str:
+    """One row each, and the notes below."""
+    header = ("benchmark", "value", "unit", "goal", "holds", "against")
+    rows = [_crash_row(r) if isinstance(r, Crash) else _row(r) for r in results]
+    notes = [f"{r.name}: {r.note}" for r in results if isinstance(r, Benchmark) and r.note]
+    return "\n".join([table(header, rows), *notes])
+
+
+def _row(result: Benchmark) -> tuple[str, ...]:
+    goal = "" if result.goal is None else f"{_SIGNS[result.better]} {number(result.goal)}"
+    unit = "" if result.unit == "1" else result.unit
+    return (result.name, f"{result.value:.4g}", unit, goal, _VERDICTS[result.holds], result.against)
+
+
+def _crash_row(crash: Crash) -> tuple[str, ...]:
+    return (crash.name, "-", "", "", "NO", str(crash))
+
+
+def write_results(path: Path, results: Sequence[Benchmark | Crash]) -> None:
+    """Writes what was measured, with the fields `FIELDS`; a crash has no value, and does not hold."""
+    write_json(path, [_fields(result) for result in results])
+
+
+def _fields(result: Benchmark | Crash) -> dict[str, Any]:
+    if isinstance(result, Crash):
+        return {**dict.fromkeys(FIELDS), "name": result.name, "holds": False}
+    return {name: getattr(result, name) for name in FIELDS}

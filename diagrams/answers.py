@@ -1,0 +1,148 @@
+"""Every application's question and our answer, beside the paper's: ``python -m diagrams.answers [ONLY...] [--full]``.
+
+Prints one row each and writes ``answers.json``, which holds what this run has answered, and nothing older.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import isinf
+from pathlib import Path
+from typing import Any
+
+import click
+
+from diagrams.tables import Crash, Registry, chosen, run, write_json
+from vtbdrake.cli.text import number, table
+
+# Application -> payload(full) -> Answer
+APPLICATIONS: Registry = {
+    "O4": "diagrams.space_climber.answers:payload",
+}
+
+FILE = "answers.json"
+FIELDS = ("id", "answer", "unit", "interval", "paper", "seconds", "holds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """The answer to the question of one application.
+
+    Attributes:
+        id: of the application: O1 to O4, R1, R2, C1, C2.
+        question: in one sentence.
+        answer: a number in ``unit``, or words.
+        unit: SI; empty for words.
+        interval: (lower, upper), in which the answer lies; an infinite end is open. None if it has no uncertainty.
+        paper: the paper's answer.
+        holds: whether the criterion of the application is met.
+        note: what is to be known besides.
+        seconds: of wall time; measured if left out.
+    """
+
+    id: str
+    question: str
+    answer: float | str
+    unit: str
+    interval: tuple[float, float] | None
+    paper: str
+    holds: bool
+    note: str = ""
+    seconds: float | None = None
+
+
+def answer_all(
+    only: Sequence[str] = (),
+    *,
+    full: bool = False,
+    registry: Registry = APPLICATIONS,
+    echo: Callable[[str], Any] = print,
+) -> list[Answer | Crash]:
+    """Runs the applications named, or all. One that raises is a `Crash`, and the others still run.
+
+    Args:
+        full: the long versions.
+        registry: name -> function ``(full) -> Answer``.
+        echo: gets a line when an application begins.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    answers: list[Answer | Crash] = []
+    for name in chosen(registry, only):
+        echo(f"{name} ...")
+        begin = time.perf_counter()
+        answer = run(registry, name, full)
+        if isinstance(answer, Answer) and answer.seconds is None:
+            answer = replace(answer, seconds=time.perf_counter() - begin)
+        answers.append(answer)
+    return answers
+
+
+def answers_table(answers: Sequence[Answer | Crash]) -> str:
+    """One row each, and the notes below."""
+    header = ("id", "question", "answer", "the paper's", "time", "holds")
+    rows = [_crash_row(a) if isinstance(a, Crash) else _row(a) for a in answers]
+    notes = [f"{a.id}: {a.note}" for a in answers if isinstance(a, Answer) and a.note]
+    return "\n".join([table(header, rows), *notes])
+
+
+def _row(answer: Answer) -> tuple[str, ...]:
+    value = answer.answer if isinstance(answer.answer, str) else number(answer.answer)
+    parts = [value, answer.unit, _interval(answer.interval)]
+    return (
+        answer.id,
+        answer.question,
+        " ".join(part for part in parts if part),
+        answer.paper,
+        f"{answer.seconds:.1f} s",
+        "yes" if answer.holds else "NO",
+    )
+
+
+def _crash_row(crash: Crash) -> tuple[str, ...]:
+    return (crash.name, "", str(crash), "", "", "NO")
+
+
+def _interval(interval: tuple[float, float] | None) -> str:
+    if interval is None:
+        return ""
+    lower, upper = interval
+    left = "(-inf" if isinf(lower) else f"[{number(lower)}"
+    right = "inf)" if isinf(upper) else f"{number(upper)}]"
+    return f"in {left}, {right}"
+
+
+def write_answers(path: Path, answers: Sequence[Answer | Crash]) -> None:
+    """Writes what was answered, with the fields `FIELDS`; a crash has neither answer nor time, and does not hold."""
+    write_json(path, [_fields(answer) for answer in answers])
+
+
+def _fields(answer: Answer | Crash) -> dict[str, Any]:
+    if isinstance(answer, Crash):
+        return {**dict.fromkeys(FIELDS), "id": answer.name, "holds": False}
+    return {name: getattr(answer, name) for name in FIELDS}
+
+
+@click.command()
+@click.argument("only", nargs=-1)
+@click.option("--full", is_flag=True, help="The long versions.")
+def main(only: tuple[str, ...], full: bool) -> None:
+    """Answer the questions of the applications ONLY (O4, say), or of all."""
+    try:
+        answers = answer_all(only, full=full, echo=lambda line: click.echo(line, err=True))
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
+    write_answers(Path(FILE), answers)
+    click.echo(answers_table(answers))
+    if any(isinstance(answer, Crash) for answer in answers):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    # Under its own name, so that there is one class Answer.
+    from diagrams.answers import main as program
+
+    program(prog_name="python -m diagrams.answers")

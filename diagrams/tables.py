@@ -1,0 +1,79 @@
+"""What the tables of answers and of benchmarks have in common: which rows to run, and the file they end in."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Name of a row -> the function that produces it: itself, or as "package.module:function", imported when it is its turn.
+Registry = Mapping[str, str | Callable[..., Any]]
+
+
+@dataclass(frozen=True)
+class Crash:
+    """A row that is not there, because its function raised."""
+
+    name: str
+    error: BaseException
+
+    def __str__(self) -> str:
+        return f"{type(self.error).__name__}: {' '.join(str(self.error).split())}"
+
+
+def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
+    """The names to run, in the order of the registry; all of them if ``only`` is empty.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    unknown = [name for name in only if name not in registry]
+    if unknown:
+        raise ValueError(f"there is no {', '.join(unknown)}; known are: {', '.join(registry)}")
+    return [name for name in registry if not only or name in only]
+
+
+def run(registry: Registry, name: str, *arguments: Any) -> Any:
+    """What the function called ``name`` returns, or a `Crash`, with its traceback on stderr: the others still run."""
+    try:
+        return _function(registry[name])(*arguments)
+    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        traceback.print_exc(file=sys.stderr)
+        return Crash(name, error)
+
+
+def _function(entry: str | Callable[..., Any]) -> Callable[..., Any]:
+    if not isinstance(entry, str):
+        return entry
+    module, _, function = entry.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
+
+
+def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes a JSON list of objects, whole or not at all; null stands for what is not finite, so for an open end."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(json.dumps([_plain(dict(row)) for row in rows], indent=2, allow_nan=False) + "\n")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
