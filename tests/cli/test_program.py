@@ -174,6 +174,12 @@ def test_animation_is_one_html_file(tmp_path: Path) -> None:
     assert "http://localhost" not in text
 
 
+def test_version_is_one_line() -> None:
+    program = run("--version")
+    assert (program.returncode, program.stderr) == (0, "")
+    assert program.stdout.startswith("vtbdrake")
+
+
 @pytest.mark.parametrize("command", ["variables", "rollout", "sweep", "boundary", "diagram"])
 def test_help_shows_an_example(command: str) -> None:
     assert f"Example:\n    vtbdrake {command} " in run(command, "--help").stdout

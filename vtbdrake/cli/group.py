@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from importlib import metadata
 from typing import Any
 
 import click
@@ -60,9 +61,18 @@ def _reraise_if_asked(ctx: click.Context) -> None:
         raise
 
 
+def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not ctx.resilient_parsing:
+        try:
+            click.echo(f"vtbdrake {metadata.version('vtbdrake')}")
+        except metadata.PackageNotFoundError:
+            click.echo("vtbdrake, not installed but run from its folder")
+        ctx.exit()
+
+
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--traceback", is_flag=True, help="Show where in the code an error comes from.")
-@click.version_option(package_name="vtbdrake")
+@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Show it.")
 def main(traceback: bool) -> None:
     """Virtual testbeds on Drake: look at one, simulate it, ask it questions.
 
