@@ -1,1 +1,5 @@
-"""A six-legged walking robot in the style of DFKI's SpaceClimber, and its testbed."""
+"""A six-legged robot in the style of DFKI's SpaceClimber, walking on the moon with an attachment at its front."""
+
+from diagrams.space_climber.scenario import SpaceClimberScenario
+
+__all__ = ["SpaceClimberScenario"]

@@ -1,0 +1,154 @@
+"""The SpaceClimber testbed: a six-legged robot with an attachment at its front, walking on the moon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import CoulombFriction
+from pydrake.systems.framework import Diagram
+from pydrake.systems.primitives import MatrixGain
+
+from diagrams.space_climber.dps import make_dps
+from diagrams.space_climber.gait import GAITS
+from diagrams.space_climber.kinematics import LegKinematics
+from diagrams.space_climber.morphology import (
+    DEFAULT_FRICTION,
+    FOOT_LINKS,
+    JOINT_NAMES,
+    LEGS,
+    LUNAR_GRAVITY,
+    Morphology,
+)
+from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
+from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, connect_to_plant
+from vtbdrake.testbed import (
+    Interface,
+    PlantFields,
+    Scenario,
+    ScenarioError,
+    Signal,
+    SimulatorFields,
+    VirtualTestbedBuilder,
+)
+
+JOINTS = len(JOINT_NAMES)
+
+
+def _cenic() -> SimulatorFields:
+    # Chosen by the convergence study that the benchmark `rollout_rtf` prints.
+    return SimulatorFields(integration_scheme="cenic", max_step_size=0.02, accuracy=1e-3)
+
+
+@dataclass
+class SpaceClimberScenario(Scenario):
+    """A six-legged robot on a plane; the address ``sim.sys.payload.mass`` is the mass attached to its front."""
+
+    simulator: SimulatorFields = field(default_factory=_cenic)
+    # Contact is between point feet and a plane. A continuous plant is for CENIC; its joints cannot be locked.
+    plant: PlantFields = field(default_factory=lambda: PlantFields(contact_model="point"))
+    # Acceleration of free fall in m/s^2.
+    gravity: float = LUNAR_GRAVITY
+    # The ground falls in the direction of x, in which the robot looks, by this angle; uphill it is negative.
+    slope_deg: float = 0.0
+    # Static and dynamic friction of feet and ground.
+    friction: float = DEFAULT_FRICTION
+    # tripod, ripple or wave.
+    gait: str = "tripod"
+    # Period of sensors and DPS in seconds.
+    period: float = 0.02
+    # False leaves the attachment out.
+    payload: bool = True
+    # True stops the joints at the ends of their ranges, which the DPS's commands never exceed; half as fast.
+    joint_stops: bool = False
+
+    def validate(self) -> None:
+        super().validate()
+        checks = {
+            "gravity": (self.gravity > 0.0, "positive, in m/s^2"),
+            "slope_deg": (abs(self.slope_deg) <= 45.0, "within 45 deg"),
+            "friction": (self.friction >= 0.0, "not negative"),
+            "gait": (self.gait in GAITS, f"one of {', '.join(GAITS)}"),
+            "period": (self.period > 0.0, "positive, in s"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                raise ScenarioError(f"SpaceClimberScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+
+    def interface(self) -> Interface:
+        m = Morphology()
+        return Interface(
+            sense=[
+                Signal("imu", size=6, unit="rad/s, m/s^2", max_age=5 * self.period),
+                Signal("joint_encoders", size=JOINTS, unit="rad", max_age=5 * self.period),
+                Signal("foot_contact", size=len(LEGS), lower=0.0, upper=1.0, max_age=5 * self.period),
+            ],
+            act=[
+                Signal(
+                    "joint_position",
+                    size=JOINTS,
+                    unit="rad",
+                    lower=m.joint_lower,
+                    upper=m.joint_upper,
+                    rate=m.joint_speed,
+                    idle=LegKinematics(m).inverse(m.stance).ravel(),
+                )
+            ],
+            commands=[
+                Signal("heading", size=1, unit="rad", lower=-np.pi, upper=np.pi),
+                Signal("walk", size=1, lower=0.0, upper=1.0, default=1.0),
+            ],
+        )
+
+    def make_dps(self) -> Diagram:
+        return make_dps(self.gait, period=self.period)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, scene_graph = builder.add_plant(self.plant)
+        climber = add_climber(plant, joint_stops=self.joint_stops)
+        if self.payload:
+            add_payload(plant, climber)
+        downhill = RigidTransform(RotationMatrix.MakeYRotation(np.radians(self.slope_deg)))
+        ground = Box(200.0, 200.0, 1.0)
+        X_WG = downhill @ RigidTransform([0.0, 0.0, -0.5])
+        friction = CoulombFriction(self.friction, self.friction)
+        plant.RegisterCollisionGeometry(plant.world_body(), X_WG, ground, "ground", friction)
+        plant.RegisterVisualGeometry(plant.world_body(), X_WG, ground, "ground", np.array([0.55, 0.53, 0.5, 1.0]))
+        base = plant.GetBodyByName("base", climber)
+        plant.SetDefaultFloatingBaseBodyPose(base, downhill @ plant.GetDefaultFloatingBaseBodyPose(base))
+        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
+        plant.Finalize()
+        set_foot_friction(plant, scene_graph, climber, self.friction)
+
+        feet = [plant.GetBodyByName(name, climber) for name in FOOT_LINKS]
+        joints = [plant.GetJointByName(name, climber) for name in JOINT_NAMES]
+        imu_frame = plant.GetFrameByName("imu", climber)
+        sensors = {
+            "imu": builder.add("sense", "imu", Imu(plant, imu_frame, period=self.period)),
+            "joint_encoders": builder.add("sense", "encoders", JointEncoders(plant, joints, period=self.period)),
+            "foot_contact": builder.add("sense", "foot_contact", ContactSensor(plant, feet, period=self.period)),
+        }
+        for signal, sensor in sensors.items():
+            connect_to_plant(builder.builder, sensor, plant)
+            builder.sim_sensor(signal, sensor.get_output_port())
+
+        # The servos are the plant's own PD controllers; they are to reach the position and to rest there.
+        rest = np.vstack([np.eye(JOINTS), np.zeros((JOINTS, JOINTS))])
+        servos = builder.add("act", "servos", MatrixGain(rest))
+        builder.builder.Connect(servos.get_output_port(), plant.get_desired_state_input_port(climber))
+        builder.sim_actuator("joint_position", servos.get_input_port())
+        self._declare_belief(builder)
+
+    def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
+        """The robot believes itself to be where its odometry says, at the attitude and with the joints it senses."""
+        builder.believe(
+            "sim.sys.climber.base.pose",
+            of=["dps.env.position", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
+            by=lambda position, roll, pitch, yaw: [*position, roll, pitch, yaw],
+        )
+        for i, name in enumerate(JOINT_NAMES):
+            builder.believe(
+                f"sim.sys.climber.{name}.position", of=[f"dps.sense.calibration.joint_encoders[{i}]"]
+            )
