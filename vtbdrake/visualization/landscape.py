@@ -1,0 +1,84 @@
+"""h over two parameters: the landscape of Figure 6."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+
+from vtbdrake.visualization.figure import label
+from vtbdrake.visualization.trajectories import FAILED
+
+# It must stand out from every colour of the map.
+_THRESHOLD = "#f4a582"
+
+if TYPE_CHECKING:
+    from vtbdrake.optimization import Sweep
+
+
+def worst(sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
+    """(points, h): the distinct points, shape (n, p), and the worst h over their conditions, shape (n,).
+
+    h is NaN where a condition is missing or its simulation failed.
+    """
+    points, where = np.unique(sweep.points, axis=0, return_inverse=True)
+    where = where.reshape(-1)
+    h = np.full(len(points), np.inf)
+    # Unlike fmin, minimum keeps a NaN.
+    np.minimum.at(h, where, sweep.h)
+    h[np.bincount(where, minlength=len(points)) < len(sweep.conditions)] = np.nan
+    return points, h
+
+
+def draw_landscape(axes: Axes, sweep: Sweep) -> None:
+    """An image of h on a full grid, else coloured points; contour lines, failures and the best point on top."""
+    points, h = worst(sweep)
+    x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
+    known = np.isfinite(h)
+    threshold = sweep.rollouts[0].threshold
+    if len(points) == x.size * y.size and min(x.size, y.size) > 1:
+        # np.unique has sorted the points by x, then y.
+        image = h.reshape(x.size, y.size).T
+        drawn: ScalarMappable = axes.pcolormesh(
+            x, y, np.ma.masked_invalid(image), shading="nearest", cmap="viridis", gid="h"
+        )
+        low, high = (np.nanmin(h), np.nanmax(h)) if known.any() else (0.0, 0.0)
+        if high > low and min(x.size, y.size) > 2:
+            axes.contour(x, y, image, levels=np.linspace(low, high, 9)[1:-1], colors="white", linewidths=0.6, alpha=0.6)
+        if low < threshold < high:
+            axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
+            axes.plot([], [], color=_THRESHOLD, linewidth=2, label=f"f_m = {threshold:g}")
+    else:
+        x_known, y_known = points[known].T
+        drawn = axes.scatter(x_known, y_known, c=h[known], cmap="viridis", s=60, gid="h")
+    if not known.all():
+        axes.plot(*points[~known].T, "x", color=FAILED, mew=2, label="failed or not finished", gid="failed")
+    _draw_best(axes, sweep)
+    first, second = (label(p.address, unit) for p, unit in zip(sweep.parameters, sweep.units, strict=True))
+    axes.set(xlabel=first, ylabel=second)
+    several = len(sweep.conditions) > 1
+    axes.set_title(f"h(s⁰), the worst of {len(sweep.conditions)} conditions" if several else "h(s⁰)")
+    axes.figure.colorbar(drawn, ax=axes, label="h(s⁰) = f'(s⁰, t*)", pad=0.02)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
+
+
+def _draw_best(axes: Axes, sweep: Sweep) -> None:
+    _, h = worst(sweep)
+    if not np.isfinite(h).any():
+        return
+    point, best = sweep.best()
+    text = ", ".join(f"{value:.4g}" for value in point.values())
+    axes.plot(
+        *point.values(),
+        "*",
+        color="#d6604d",
+        markersize=18,
+        markeredgecolor="white",
+        clip_on=False,
+        zorder=4,
+        label=f"s⁰* = [{text}], h = {best:.4g}",
+        gid="best",
+    )
