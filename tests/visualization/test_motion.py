@@ -1,0 +1,143 @@
+"""What Meshcat writes is read back: keyframes, their times, their poses and their paths."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+
+from tests.testbeds import AcrobotScenario
+from tests.visualization.meshcat_page import messages
+from vtbdrake.optimization import Motion
+from vtbdrake.visualization import make_meshcat, save_html, show_motion, show_motions
+
+UPPER = "Acrobot/upper_link"
+
+
+@pytest.fixture(scope="module")
+def meshcat() -> Meshcat:
+    return make_meshcat()
+
+
+def motion(end: float = 2.0, *, period: float = 0.05, speed: float = 1.0) -> Motion:
+    times = np.arange(round(end / period) + 1) * period
+    states = np.zeros((times.size, 4))
+    states[:, 0] = speed * times
+    return Motion(AcrobotScenario(), times, states)
+
+
+def clips(meshcat: Meshcat) -> dict[str, dict]:
+    (animation,) = [m for m in messages(meshcat.StaticHtml()) if m["type"] == "set_animation"]
+    return {a["path"].removeprefix("/drake/"): a["clip"] for a in animation["animations"]}
+
+
+def keys(clip: dict, track: str) -> tuple[np.ndarray, np.ndarray]:
+    """(times in seconds, values) of a track."""
+    (found,) = [t["keys"] for t in clip["tracks"] if t["name"] == track]
+    return np.array([k["time"] for k in found]) / clip["fps"], np.array([k["value"] for k in found])
+
+
+def colors(meshcat: Meshcat, path: str) -> list[tuple[int, float]]:
+    """(0xRRGGBB, opacity) of the objects below a path."""
+    found = [m for m in messages(meshcat.StaticHtml()) if m["type"] == "set_object" and path in m["path"]]
+    return [(m["color"], m["opacity"]) for o in found for m in o["object"]["materials"]]
+
+
+def test_recording_has_every_sample_at_its_simulated_time(meshcat: Meshcat) -> None:
+    shown = motion()
+    show_motion(meshcat, shown)
+    times, quaternions = keys(clips(meshcat)[f"rollout/{UPPER}"], ".quaternion")
+    np.testing.assert_allclose(times, shown.times, atol=1e-12)
+    # The shoulder turns about y; three.js writes a quaternion as x, y, z, w.
+    np.testing.assert_allclose(quaternions[:, 1], np.sin(shown.states[:, 0] / 2), atol=1e-6)
+
+
+def test_dense_samples_are_thinned_to_the_rate_and_the_last_stays(meshcat: Meshcat) -> None:
+    show_motion(meshcat, motion(1.015, period=0.005), rate=20.0)
+    times, _ = keys(clips(meshcat)[f"rollout/{UPPER}"], ".position")
+    np.testing.assert_allclose(times, [*np.arange(21) * 0.05, 1.015])
+
+
+def test_showing_again_replaces_the_recording(meshcat: Meshcat) -> None:
+    show_motion(meshcat, motion(2.0))
+    show_motion(meshcat, motion(1.0))
+    times, _ = keys(clips(meshcat)[f"rollout/{UPPER}"], ".position")
+    assert times[-1] == 1.0
+
+
+def test_overlay_holds_the_shorter_motion_until_the_end(meshcat: Meshcat) -> None:
+    show_motions(meshcat, {"0 kg": motion(2.0), "45 kg": motion(1.0, speed=0.5)})
+    found = clips(meshcat)
+    times, quaternions = keys(found[f"rollout/45 kg/{UPPER}"], ".quaternion")
+    assert keys(found[f"rollout/0 kg/{UPPER}"], ".quaternion")[0][-1] == times[-1] == 2.0
+    np.testing.assert_allclose(times[-2], 1.0)
+    np.testing.assert_allclose(quaternions[-2:, 1], np.sin(0.25), atol=1e-6)
+
+
+def test_surroundings_of_one_scenario_are_drawn_once(meshcat: Meshcat) -> None:
+    show_motions(meshcat, {"a": motion(), "b": motion()})
+    assert meshcat.HasPath("/drake/rollout/a/Acrobot/base_link")
+    assert not meshcat.HasPath("/drake/rollout/b/Acrobot/base_link")
+
+
+def test_tint_and_opacity_are_of_the_moving_bodies(meshcat: Meshcat) -> None:
+    legend = show_motions(meshcat, {"a": motion(), "b": motion()}, colors={"b": (1.0, 0.0, 0.0)}, opacity={"b": 0.5})
+    assert legend == {"b": "#ff0000"}
+    # Drake's acrobot has a red upper and a blue lower link, of which the tint keeps the brightness.
+    assert set(colors(meshcat, "rollout/a/Acrobot/upper")) == {(0xFF0000, 1.0)}
+    ((lower, opacity),) = set(colors(meshcat, "rollout/b/Acrobot/lower"))
+    assert (lower >> 16, opacity) == (0xC3, 0.5)
+    assert lower >> 8 & 0xFF == lower & 0xFF == 0x04
+
+
+def test_motions_are_told_apart_by_default(meshcat: Meshcat) -> None:
+    legend = show_motions(meshcat, {"a": motion(), "b": motion()})
+    assert len(set(legend.values())) == 2
+    assert colors(meshcat, "rollout/a/Acrobot/upper") != colors(meshcat, "rollout/b/Acrobot/upper")
+
+
+def test_spacing_displaces_the_second_motion(meshcat: Meshcat) -> None:
+    show_motions(meshcat, {"a": motion(), "b": motion()}, spacing=[0.0, 1.5, 0.0])
+    places = {m["path"]: m["matrix"][12:15] for m in messages(meshcat.StaticHtml()) if m["type"] == "set_transform"}
+    assert places["/drake/rollout/a"] == [0.0, 0.0, 0.0]
+    assert places["/drake/rollout/b"] == [0.0, 1.5, 0.0]
+
+
+def test_wrong_overlays_are_refused(meshcat: Meshcat) -> None:
+    with pytest.raises(ValueError, match="no motion to show"):
+        show_motions(meshcat, {})
+    with pytest.raises(ValueError, match="no motion 'c'; there are: a"):
+        show_motions(meshcat, {"a": motion()}, colors={"c": "red"})
+    with pytest.raises(ValueError, match="opacity of a"):
+        show_motions(meshcat, {"a": motion()}, opacity=0.0)
+    with pytest.raises(ValueError, match="has no '/'"):
+        show_motions(meshcat, {"a/b": motion()})
+
+
+def test_states_of_another_plant_are_refused(meshcat: Meshcat) -> None:
+    with pytest.raises(ValueError, match=r"states of shape \(3, 2\)"):
+        show_motion(meshcat, Motion(AcrobotScenario(), np.arange(3.0), np.zeros((3, 2))))
+    with pytest.raises(ValueError, match="no sample"):
+        show_motion(meshcat, Motion(AcrobotScenario(), np.empty(0), np.empty((0, 4))))
+
+
+def test_page_is_written_whole_with_its_legend(meshcat: Meshcat, tmp_path: Path) -> None:
+    legend = show_motions(meshcat, {"0 kg": motion(), "<45> kg": motion()})
+    path = tmp_path / "overlay.html"
+    save_html(meshcat, path, title="Moon & Mars", legend=legend)
+    page = path.read_text(encoding="utf-8")
+    assert "<b>Moon &amp; Mars</b>" in page
+    assert f'color:{legend["<45> kg"]}">&#9632;</span> &lt;45&gt; kg' in page
+    assert any(m["type"] == "set_animation" for m in messages(page))
+    assert [p.name for p in tmp_path.iterdir()] == ["overlay.html"]
+
+
+def test_meshcat_listens_on_this_machine_only(meshcat: Meshcat) -> None:
+    port = f"{meshcat.port():04X}"
+    listening = []
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        if Path(table).exists():
+            rows = [line.split() for line in Path(table).read_text().splitlines()[1:]]
+            listening += [row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{port}")]
+    assert set(listening) <= {f"0100007F:{port}", f"{'0' * 24}01000000:{port}"}
+    assert meshcat.web_url() == f"http://localhost:{meshcat.port()}"

@@ -1,0 +1,259 @@
+"""Motions of the simulated world as recordings in Meshcat; several of them overlaid (Figure 7)."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Mapping
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import to_hex, to_rgb
+from pydrake.geometry import (
+    IllustrationProperties,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    Rgba,
+    Role,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+
+from vtbdrake.testbed import VirtualTestbed
+
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+    from numpy.typing import ArrayLike
+
+    from vtbdrake.optimization import Motion
+
+# Colours that are told apart by everyone (Okabe and Ito).
+_PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+
+# Of the primaries of sRGB, to the eye.
+_BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
+
+# Keyframes lie on whole milliseconds; the browser interpolates between them.
+_RESOLUTION = 1000.0
+
+
+def make_meshcat() -> Meshcat:
+    """A Meshcat server that listens on this machine only, unlike Drake's default."""
+    return Meshcat(MeshcatParams(host="localhost"))
+
+
+def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> None:
+    """Puts a motion into ``meshcat`` as its recording, under ``prefix``; one second of it is one simulated second.
+
+    It replaces the recording that is there, and what is drawn under ``prefix``. To see several motions at a time, use
+    `show_motions`.
+
+    Args:
+        rate: keyframes per second at most.
+
+    Raises:
+        ValueError: the motion has no sample, its states do not fit the scenario's plant, or there is nothing to draw.
+    """
+    _check(motion, prefix, rate)
+    meshcat.Delete(prefix)
+    _record(meshcat, [_Actor(motion, prefix)], rate)
+
+
+def show_motions(
+    meshcat: Meshcat,
+    motions: Mapping[str, Motion],
+    *,
+    prefix: str = "rollout",
+    colors: Mapping[str, ColorType] | None = None,
+    opacity: float | Mapping[str, float] = 1.0,
+    spacing: ArrayLike = (0.0, 0.0, 0.0),
+    rate: float = 20.0,
+) -> dict[str, str]:
+    """Overlays motions in one recording (Figure 7): the unloaded and the loaded robot, say.
+
+    Each is drawn under ``<prefix>/<label>``, its moving bodies tinted; of several in one scenario, the surroundings are
+    drawn once. A motion that ends earlier stands still until the last one has ended.
+
+    Args:
+        motions: label -> motion.
+        colors: label -> tint, any matplotlib colour; a label that is missing keeps its own colours. Left out, every
+            motion gets a tint.
+        opacity: of the moving bodies, in (0, 1], for all or by label.
+        spacing: the n-th motion is drawn displaced by n times this, in metres; shape (3,).
+        rate: keyframes per second at most.
+
+    Returns:
+        label -> tint as ``#rrggbb``, for the ``legend`` of `save_html`.
+
+    Raises:
+        ValueError: there is no motion, a label or opacity makes no sense, or as in `show_motion`.
+    """
+    if not motions:
+        raise ValueError("there is no motion to show")
+    tints = {name: to_hex(c) for name, c in (zip(motions, cycle(_PALETTE)) if colors is None else colors.items())}
+    opacities = dict(opacity) if isinstance(opacity, Mapping) else dict.fromkeys(motions, float(opacity))
+    for unknown in (tints.keys() | opacities.keys()) - motions.keys():
+        raise ValueError(f"there is no motion {unknown!r}; there are: {', '.join(motions)}")
+    step = np.asarray(spacing, dtype=float)
+    if step.shape != (3,):
+        raise ValueError(f"spacing is a displacement of shape (3,) in metres, not of shape {step.shape}")
+    actors: list[_Actor] = []
+    for number, (name, motion) in enumerate(motions.items()):
+        path = f"{prefix}/{name}"
+        _check(motion, path, rate)
+        if not name or "/" in name:
+            raise ValueError(f"a label is part of a Meshcat path and has no '/', unlike {name!r}")
+        strength = opacities.get(name, 1.0)
+        if not 0.0 < strength <= 1.0:
+            raise ValueError(f"the opacity of {name} must lie in (0, 1], not be {strength}")
+        drawn = any(other.motion.scenario == motion.scenario for other in actors) and not step.any()
+        actors.append(
+            _Actor(motion, path, tint=tints.get(name), opacity=strength, offset=number * step, surroundings=not drawn)
+        )
+    meshcat.Delete(prefix)
+    _record(meshcat, actors, rate)
+    return tints
+
+
+def save_html(
+    meshcat: Meshcat,
+    path: str | os.PathLike[str],
+    *,
+    title: str = "",
+    legend: Mapping[str, str] | None = None,
+) -> None:
+    """Writes what ``meshcat`` shows, with its recording, as one self-contained page; whole or not at all.
+
+    Args:
+        title: a caption on the page.
+        legend: label -> colour, also on the page; see `show_motions`.
+    """
+    page = meshcat.StaticHtml()
+    if title or legend:
+        head, tag, tail = page.rpartition("</body>")
+        page = f"{head}{_caption(title, legend or {})}{tag}{tail}"
+    target = Path(path)
+    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(page, encoding="utf-8")
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _caption(title: str, legend: Mapping[str, str]) -> str:
+    rows = [f"<b>{html.escape(title)}</b>"] if title else []
+    rows += [
+        f'<span style="color:{html.escape(color, quote=True)}">&#9632;</span> {html.escape(name)}'
+        for name, color in legend.items()
+    ]
+    style = (
+        "position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,0.85);border-radius:6px;"
+        "font:14px/1.5 sans-serif;color:#222"
+    )
+    return f'<div id="caption" style="{style}">{"<br>".join(rows)}</div>\n'
+
+
+def _check(motion: Motion, path: str, rate: float) -> None:
+    if len(motion.times) == 0:
+        raise ValueError(f"the motion for {path} has no sample: its simulation failed at once")
+    if not rate > 0.0:
+        raise ValueError(f"rate is a positive number of keyframes per second, not {rate}")
+
+
+def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> None:
+    end = max(float(actor.motion.times[-1]) for actor in actors)
+    meshcat.DeleteRecording()
+    meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
+    try:
+        for actor in actors:
+            actor.play(meshcat, end, rate)
+    finally:
+        meshcat.StopRecording()
+    meshcat.PublishRecording()
+
+
+class _Actor:
+    """One motion in a recording."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        path: str,
+        *,
+        tint: str | None = None,
+        opacity: float = 1.0,
+        offset: np.ndarray | None = None,
+        surroundings: bool = True,
+    ) -> None:
+        self.motion = motion
+        self.path = path
+        self._tint = to_rgb(tint) if tint is not None else None
+        self._opacity = opacity
+        self._offset = offset if offset is not None else np.zeros(3)
+        self._surroundings = surroundings
+
+    def play(self, meshcat: Meshcat, end: float, rate: float) -> None:
+        testbed = self.motion.scenario.build(meshcat=meshcat, prefix=self.path)
+        plant = testbed.plant
+        assert plant is not None
+        states, size = np.asarray(self.motion.states), plant.num_positions() + plant.num_velocities()
+        if states.shape != (len(self.motion.times), size):
+            raise ValueError(
+                f"the motion for {self.path} has states of shape {states.shape}, but its {len(self.motion.times)} "
+                f"samples and the scenario's plant make ({len(self.motion.times)}, {size})"
+            )
+        self._paint(testbed, plant)
+        context = testbed.default_context()
+        visualizer = next(s for s in testbed.diagram.GetSystems() if isinstance(s, MeshcatVisualizer))
+        visible = visualizer.GetMyContextFromRoot(context)
+        meshcat.SetTransform(self.path, RigidTransform(self._offset))
+        for time, sample in _keyframes(self.motion.times, end, rate):
+            plant.SetPositions(plant.GetMyMutableContextFromRoot(context), states[sample, : plant.num_positions()])
+            # Meshcat rounds the time of a keyframe down; the quarter keeps it off the edge.
+            context.SetTime(time + 0.25 / _RESOLUTION)
+            visualizer.ForcedPublish(visible)
+
+    def _paint(self, testbed: VirtualTestbed, plant: MultibodyPlant) -> None:
+        # This testbed serves nothing but the recording: what its SceneGraph hands to new contexts may be changed.
+        scene_graph = testbed.scene_graph
+        assert scene_graph is not None
+        inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+        for index in range(plant.num_bodies()):
+            body = plant.get_body(BodyIndex(index))
+            for geometry in plant.GetVisualGeometriesForBody(body):
+                if plant.IsAnchored(body):
+                    if not self._surroundings:
+                        scene_graph.RemoveRole(source, geometry, Role.kIllustration)
+                elif self._tint is not None or self._opacity < 1.0:
+                    properties = IllustrationProperties(inspector.GetIllustrationProperties(geometry))
+                    color = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
+                    properties.UpdateProperty("phong", "diffuse", self._paint_over(color))
+                    scene_graph.RemoveRole(source, geometry, Role.kIllustration)
+                    scene_graph.AssignRole(source, geometry, properties)
+
+    def _paint_over(self, color: Rgba) -> Rgba:
+        rgb = np.array([color.r(), color.g(), color.b()])
+        if self._tint is not None:
+            # The old colour's brightness stays, so that the parts of a robot are told apart.
+            rgb = 0.75 * np.array(self._tint) + 0.25 * rgb @ _BRIGHTNESS
+        return Rgba(*rgb, color.a() * self._opacity)
+
+
+def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
+    """(time, number of the sample) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
+    stamps = np.round(np.asarray(times, dtype=float) * _RESOLUTION) / _RESOLUTION
+    chosen: list[tuple[float, int]] = []
+    for sample, stamp in enumerate(stamps):
+        if not chosen or stamp - chosen[-1][0] >= 1.0 / rate - 0.5 / _RESOLUTION:
+            chosen.append((float(stamp), sample))
+    last = (float(stamps[-1]), len(stamps) - 1)
+    if chosen[-1] != last:
+        chosen.append(last)
+    if end > last[0]:
+        chosen.append((round(end * _RESOLUTION) / _RESOLUTION, last[1]))
+    return chosen
