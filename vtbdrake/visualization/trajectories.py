@@ -50,7 +50,6 @@ def draw_trajectory(
             gid="failed",
             clip_on=False,
             zorder=3,
-            clip_on=False,
         )
     elif not rollout.failed:
         draw_t_star(axes, rollout.t_star, rollout.h, color=color, style=style)
