@@ -1,18 +1,25 @@
-"""vtbdrake: virtual testbeds on Drake. One model to develop, optimize, reason and control."""
+"""vtbdrake: virtual testbeds on Drake. One model to develop, optimize, reason and control.
 
-from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
-from vtbdrake.rollout import Quality, RolloutResult
-from vtbdrake.state import Snapshot
-from vtbdrake.testbed import (
-    Interface,
-    PlantFields,
-    Scenario,
-    Signal,
-    SimulatorFields,
-    VirtualTestbed,
-    VirtualTestbedBuilder,
-    load_scenario,
-)
+Names are loaded when they are first used, so that importing the package costs next to nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
+    from vtbdrake.rollout import Quality, RolloutResult
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import (
+        Interface,
+        PlantFields,
+        Scenario,
+        Signal,
+        SimulatorFields,
+        VirtualTestbed,
+        VirtualTestbedBuilder,
+        load_scenario,
+    )
 
 __all__ = [
     "Boundary",
@@ -31,3 +38,32 @@ __all__ = [
     "VirtualTestbedBuilder",
     "load_scenario",
 ]
+
+_LAYERS = {
+    "optimization": ("Boundary", "Parameter", "Problem", "Sweep"),
+    "rollout": ("Quality", "RolloutResult"),
+    "state": ("Snapshot",),
+    "testbed": (
+        "Interface",
+        "PlantFields",
+        "Scenario",
+        "Signal",
+        "SimulatorFields",
+        "VirtualTestbed",
+        "VirtualTestbedBuilder",
+        "load_scenario",
+    ),
+}
+_HOME = {name: layer for layer, names in _LAYERS.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'vtbdrake' has no attribute {name!r}")
+    value = getattr(import_module(f"vtbdrake.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

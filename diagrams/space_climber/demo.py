@@ -1,0 +1,45 @@
+"""``make demo``: how heavy may the attachment be, on the moon? The answer, a plot, and a recording to look at."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, static_limit
+from vtbdrake.visualization import make_meshcat, save_html, show_motions
+
+OUT = Path("out")
+
+
+def main() -> None:
+    begin = time.perf_counter()
+    print("How heavy may a component attached to the front of the SpaceClimber be before it is no longer stable?")
+    problem = payload_problem()
+    boundary = problem.boundary(resolution=1.0, coarse=5.0)
+    sweep = boundary.sweep
+    assert sweep is not None
+    stroke = problem.testbed.read(problem.testbed.default_context(), "dps.impl.gait.stroke")
+    print(f"\nLunar gravity, {HORIZON:g} s of walking from each of {len(PHASES)} start phases, {len(sweep)} rollouts:")
+    print(f"  ours      stable up to {boundary.lower:g} kg, tips over at {boundary.upper:g} kg")
+    for phase, (lower, upper) in zip(PHASES, boundary.by_condition, strict=True):
+        print(f"            start phase {phase:5.3f}: {lower:g} to {upper:g} kg")
+    print(f"  statics   {static_limit(problem.testbed, stroke=stroke):.1f} kg (centre of mass over the front feet at the")
+    print(f"            end of their stance; {static_limit(problem.testbed):.1f} kg over feet that do not move)")
+    print(f"  paper     {PAPER} (its robot's dimensions and the lever of the mass are not published)")
+
+    OUT.mkdir(exist_ok=True)
+    sweep.plot().savefig(OUT / "payload.png", dpi=150)
+    sweep.save(OUT / "payload.vtb")
+    meshcat = make_meshcat()
+    motions = {
+        "unloaded": problem.motion({MASS: 0.0}),
+        f"{boundary.lower:g} kg": problem.motion({MASS: boundary.lower}),
+    }
+    legend = show_motions(meshcat, motions)
+    save_html(meshcat, OUT / "payload.html", title="SpaceClimber on the moon, attachment at its front", legend=legend)
+    print(f"\nWrote {OUT}/payload.png (plot), payload.html (recording, open it in a browser), payload.vtb (all rollouts).")
+    print(f"{time.perf_counter() - begin:.0f} s in all.")
+
+
+if __name__ == "__main__":
+    main()
