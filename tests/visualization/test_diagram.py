@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.geometry import HalfSpace
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import CoulombFriction
 from pydrake.systems.framework import System
-from pydrake.systems.primitives import ConstantValueSource, PassThrough
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, PoseRelay
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbed, VirtualTestbedBuilder
@@ -109,6 +111,14 @@ def test_simulated_sensor_is_the_one_that_feeds_the_switch() -> None:
     testbed = AcrobotScenario().build()
     assert "sim.sense.joints" in texts(svg(testbed))
     assert "sim_sense_0 ==> T_sense_0" in mermaid(testbed)
+
+
+def test_ground_belongs_to_the_environment() -> None:
+    builder = VirtualTestbedBuilder(Interface(sense=[], act=[]))
+    plant, _ = builder.add_plant()
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(1, 1))
+    builder.set_dps(ConstantVectorSource([0.0]))
+    assert 'sim_env_0["plant: world"]:::sim' in mermaid(builder.build())
 
 
 def test_names_are_escaped_and_every_role_is_drawn() -> None:

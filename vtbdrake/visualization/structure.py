@@ -130,10 +130,13 @@ def _is_framework(testbed: VirtualTestbed, system: System) -> bool:
 
 
 def _plant_instances(testbed: VirtualTestbed) -> Iterator[tuple[str, str]]:
-    """(role, name) of the plant's model instances that have bodies."""
+    """(role, name) of the plant's model instances that have bodies, and of the world if something is fixed to it."""
     plant = testbed.plant
     if plant is None:
         return
+    world = plant.world_body()
+    if plant.GetVisualGeometriesForBody(world) or plant.GetCollisionGeometriesForBody(world):
+        yield "env", "world"
     for index in range(1, plant.num_model_instances()):
         instance = ModelInstanceIndex(index)
         name = str(plant.GetModelInstanceName(instance))
