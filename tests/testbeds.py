@@ -28,11 +28,12 @@ class PendulumScenario(Scenario):
     simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-6, max_step_size=0.05))
     stiffness: float = 0.0
     damping: float = 0.0
+    idle: float = 0.0
 
     def interface(self) -> Interface:
         return Interface(
             sense=[Signal("joint_state", size=2, unit="rad, rad/s")],
-            act=[Signal("torque", size=1, unit="N m", idle=0.0)],
+            act=[Signal("torque", size=1, unit="N m", idle=self.idle)],
             commands=[Signal("angle", size=1, unit="rad", lower=-np.pi, upper=np.pi)],
         )
 

@@ -45,5 +45,3 @@ def _range(boundary: Boundary) -> str:
     spread = f", phases up to {boundary.by_condition[:, 0].max():g}" if len(boundary.by_condition) > 1 else ""
     upper = f"{boundary.upper:g}" if isfinite(boundary.upper) else "more"
     return f"{boundary.lower:g} to {upper} kg{spread}"
-
-

@@ -23,7 +23,9 @@ def main() -> None:
     print(f"  ours      stable up to {boundary.lower:g} kg, tips over at {boundary.upper:g} kg")
     for phase, (lower, upper) in zip(PHASES, boundary.by_condition, strict=True):
         print(f"            start phase {phase:5.3f}: {lower:g} to {upper:g} kg")
-    print(f"  statics   {static_limit(problem.testbed, stroke=stroke):.1f} kg (centre of mass over the front feet at the")
+    print(
+        f"  statics   {static_limit(problem.testbed, stroke=stroke):.1f} kg (centre of mass over the front feet at the"
+    )
     print(f"            end of their stance; {static_limit(problem.testbed):.1f} kg over feet that do not move)")
     print(f"  paper     {PAPER} (its robot's dimensions and the lever of the mass are not published)")
 
@@ -37,7 +39,9 @@ def main() -> None:
     }
     legend = show_motions(meshcat, motions)
     save_html(meshcat, OUT / "payload.html", title="SpaceClimber on the moon, attachment at its front", legend=legend)
-    print(f"\nWrote {OUT}/payload.png (plot), payload.html (recording, open it in a browser), payload.vtb (all rollouts).")
+    print(
+        f"\nWrote {OUT}/payload.png (plot), payload.html (recording, open it in a browser), payload.vtb (all rollouts)."
+    )
     print(f"{time.perf_counter() - begin:.0f} s in all.")
 
 

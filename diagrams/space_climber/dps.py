@@ -18,7 +18,7 @@ from vtbdrake.state import discrete_state, parameter
 SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": len(LEGS)}
 
 
-def make_dps(gait: str = "tripod", *, period: float = 0.02, morphology: Morphology | None = None) -> Diagram:
+def make_dps(gait: str = "tripod", *, period: float, morphology: Morphology | None = None) -> Diagram:
     """The DPS: ``sense`` calibrates and filters, ``env`` perceives, ``impl`` walks, ``act`` limits.
 
     Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the

@@ -13,6 +13,7 @@ rest on its attachment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ PHASE = "dps.impl.gait.phase"
 
 PHASES = (0.0, 1 / 8, 2 / 8, 3 / 8)
 HORIZON = 15.0
+# A multiple of the DPS's period, so that the simulation does not pause more often than it has to.
+SAMPLE_PERIOD = 1 / 8
 PAPER = "about 45 kg"
 
 # Name -> fields of the scenario.
@@ -45,7 +48,7 @@ def tipped_over(pitch: float) -> float:
     return 0.0 if abs(pitch) < np.pi / 4 else 1.0
 
 
-def payload_problem(**environment: Any) -> vtb.Problem:
+def payload_problem(*, phases: Sequence[float] = PHASES, **environment: Any) -> vtb.Problem:
     """The paper's five steps, in an environment given by fields of the scenario."""
     return vtb.Problem(
         scenario=SpaceClimberScenario(**environment),
@@ -53,7 +56,8 @@ def payload_problem(**environment: Any) -> vtb.Problem:
         quality=vtb.Quality(tipped_over, of=PITCH),
         horizon=HORIZON,
         threshold=0.9,
-        conditions=[{PHASE: phase} for phase in PHASES],
+        sample_period=SAMPLE_PERIOD,
+        conditions=[{PHASE: phase} for phase in phases],
     )
 
 
@@ -91,5 +95,6 @@ def locked_problem(*, upper: float = 120.0) -> vtb.Problem:
         quality=vtb.Quality(tipped_over, of=PITCH),
         horizon=HORIZON,
         threshold=0.9,
+        sample_period=SAMPLE_PERIOD,
         conditions=[{"u.walk": 0.0, **locks}],
     )

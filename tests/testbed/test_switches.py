@@ -202,12 +202,10 @@ def test_no_command_leaves_while_the_switch_is_on_sim():
 
 @pytest.mark.parametrize(("position", "expected"), [("sim", 0.75), ("real", 0.2), ("twin", 0.75)])
 def test_the_simulated_actuator_idles_while_the_real_one_is_driven(position, expected):
-    scenario = PendulumScenario(stiffness=1.5)
+    scenario = PendulumScenario(stiffness=1.5, idle=0.2)
     testbed = scenario.build()
     context = testbed.default_context()
     testbed.write(context, {"u.angle": 0.5, "T_act.torque": ["sim", "real", "twin"].index(position)})
-    idle = testbed.diagram.GetSubsystemByName("T_act.torque.idle")
-    idle.GetMyMutableContextFromRoot(context).get_mutable_numeric_parameter(0).SetFromVector([0.2])
     plant_input = testbed.plant.get_actuation_input_port().Eval(testbed.plant.GetMyContextFromRoot(context))
     assert plant_input == pytest.approx([expected])
 

@@ -18,7 +18,7 @@ from vtbdrake.state.systems import leaf_variables
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
-from vtbdrake.testbed.switch import ActSwitch, SenseSwitch, add_active_port
+from vtbdrake.testbed.switch import ActSide, Selector, SenseSwitch
 from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
@@ -157,9 +157,7 @@ class VirtualTestbedBuilder:
         self._finish_plant()
         sense_position, act_position = MODES[mode]
         sense = {s.name: self._switch_sense(s, sense_position) for s in self.interface.sense}
-        act = {s.name: self._switch_act(s, act_position) for s in self.interface.act}
-        if act:
-            self.builder.ExportOutput(add_active_port(self.builder, list(act.values())), "real.act.active")
+        act = self._switch_act(act_position)
         commands = [v for s in self.interface.commands for v in self._connect_command(s)]
         if meshcat is not None:
             if self.scene_graph is None:
@@ -175,7 +173,7 @@ class VirtualTestbedBuilder:
             plant=self.plant,
             scene_graph=self.scene_graph,
             sense={name: switch.selector for name, switch in sense.items()},
-            act={name: switch.selector for name, switch in act.items()},
+            act=act,
             simulator=self.simulator,
             scenario=scenario,
             beliefs=tuple(self._beliefs),
@@ -196,12 +194,16 @@ class VirtualTestbedBuilder:
         self.builder.Connect(switch.output_port, self._dps.GetInputPort(signal.name))
         return switch
 
-    def _switch_act(self, signal: Signal, position: str) -> ActSwitch:
+    def _switch_act(self, position: str) -> dict[str, Selector]:
         assert self._dps is not None
-        switch = ActSwitch(self.builder, signal, position, self._dps.GetOutputPort(signal.name))
-        self.builder.Connect(switch.sim_port, self._actuators[signal.name])
-        self.builder.ExportOutput(switch.real_port, f"real.act.{signal.name}")
-        return switch
+        if not self.interface.act:
+            return {}
+        side = ActSide(self.builder, self.interface.act, position, self._dps)
+        for name, port in self._actuators.items():
+            self.builder.Connect(side.sim_ports[name], port)
+            self.builder.ExportOutput(side.real_ports[name], f"real.act.{name}")
+        self.builder.ExportOutput(side.active_port, "real.act.active")
+        return side.selectors
 
     def _connect_command(self, signal: Signal) -> list[Variable]:
         assert self._dps is not None

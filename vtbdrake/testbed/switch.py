@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import (
     ConstantValueSource,
     ConstantVectorSource,
+    Demultiplexer,
     Multiplexer,
     PortSwitch,
     ZeroOrderHold,
@@ -157,51 +159,70 @@ class SenseSwitch:
         self.sim_port, self.real_port = ports
 
 
-class ActSwitch:
-    """T_act of one signal: the DPS leads to the simulated actuator, to the real port, or (twin) to both."""
+class ActSide:
+    """T_act of all signals: the DPS leads to the simulated actuators, to the real ports, or (twin) to both.
 
-    def __init__(self, builder: DiagramBuilder, signal: Signal, position: str, command: OutputPort) -> None:
-        name = f"T_act.{signal.name}"
-        self.signal = signal
-        self.selector = Selector(builder, name, ACT_POSITIONS, position)
-        (on_sim, on_real, on_twin), self.sim_port = _add_switch(
-            builder, f"{name}.sim", signal, self.selector, ACT_POSITIONS
+    The constants of all signals (idle commands, no commands, flags) come from one source: every system that a Diagram
+    has costs time at each of its steps, whether it computes or not.
+    """
+
+    def __init__(self, builder: DiagramBuilder, signals: Sequence[Signal], position: str, dps: System) -> None:
+        self._builder = builder
+        self.selectors: dict[str, Selector] = {}
+        self.sim_ports: dict[str, OutputPort] = {}
+        self.real_ports: dict[str, OutputPort] = {}
+        active = []
+        constants = self._add_constants([signal for signal in signals if signal.is_vector])
+        for signal in signals:
+            name, command = f"T_act.{signal.name}", dps.GetOutputPort(signal.name)
+            selector = self.selectors[signal.name] = Selector(builder, name, ACT_POSITIONS, position)
+            idle = constants[f"{signal.name}.idle"] if signal.is_vector else self._add_value(f"{name}.idle", signal)
+            self.sim_ports[signal.name] = self._add(f"{name}.sim", signal, selector, command, idle, command)
+            if signal.is_vector:
+                none = constants[f"{signal.name}.none"]
+                self.real_ports[signal.name] = self._add(f"{name}.real", signal, selector, none, command, command)
+            else:
+                self.real_ports[signal.name] = self._add_gate(f"{name}.real", signal, selector, command)
+            yes, no = constants["yes"], constants["no"]
+            active.append(self._add(f"{name}.active", _FLAG, selector, no, yes, yes))
+        self.active_port = active[0] if len(active) == 1 else self._add_mux(active)
+
+    def _add_constants(self, signals: Sequence[Signal]) -> dict[str, OutputPort]:
+        values = {"no": np.zeros(1), "yes": np.ones(1)}
+        for signal in signals:
+            values[f"{signal.name}.idle"] = signal.vector(signal.idle)
+            values[f"{signal.name}.none"] = signal.vector(np.nan)
+        source = self._builder.AddNamedSystem(
+            "T_act.constants", ConstantVectorSource(np.concatenate(list(values.values())))
         )
-        idle = _add_constant(builder, f"{name}.idle", signal, signal.idle)
-        builder.Connect(command, on_sim)
-        builder.Connect(idle, on_real)
-        builder.Connect(command, on_twin)
-        if signal.is_vector:
-            (on_sim, on_real, on_twin), self.real_port = _add_switch(
-                builder, f"{name}.real", signal, self.selector, ACT_POSITIONS
-            )
-            builder.Connect(_add_constant(builder, f"{name}.no_command", signal, np.nan), on_sim)
-            builder.Connect(command, on_real)
-            builder.Connect(command, on_twin)
-        else:
-            gate = builder.AddNamedSystem(f"{name}.real", CommandGate(signal))
-            builder.Connect(self.selector.output_port, gate.GetInputPort("port_selector"))
-            builder.Connect(command, gate.GetInputPort("command"))
-            self.real_port = gate.get_output_port()
-        self.active_port = self._add_active(builder, name)
+        split = self._builder.AddNamedSystem("T_act.split", Demultiplexer([value.size for value in values.values()]))
+        self._builder.Connect(source.get_output_port(), split.get_input_port())
+        return {name: split.get_output_port(i) for i, name in enumerate(values)}
 
-    def _add_active(self, builder: DiagramBuilder, name: str) -> OutputPort:
-        """1 while the signal commands the real actuator, else 0."""
-        flag = Signal("active", size=1)
-        (on_sim, on_real, on_twin), active = _add_switch(builder, f"{name}.active", flag, self.selector, ACT_POSITIONS)
-        yes = _add_constant(builder, f"{name}.active.yes", flag, 1.0)
-        builder.Connect(_add_constant(builder, f"{name}.active.no", flag, 0.0), on_sim)
-        builder.Connect(yes, on_real)
-        builder.Connect(yes, on_twin)
-        return active
+    def _add(self, name: str, signal: Signal, selector: Selector, *sources: OutputPort) -> OutputPort:
+        inputs, output = _add_switch(self._builder, name, signal, selector, ACT_POSITIONS)
+        for source, port in zip(sources, inputs, strict=True):
+            self._builder.Connect(source, port)
+        return output
+
+    def _add_value(self, name: str, signal: Signal) -> OutputPort:
+        return self._builder.AddNamedSystem(name, ConstantValueSource(Value(signal.idle))).get_output_port()
+
+    def _add_gate(self, name: str, signal: Signal, selector: Selector, command: OutputPort) -> OutputPort:
+        gate = self._builder.AddNamedSystem(name, CommandGate(signal))
+        self._builder.Connect(selector.output_port, gate.GetInputPort("port_selector"))
+        self._builder.Connect(command, gate.GetInputPort("command"))
+        return gate.get_output_port()
+
+    def _add_mux(self, flags: Sequence[OutputPort]) -> OutputPort:
+        mux = self._builder.AddNamedSystem("T_act.active", Multiplexer(len(flags)))
+        for i, flag in enumerate(flags):
+            self._builder.Connect(flag, mux.get_input_port(i))
+        return mux.get_output_port()
 
 
-def add_active_port(builder: DiagramBuilder, switches: list[ActSwitch]) -> OutputPort:
-    """One port that says for every actuator signal, in their order, whether it commands the real actuator."""
-    mux = builder.AddNamedSystem("T_act.active", Multiplexer(len(switches)))
-    for i, switch in enumerate(switches):
-        builder.Connect(switch.active_port, mux.get_input_port(i))
-    return mux.get_output_port()
+# 1 for a signal that commands the real actuator, else 0.
+_FLAG = Signal("active", size=1)
 
 
 def _add_switch(
@@ -217,10 +238,3 @@ def _add_switch(
     builder.AddNamedSystem(name, system)
     builder.Connect(selector.output_port, system.get_input_port(0))
     return inputs, system.get_output_port()
-
-
-def _add_constant(builder: DiagramBuilder, name: str, signal: Signal, value: Any) -> OutputPort:
-    source: System = (
-        ConstantVectorSource(signal.vector(value)) if signal.is_vector else ConstantValueSource(Value(value))
-    )
-    return builder.AddNamedSystem(name, source).get_output_port()

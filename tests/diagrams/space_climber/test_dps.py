@@ -55,7 +55,7 @@ def set_element(dps: Diagram, context: Context, path: str, name: str, value: obj
 
 
 def test_parts_and_ports() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     assert [system.get_name() for system in dps.GetSystems()] == ["sense", "env", "impl", "act"]
     sizes = {dps.get_input_port(k).get_name(): dps.get_input_port(k).size() for k in range(dps.num_input_ports())}
     assert sizes == {"imu": 6, "joint_encoders": 18, "foot_contact": 6, "heading": 1, "walk": 1}
@@ -66,11 +66,11 @@ def test_parts_and_ports() -> None:
 
 def test_unknown_gait_is_refused() -> None:
     with pytest.raises(ValueError, match="tripod, ripple, wave"):
-        make_dps("gallop")
+        make_dps("gallop", period=PERIOD)
 
 
 def test_stands_still_from_the_start() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     simulator = Simulator(dps, fixed(dps))
     for k in range(1, 40):
         simulator.AdvanceTo(k * PERIOD)
@@ -78,7 +78,7 @@ def test_stands_still_from_the_start() -> None:
 
 
 def test_copied_contexts_continue_alike() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     imu = [0.01, -0.02, 0.03, 0.1, 0.05, 1.6]
     first = Simulator(dps, fixed(dps, walk=[1.0], imu=imu))
     first.AdvanceTo(1.0)
@@ -91,7 +91,7 @@ def test_copied_contexts_continue_alike() -> None:
 
 
 def test_low_pass_reaches_63_percent_after_its_time_constant() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     context = fixed(dps, imu=[1.0, 0, 0, 0, 0, 1.62])
     set_element(dps, context, "sense.calibration", "imu_time_constant", 10 * PERIOD)
     set_element(dps, context, "sense.calibration", "gyro_bias", [0.5, 0, 0])
@@ -102,7 +102,7 @@ def test_low_pass_reaches_63_percent_after_its_time_constant() -> None:
 
 
 def test_first_specific_force_sets_roll_and_pitch() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     roll, pitch, g = 0.2, -0.3, 3.71
     force = g * np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     simulator = Simulator(dps, fixed(dps, imu=[0, 0, 0, *force]))
@@ -136,7 +136,7 @@ def test_wrap() -> None:
 
 
 def test_odometry_counts_the_motion_over_standing_feet() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     kinematics = LegKinematics()
     context = fixed(dps, foot_contact=[1, 0, 0, 1, 1, 0])
     simulator = Simulator(dps, context)
@@ -153,7 +153,7 @@ def test_odometry_counts_the_motion_over_standing_feet() -> None:
 @pytest.mark.parametrize(("roll", "pitch"), [(0.02, 0.0), (0.0, -0.03)])
 def test_posture_leans_against_the_tilt(roll: float, pitch: float) -> None:
     """The feet's plane turns so that the torso turns back: its lean grows at gain * tilt, up to its limit."""
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     force = [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
     simulator = Simulator(dps, fixed(dps, imu=[0, 0, 0, *force]))
     simulator.AdvanceTo(1.0)
@@ -168,7 +168,7 @@ def test_posture_leans_against_the_tilt(roll: float, pitch: float) -> None:
 
 
 def test_commands_keep_joint_range_and_rate() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     context = fixed(dps, walk=[1.0])
     set_element(dps, context, "act", "rate", 0.5)
     upper = element(dps, context, "act", "upper")
@@ -188,7 +188,7 @@ def test_commands_keep_joint_range_and_rate() -> None:
 
 
 def test_start_phase_is_part_of_the_state() -> None:
-    dps = make_dps()
+    dps = make_dps(period=PERIOD)
     context = fixed(dps, walk=[1.0])
     set_element(dps, context, "impl.gait", "phase", 0.25)
     simulator = Simulator(dps, context)

@@ -1,0 +1,151 @@
+"""What the framework costs, and what it saves, on the SpaceClimber."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+import vtbdrake as vtb
+from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio, seconds, spread
+from benchmarks.plain_climber import build_plain_climber
+from diagrams.space_climber import SpaceClimberScenario
+from diagrams.space_climber.payload import HORIZON, MASS, PITCH, SAMPLE_PERIOD, payload_problem, tipped_over
+from vtbdrake.rollout import RolloutRunner, RolloutTask
+
+DISTANCE = "sim.sys.climber.base.x"
+REFERENCE = vtb.SimulatorFields("cenic", 0.1, 1e-6)
+
+
+def testbed_overhead(repeats: int = 9) -> Benchmark:
+    """The testbed against the same systems wired by hand in plain Drake, same integrator, 15 s of walking."""
+    scenario = SpaceClimberScenario()
+    testbed = scenario.build()
+    plain = build_plain_climber(scenario)
+
+    def ours() -> None:
+        testbed.simulator().AdvanceTo(HORIZON)
+
+    def theirs() -> None:
+        plain.simulator().AdvanceTo(HORIZON)
+
+    a, b = interleaved(ours, theirs, repeats=repeats)
+    end = testbed.simulator()
+    end.AdvanceTo(HORIZON)
+    other = plain.simulator()
+    other.AdvanceTo(HORIZON)
+    x = testbed.read(end.get_context(), DISTANCE)
+    x_plain = plain.plant.GetPositions(plain.plant.GetMyContextFromRoot(other.get_context()))[4]
+    return Benchmark(
+        name="testbed_overhead",
+        value=ratio(a, b),
+        unit="1",
+        goal=1.03,
+        better=LOWER,
+        against="the same systems wired by hand in plain Drake",
+        note=f"testbed {spread(a)}, by hand {spread(b)}; distance walked {x:.6f} m and {x_plain:.6f} m",
+    )
+
+
+def sweep_speedup(masses: int = 31) -> list[Benchmark]:
+    """The payload sweep against what one would write first: rebuild per mass, serial, full horizon."""
+    values = np.linspace(0.0, 60.0, masses)
+    problem = payload_problem(phases=(0.0,))
+    scenario = SpaceClimberScenario()
+    tipped: dict[str, list[bool]] = {}
+
+    def naive() -> None:
+        tipped["naive"] = [_naive_rollout(mass, scenario, problem.task.sample_times()) for mass in values]
+
+    def ours(executor: str) -> Callable[[], None]:
+        def sweep() -> None:
+            tipped[executor] = problem.sweep(values=values, executor=executor, progress=False).exceeded.tolist()
+
+        return sweep
+
+    by_hand, serial, parallel = seconds(naive), seconds(ours("serial")), seconds(ours("auto"))
+    agree = sum(a == b for a, b in zip(tipped["naive"], tipped["auto"], strict=True))
+    note = (
+        f"{masses} masses: by hand {by_hand:.1f} s, serial {serial:.1f} s, two cores {parallel:.1f} s (starting the "
+        f"workers included); {agree} of {masses} outcomes agree"
+    )
+    against = "rebuild per mass, serial, full horizon, same integrator and masses"
+    return [
+        Benchmark(name="sweep_speedup", value=by_hand / parallel, unit="1", goal=2.5, better=HIGHER, against=against,
+                  note=note),
+        Benchmark(name="sweep_speedup_serial", value=by_hand / serial, unit="1", goal=None, better=HIGHER,
+                  against=against),
+    ]  # fmt: skip
+
+
+def _naive_rollout(mass: float, scenario: SpaceClimberScenario, times: np.ndarray) -> bool:
+    """One rollout as one would write it first, with the same pauses; whether it tipped over."""
+    plain = build_plain_climber(scenario)
+    simulator = plain.simulator()
+    plant_context = plain.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plain.plant.GetBodyByName("payload").SetMass(plant_context, mass)
+    base = plain.plant.GetBodyByName("base")
+    worst = 0.0
+    for t in times[1:]:
+        simulator.AdvanceTo(t)
+        R_WB = base.EvalPoseInWorld(plant_context).rotation()
+        worst = max(worst, tipped_over(float(R_WB.ToRollPitchYaw().pitch_angle())))
+    return worst > 0.9
+
+
+def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
+    """Simulated seconds per wall second of one rollout with the scenario's settings, and why it has them."""
+    scenario = SpaceClimberScenario()
+    reference = _walk(scenario, REFERENCE)
+    rows = []
+    for accuracy in (1e-2, 1e-3, 1e-4):
+        fields = vtb.SimulatorFields("cenic", scenario.simulator.max_step_size, accuracy)
+        rtf, distance = _measured(scenario, fields, 2)
+        rows.append(f"accuracy {accuracy:g}: RTF {rtf:.1f}, distance {100 * (distance / reference - 1):+.2f} %")
+    rtf, distance = _measured(scenario, scenario.simulator, repeats)
+    error = abs(distance / reference - 1.0)
+    boundaries = {
+        f"{fields.accuracy:g}": _first_tipping(scenario, fields) for fields in (scenario.simulator, REFERENCE)
+    }
+    limits = ", ".join(f"{mass:g} kg at accuracy {accuracy}" for accuracy, mass in boundaries.items())
+    study = "; ".join(rows)
+    return [
+        Benchmark(
+            name="rollout_rtf",
+            value=rtf,
+            unit="1",
+            goal=35.0,
+            better=HIGHER,
+            against=f"accuracy {REFERENCE.accuracy:g}: {reference:.4f} m walked in {HORIZON:g} s",
+            holds=rtf >= 35.0 and error <= 0.01,
+            note=f"max step {scenario.simulator.max_step_size:g} s; {study}; first mass that tips: {limits}",
+        ),
+        Benchmark(name="rollout_distance_error", value=error, unit="1", goal=0.01, better=LOWER,
+                  against="the fine reference"),
+    ]  # fmt: skip
+
+
+def _runner(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> RolloutRunner:
+    quality = vtb.Quality(tipped_over, of=PITCH)
+    scenario = replace(scenario, simulator=fields)
+    return RolloutRunner(
+        RolloutTask(scenario, HORIZON, quality, threshold=0.9, sample_period=SAMPLE_PERIOD, record=(DISTANCE,))
+    )
+
+
+def _walk(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> float:
+    return float(_runner(scenario, fields).run({MASS: 0.0}).record[DISTANCE][-1])
+
+
+def _measured(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields, repeats: int) -> tuple[float, float]:
+    """(real-time factor, distance walked), the median of ``repeats`` rollouts."""
+    runner = _runner(scenario, fields)
+    results = [runner.run({MASS: 0.0}) for _ in range(repeats)]
+    return HORIZON / float(np.median([r.wall_time for r in results])), float(results[0].record[DISTANCE][-1])
+
+
+def _first_tipping(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> float:
+    """The least of the masses around the boundary, in steps of 1 kg, that tips the robot over."""
+    runner = _runner(scenario, fields)
+    return next((m for m in np.arange(32.0, 45.0) if runner.run({MASS: m}).end == "threshold"), np.inf)
