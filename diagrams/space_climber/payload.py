@@ -29,7 +29,7 @@ PHASE = "dps.impl.gait.phase"
 PHASES = (0.0, 1 / 8, 2 / 8, 3 / 8)
 HORIZON = 15.0
 # A multiple of the DPS's period, so that the simulation does not pause more often than it has to.
-SAMPLE_PERIOD = 1 / 8
+SAMPLE_PERIOD = 0.1
 PAPER = "about 45 kg"
 
 # Name -> fields of the scenario.

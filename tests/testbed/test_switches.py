@@ -6,12 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, LinearSystem, PassThrough, Saturation, ZeroOrderHold
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import LinearSystem, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
-from tests.testbeds import AcrobotScenario, PendulumScenario, PoseRelay
-from vtbdrake.state.copying import StateCopier
+from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
 from vtbdrake.testbed import Command, Interface, Signal, VirtualTestbedBuilder

@@ -8,6 +8,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -21,6 +22,10 @@ from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
+
+# Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
+_DRAKE = version("drake")
+_CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
 
 
 class ScenarioError(ValueError):
@@ -64,6 +69,15 @@ class Scenario(ABC):
             raise ScenarioError(
                 f"{type(self).__name__}.simulator.integration_scheme is one of {', '.join(known)}, not "
                 f"{self.simulator.integration_scheme!r}"
+            )
+        if (
+            self.simulator.integration_scheme == "cenic"
+            and not self.simulator.use_error_control
+            and not _CENIC_IS_FRESH
+        ):
+            raise ScenarioError(
+                f"{type(self).__name__}.simulator: CENIC without error control leaves poses one step behind in Drake "
+                f"{_DRAKE}; set use_error_control to true, or use Drake 1.58"
             )
         if self.simulator.max_step_size <= 0 or self.simulator.accuracy <= 0:
             raise ScenarioError(
