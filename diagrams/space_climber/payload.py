@@ -33,8 +33,9 @@ SAMPLE_PERIOD = 0.1
 PAPER = "about 45 kg"
 
 # Name -> fields of the scenario.
+MOON = "moon"
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
-    "moon": {},
+    MOON: {},
     "Mars": {"gravity": 3.71},
     "earth": {"gravity": 9.81},
     "moon, 10 deg downhill": {"slope_deg": 10.0},
@@ -82,7 +83,7 @@ def static_limit(testbed: vtb.VirtualTestbed, *, stroke: float = 0.0) -> float:
     return float(M * (x_f - x_c) / (x_a - x_f))
 
 
-def locked_problem(*, upper: float = 120.0) -> vtb.Problem:
+def locked_problem(*, lower: float = 70.0, upper: float = 120.0) -> vtb.Problem:
     """The same question for a robot that stands on six legs with all joints locked, where statics knows the answer."""
     scenario = SpaceClimberScenario(
         plant=vtb.PlantFields(time_step=0.002, contact_model="point", discrete_contact_approximation="sap"),
@@ -91,7 +92,7 @@ def locked_problem(*, upper: float = 120.0) -> vtb.Problem:
     locks = {f"sim.sys.climber.{name}.locked": 1.0 for name in JOINT_NAMES}
     return vtb.Problem(
         scenario=scenario,
-        parameters=[vtb.Parameter(MASS, 0.0, upper)],
+        parameters=[vtb.Parameter(MASS, lower, upper)],
         quality=vtb.Quality(tipped_over, of=PITCH),
         horizon=HORIZON,
         threshold=0.9,

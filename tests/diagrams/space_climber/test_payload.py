@@ -1,0 +1,95 @@
+"""The testbed and its question: how heavy may the attachment be?"""
+
+import numpy as np
+import pytest
+
+from diagrams.space_climber import SpaceClimberScenario
+from diagrams.space_climber.morphology import JOINT_NAMES, Morphology
+from diagrams.space_climber.payload import MASS, locked_problem, payload_problem, static_limit, tipped_over
+from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
+
+
+def test_f_is_that_of_the_paper() -> None:
+    angles = np.radians([0.0, 44.9, -44.9, 45.1, -45.1, 120.0])
+    assert [tipped_over(angle) for angle in angles] == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+
+
+def test_static_limit_balances_the_moments_about_the_front_feet() -> None:
+    testbed = SpaceClimberScenario().build()
+    context = testbed.default_context()
+    for stroke in (0.0, 0.2):
+        limit = static_limit(testbed, stroke=stroke)
+        testbed.write(context, {MASS: limit})
+        plant = testbed.plant
+        x_cm = plant.CalcCenterOfMassPositionInWorld(plant.GetMyContextFromRoot(context))[0]
+        assert x_cm == pytest.approx(Morphology().stance_x - stroke / 2, abs=1e-6)
+
+
+def test_with_locked_legs_it_tips_where_statics_says() -> None:
+    problem = locked_problem()
+    limit = static_limit(problem.testbed)
+    below, above = problem.rollout([0.98 * limit]), problem.rollout([1.02 * limit])
+    assert below.end == "horizon"
+    assert above.end == "threshold"
+
+
+def test_a_light_attachment_is_carried_and_a_heavy_one_tips_the_robot() -> None:
+    sweep = payload_problem(phases=[0.0]).sweep(values=[0.0, 20.0, 55.0], executor="serial", progress=False)
+    assert sweep.exceeded.tolist() == [False, False, True]
+    assert sweep.t_star[2] < 6.0
+
+
+def test_a_robot_that_falls_keeps_its_energy_until_it_lands() -> None:
+    # CENIC is of first order: a body in free fall is g t h / 2 too low, h half a step.
+    step = 0.002
+    testbed = SpaceClimberScenario(simulator=SimulatorFields("cenic", step, 1e-3)).build()
+    context = testbed.default_context()
+    testbed.write(context, {"u.walk": 0.0, "sim.sys.climber.base.pose": [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]})
+    plant, own = testbed.plant, testbed.plant.GetMyContextFromRoot(context)
+    before = plant.CalcPotentialEnergy(own) + plant.CalcKineticEnergy(own)
+    testbed.simulator(context).AdvanceTo(1.5)
+    after = plant.CalcPotentialEnergy(own) + plant.CalcKineticEnergy(own)
+    fall = 1.62 * 1.5**2 / 2
+    assert testbed.read(context, "sim.sys.climber.base.height") == pytest.approx(3.0 - fall, abs=1.62 * 1.5 * step / 2)
+    # Of the energy that has moved, joints that give way have taken next to nothing.
+    moved = plant.CalcTotalMass(own) * 1.62 * fall
+    assert abs(after - before) < 0.01 * moved
+
+
+def test_the_simulated_world_starts_from_what_the_robot_believes() -> None:
+    testbed = SpaceClimberScenario().build()
+    context = testbed.default_context()
+    testbed.write(context, {"u.heading": 0.3})
+    testbed.simulator(context).AdvanceTo(4.0)
+    names = ["sim.sys.climber.base.pose", *(f"sim.sys.climber.{name}.position" for name in JOINT_NAMES)]
+    true = testbed.variables().read(context, names)
+    testbed.start_from_belief(context)
+    believed = testbed.variables().read(context, names)
+    np.testing.assert_array_equal(
+        believed[names[0]][:3], testbed.read(context, "dps.env.position"), err_msg="not the belief"
+    )
+    np.testing.assert_allclose(believed[names[0]], true[names[0]], atol=0.08)
+    for name in names[1:]:
+        assert believed[name] == pytest.approx(true[name], abs=0.2)
+        assert believed[name] != true[name]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"gravity": -1.62}, "gravity must be positive"),
+        ({"gait": "gallop"}, "gait must be one of tripod, ripple, wave, not 'gallop'"),
+        ({"slope_deg": 60.0}, "slope_deg must be within 45 deg"),
+        ({"friction": -0.1}, "friction must be not negative"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_a_world_that_makes_no_sense_is_refused(fields, message) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        SpaceClimberScenario(**fields).build()
+
+
+def test_the_scenario_loads_from_a_file(tmp_path) -> None:
+    file = tmp_path / "mars.yaml"
+    file.write_text("diagrams.space_climber:SpaceClimberScenario:\n  gravity: 3.71\n  gait: ripple\n")
+    assert load_scenario(file) == SpaceClimberScenario(gravity=3.71, gait="ripple")
