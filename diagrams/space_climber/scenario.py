@@ -116,7 +116,9 @@ class SpaceClimberScenario(Scenario):
         X_WG = downhill @ RigidTransform([0.0, 0.0, -0.5])
         friction = CoulombFriction(self.friction, self.friction)
         plant.RegisterCollisionGeometry(plant.world_body(), X_WG, ground, "ground", friction)
-        plant.RegisterVisualGeometry(plant.world_body(), X_WG, ground, "ground", np.array([0.55, 0.53, 0.5, 1.0]))
+        # A little lower than it is, or Meshcat's grid would shine through.
+        shown = X_WG @ RigidTransform([0.0, 0.0, -0.002])
+        plant.RegisterVisualGeometry(plant.world_body(), shown, ground, "ground", np.array([0.55, 0.53, 0.5, 1.0]))
         base = plant.GetBodyByName("base", climber)
         plant.SetDefaultFloatingBaseBodyPose(base, downhill @ plant.GetDefaultFloatingBaseBodyPose(base))
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])

@@ -101,7 +101,7 @@ class Variables(Mapping[str, Variable]):
             text = (
                 f"{value:.6g}"
                 if isinstance(value, float)
-                else np.array2string(value, precision=4, threshold=8, suppress_small=True, max_line_width=10_000)
+                else np.array2string(value.ravel(), precision=4, threshold=8, suppress_small=True, max_line_width=999)
             )
             rows.append((variable.address, kind, shape, variable.unit, bounds, text))
         widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]

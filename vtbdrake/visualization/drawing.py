@@ -64,7 +64,7 @@ class _Drawing:
         size = f'width="{WIDTH}" height="{self.height}" viewBox="0 0 {WIDTH} {self.height}"'
         font = 'font-family="DejaVu Sans, Verdana, Helvetica, sans-serif"'
         head = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" {size} {font} fill="{INK}">',
+            f'<svg xmlns="http://www.w3.org/2000/svg" {size} {font} fill="{INK}" style="max-width:100%;height:auto">',
             f"<title>{escape(structure.name)}</title>",
             "<defs>",
             *(_arrow_head(color) for color in (SIM, REAL, DPS, OFF)),

@@ -119,6 +119,17 @@ def show_motions(
     return tints
 
 
+def page(meshcat: Meshcat, *, title: str = "", legend: Mapping[str, str] | None = None) -> str:
+    """What ``meshcat`` shows, with its recording, as one self-contained HTML page.
+
+    Args:
+        title: a caption on the page.
+        legend: label -> colour, also on the page; see `show_motions`.
+    """
+    head, tag, tail = meshcat.StaticHtml().rpartition("</body>")
+    return f"{head}{_caption(title, legend or {}) if title or legend else ''}{tag}{tail}"
+
+
 def save_html(
     meshcat: Meshcat,
     path: str | os.PathLike[str],
@@ -126,20 +137,11 @@ def save_html(
     title: str = "",
     legend: Mapping[str, str] | None = None,
 ) -> None:
-    """Writes what ``meshcat`` shows, with its recording, as one self-contained page; whole or not at all.
-
-    Args:
-        title: a caption on the page.
-        legend: label -> colour, also on the page; see `show_motions`.
-    """
-    page = meshcat.StaticHtml()
-    if title or legend:
-        head, tag, tail = page.rpartition("</body>")
-        page = f"{head}{_caption(title, legend or {})}{tag}{tail}"
+    """Writes the `page`, whole or not at all."""
     target = Path(path)
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     try:
-        partial.write_text(page, encoding="utf-8")
+        partial.write_text(page(meshcat, title=title, legend=legend), encoding="utf-8")
         partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)

@@ -129,7 +129,8 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
         marker = MARKERS[number % len(MARKERS)]
         name = describe(condition) if many else "h(s⁰)"
         (line,) = axes.plot(values[mine], h[mine], color=color, marker=marker, markersize=5, label=name, gid="h")
-        line.set_linestyle(STYLES[number % len(STYLES)])
+        # Between 0 and 1 of a quality that takes no other value there is nothing to be drawn.
+        line.set_linestyle("none" if is_two_valued(sweep.rollouts) else STYLES[number % len(STYLES)])
         line.set_linewidth(1.2)
         # An open marker: f' exceeded f_m.
         line.set_markerfacecolor("white")
@@ -199,8 +200,9 @@ def _draw_bars(axes: Axes, sweep: Sweep) -> None:
     count = len(sweep.conditions)
     distinct = np.unique(sweep.points[:, 0])
     spacing = float(np.diff(distinct).min()) if distinct.size > 1 else 1.0
-    # The conditions of one value lie side by side, within the distance to the next value.
-    heights = sweep.points[:, 0] + 0.7 * spacing * ((sweep.condition + 0.5) / count - 0.5)
+    # The conditions of one value lie side by side, close to it.
+    spread = min(0.7 * spacing, 0.03 * float(np.ptp(distinct)) or 1.0)
+    heights = sweep.points[:, 0] + spread * ((sweep.condition + 0.5) / count - 0.5)
     colors = [_CONDITIONS(number % 10) if count > 1 else _SINGLE for number in sweep.condition]
     draw_bars(axes, sweep.rollouts, heights, colors=colors, styles=sweep.condition.tolist())
     axes.set_ylabel(label(sweep.parameters[0].address, sweep.units[0]))
