@@ -29,6 +29,7 @@ class Boundary:
         safe_beyond: values above a condition's own interval that were safe all the same: where there are any, the
             outcome is not monotonic, and a bisection could have ended there.
         undecided: values at which a simulation failed; they count as exceeded.
+        failure: the reason of the first of them.
         sweep: the rollouts that it rests on.
     """
 
@@ -39,9 +40,14 @@ class Boundary:
     by_condition: np.ndarray = field(compare=False)
     safe_beyond: tuple[float, ...] = ()
     undecided: tuple[float, ...] = ()
+    failure: str = ""
     sweep: Sweep | None = field(default=None, repr=False, compare=False)
 
     def __str__(self) -> str:
+        failed = f" ({len(self.undecided)} values with failed simulations: {self.failure})" if self.undecided else ""
+        return self._interval() + failed
+
+    def _interval(self) -> str:
         if isinf(self.upper):
             return f"{self.address}: safe up to {self.lower:g} {self.unit}, the largest value examined"
         if isinf(self.lower):
@@ -77,6 +83,7 @@ def boundary_of(sweep: Sweep) -> Boundary:
         by_condition=by_condition,
         safe_beyond=tuple(sorted(float(value) for value in beyond)),
         undecided=tuple(sorted({float(value) for value in values[sweep.failed]})),
+        failure=next((rollout.message for rollout in sweep.rollouts if rollout.failed), ""),
         sweep=sweep,
     )
 
@@ -95,7 +102,7 @@ class Refinement:
                 f"it takes 0 < resolution <= coarse <= {upper - lower:g}, the width of the range, not a resolution of "
                 f"{resolution:g} and a coarse step of {coarse:g}"
             )
-        self._lower, self._upper = lower, upper
+        self._lower, self._upper = float(lower), float(upper)
         self._count = int(np.ceil((upper - lower) / resolution - 1e-9))
         self._resolution = resolution
         self._coarse = max(1, round(coarse / resolution))

@@ -25,6 +25,8 @@ class Parameter:
     upper: float
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "lower", float(self.lower))
+        object.__setattr__(self, "upper", float(self.upper))
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
             raise ValueError(
                 f"the range of {self.address} must be finite and not empty, lower < upper, but it is "
@@ -48,6 +50,6 @@ class Parameter:
         if self.lower < lower or self.upper > upper:
             raise ValueError(
                 f"the range [{self.lower:g}, {self.upper:g}] of {self.address} exceeds its bounds "
-                f"[{lower:g}, {upper:g}] {variable.unit}"
+                f"{variable.bounds_text()} {variable.unit}"
             )
         return variable

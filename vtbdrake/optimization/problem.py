@@ -87,7 +87,6 @@ class Problem:
         conditions: Sequence[Condition] = ({},),
         start: Snapshot | None = None,
     ) -> None:
-        self.scenario = scenario
         self.parameters = tuple(parameters)
         self.conditions = tuple({**condition} for condition in conditions)
         self.task = RolloutTask(
@@ -98,7 +97,8 @@ class Problem:
             sample_period=sample_period,
             start=start,
         )
-        self.testbed: VirtualTestbed = scenario.build()
+        self.scenario = self.task.scenario
+        self.testbed: VirtualTestbed = self.scenario.build()
         self._check()
 
     def _check(self) -> None:
@@ -277,7 +277,7 @@ class Problem:
             parameters=self.parameters,
             units=tuple(variables[parameter.address].unit for parameter in self.parameters),
             conditions=self.conditions,
-            points=np.array([point for point, _, _ in finished]).reshape(-1, len(self.parameters)),
+            points=np.array([point for point, _, _ in finished], dtype=float).reshape(-1, len(self.parameters)),
             condition=np.array([condition for _, condition, _ in finished], dtype=int),
             rollouts=tuple(result for _, _, result in finished),
             scenario=self.scenario.record(),

@@ -102,7 +102,7 @@ class RolloutRunner:
         # A new integrator: the step memory of a used one would be part of the trajectory. Its config sets the time.
         ApplySimulatorConfig(self._config, self._simulator)
         self._copier.copy(self._s0, self._context, hidden=self._changed)
-        self._changed = {a.partition("[")[0] for a in parameters if self._variables[a].hidden}
+        self._changed = {self._variables[a].carried_by for a in parameters} - {""}
         restored = self.task.start is not None
         with _FailuresAsOutcomes():
             self._variables.write(self._context, parameters)

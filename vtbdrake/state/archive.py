@@ -63,5 +63,5 @@ def read_archive(
             return header, arrays
     except (FileNotFoundError, ArchiveError):
         raise
-    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, LookupError, ValueError, EOFError, OSError, RuntimeError) as error:
         raise ArchiveError(f"{path} is not a {kind}, or it is damaged: {error}") from error

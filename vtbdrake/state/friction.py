@@ -11,7 +11,7 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.systems.framework import Context
 
 from vtbdrake.state.multibody import Prefix, bodies, element_address
-from vtbdrake.state.variable import A, Variable
+from vtbdrake.state.variable import A, Variable, VariableError
 
 _FRICTION = ("material", "coulomb_friction")
 
@@ -30,31 +30,47 @@ def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix
         if with_friction(geometry):
             name = inspector.GetName(geometry).replace("::", ".")
             address = f"{world_prefix}.{name}" if world_prefix else name
-            yield _friction(address, plant, scene_graph, [geometry])
+            yield from _friction(address, plant, scene_graph, [geometry])
     for body in bodies(plant):
         geometries = [g for g in plant.GetCollisionGeometriesForBody(body) if with_friction(g)]
         if geometries:
-            yield _friction(element_address(plant, body, prefix), plant, scene_graph, geometries)
+            yield from _friction(element_address(plant, body, prefix), plant, scene_graph, geometries)
 
 
-def _friction(address: str, plant: MultibodyPlant, scene_graph: SceneGraph, geometries: list[GeometryId]) -> Variable:
-    """Static and dynamic coefficient alike; what is read is the dynamic one, which Drake's discrete and convex
-    contact models use."""
+def _friction(
+    address: str, plant: MultibodyPlant, scene_graph: SceneGraph, geometries: list[GeometryId]
+) -> Iterator[Variable]:
+    """``friction``, one coefficient for all, and what carries it: static and dynamic ones of each geometry.
+
+    What is read of ``friction`` is the first geometry's dynamic one: Drake's discrete and convex contact models use
+    the dynamic coefficients only.
+    """
+    by_geometry = f"{address}.friction_by_geometry"
 
     def inspect(root: Context) -> SceneGraphInspector:
         context = scene_graph.GetMyContextFromRoot(root)
         return scene_graph.get_query_output_port().Eval(context).inspector()
 
-    def read(root: Context) -> float:
-        properties = inspect(root).GetProximityProperties(geometries[0])
-        return float(properties.GetProperty(*_FRICTION).dynamic_friction())
+    def read(root: Context) -> np.ndarray:
+        inspector = inspect(root)
+        frictions = [inspector.GetProximityProperties(geometry).GetProperty(*_FRICTION) for geometry in geometries]
+        return np.array([[friction.static_friction(), friction.dynamic_friction()] for friction in frictions])
 
     def write(root: Context, value: np.ndarray) -> None:
+        if (value[:, 0] < value[:, 1]).any():
+            raise VariableError(f"{by_geometry} is [static, dynamic] of each geometry, the dynamic one not larger")
         inspector = inspect(root)
+        changed = [ProximityProperties(inspector.GetProximityProperties(geometry)) for geometry in geometries]
         context = scene_graph.GetMyMutableContextFromRoot(root)
-        for geometry in geometries:
-            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
-            properties.UpdateProperty(*_FRICTION, CoulombFriction(float(value), float(value)))
+        for geometry, properties, coefficients in zip(geometries, changed, value, strict=True):
+            properties.UpdateProperty(*_FRICTION, CoulombFriction(*coefficients))
             scene_graph.AssignRole(context, plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
-    return Variable(f"{address}.friction", A, (), "1", read, write, bounds=(0.0, inf), hidden=True)
+    def write_all(root: Context, value: np.ndarray) -> None:
+        write(root, np.full((len(geometries), 2), float(value)))
+
+    first = f"{address}.friction"
+    yield Variable(
+        first, A, (), "1", lambda root: read(root)[0, 1], write_all, bounds=(0.0, inf), carried_by=by_geometry
+    )
+    yield Variable(by_geometry, A, (len(geometries), 2), "1", read, write, bounds=(0.0, inf), carried_by=by_geometry)

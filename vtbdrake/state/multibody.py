@@ -157,7 +157,8 @@ def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
         else:
             joint.Unlock(context)
 
-    return Variable(name, A, (), "1", read, write, bounds=(0.0, 1.0), hidden=True)
+    # Locking stops the joint, and a locked joint takes no velocity: last.
+    return Variable(name, A, (), "1", read, write, bounds=(0.0, 1.0), carried_by=name, order=1)
 
 
 def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Iterator[Variable]:
@@ -203,9 +204,9 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
             ) from None
         set_inertia(root, M_new)
 
-    yield Variable(f"{address}.mass", A, (), "kg", read_mass, write_mass, bounds=(0.0, inf))
-    yield Variable(f"{address}.center_of_mass", A, (3,), "m", read_com, write_com)
-    yield Variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia)
+    yield Variable(f"{address}.mass", A, (), "kg", read_mass, write_mass, bounds=(0.0, inf), order=-3)
+    yield Variable(f"{address}.center_of_mass", A, (3,), "m", read_com, write_com, order=-2)
+    yield Variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1)
 
 
 def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:

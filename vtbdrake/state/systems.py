@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, System
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import RgbdSensor
@@ -42,7 +42,7 @@ def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | N
     ``declared`` names its elements where the system itself, one of Drake's, cannot.
     """
     if isinstance(system, RgbdSensor):
-        yield _camera_pose(path, system)
+        yield from _camera_pose(path, system)
     for element in _elements(system) if declared is None else declared:
         address = f"{path}.{element.name}" if element.name else path
         yield _numeric(address, system, element)
@@ -119,14 +119,25 @@ def _numeric(address: str, system: System, element: Element) -> Variable:
     return Variable(address, kind, element.shape, element.unit, read, write, bounds=element.bounds)
 
 
-def _camera_pose(path: str, camera: RgbdSensor) -> Variable:
+def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
+    """``pose`` for the user, and the matrix that carries it: angles would not come back to the last bit."""
+    matrix = f"{path}.pose_matrix"
+
+    def read_matrix(root: Context) -> np.ndarray:
+        return camera.GetX_PB(camera.GetMyContextFromRoot(root)).GetAsMatrix34()
+
+    def write_matrix(root: Context, value: np.ndarray) -> None:
+        pose = RigidTransform(RotationMatrix(value[:, :3]), value[:, 3])
+        camera.SetX_PB(camera.GetMyMutableContextFromRoot(root), pose)
+
     def read(root: Context) -> np.ndarray:
         return pose_to_array(camera.GetX_PB(camera.GetMyContextFromRoot(root)))
 
     def write(root: Context, value: np.ndarray) -> None:
         camera.SetX_PB(camera.GetMyMutableContextFromRoot(root), pose_from_array(value))
 
-    return Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, hidden=True)
+    yield Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, carried_by=matrix)
+    yield Variable(matrix, A, (3, 4), "1, m", read_matrix, write_matrix, carried_by=matrix)
 
 
 def is_python(system: System) -> bool:

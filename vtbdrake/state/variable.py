@@ -30,11 +30,13 @@ class Variable:
         kind: ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part).
         shape: of its value; ``()`` is a scalar.
         unit: SI unit; ``"1"`` if it has none.
-        bounds: closed interval for every entry.
+        bounds: closed interval, for all entries or of the variable's shape.
         read: reads the value from a context of the Diagram.
         write: writes a checked value into a context; None marks a derived quantity, which is read only.
-        hidden: kept by Drake outside the numeric groups of a context (contact friction, camera poses, joint
-            locks, switches), so that a copy of the numeric groups does not carry it.
+        carried_by: empty if a copy of the numeric groups of a context carries the variable. Else (contact friction,
+            camera poses, joint locks, switches) the address of the hidden variable that copies and snapshots have to
+            carry for it: itself, or a finer one.
+        order: variables of a lower order are written first, as writing them changes others.
     """
 
     address: str
@@ -43,8 +45,14 @@ class Variable:
     unit: str
     read: Reader
     write: Writer | None = None
-    bounds: tuple[float, float] = (-inf, inf)
-    hidden: bool = False
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
+    carried_by: str = ""
+    order: int = 0
+
+    @property
+    def hidden(self) -> bool:
+        """True if copies and snapshots have to carry this very variable."""
+        return self.carried_by == self.address
 
     @property
     def derived(self) -> bool:
@@ -75,12 +83,18 @@ class Variable:
             raise VariableError(f"{self.address} has shape {self.shape}, but the value given has {array.shape}")
         if not np.isfinite(array).all():
             raise VariableError(f"{self.address} must be finite, but the value given is {value!r}")
-        lower, upper = self.bounds
+        lower, upper = (np.asarray(bound, dtype=float) for bound in self.bounds)
         if (array < lower).any() or (array > upper).any():
             raise VariableError(
-                f"{self.address} must lie in [{lower:g}, {upper:g}] {self.unit}, but the value given is {value!r}"
+                f"{self.address} must lie in {self.bounds_text()} {self.unit}, but the value given is {value!r}"
             )
         return array
+
+    def bounds_text(self) -> str:
+        """The closed interval of the bounds, to be read; of an array with several, the first."""
+        lower, upper = (float(np.ravel(bound)[0]) for bound in self.bounds)
+        more = ", ..." if any(np.size(bound) > 1 for bound in self.bounds) else ""
+        return f"[{lower:g}, {upper:g}]{more}"
 
     def set(self, context: Context, value: ArrayLike) -> None:
         """Checks ``value`` and writes it into ``context``.

@@ -6,12 +6,13 @@ import difflib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
-from vtbdrake.state.variable import Variable
+from vtbdrake.state.variable import Variable, VariableError
 
 
 class AddressError(KeyError, ValueError):
@@ -75,16 +76,32 @@ class Variables(Mapping[str, Variable]):
         return {address: self[address].get(context) for address in addresses}
 
     def write(self, context: Context, values: Mapping[str, ArrayLike]) -> None:
-        """Checks all of ``values``, then sets the variables at their addresses."""
-        checked = [(self[address], value) for address, value in values.items()]
-        for variable, value in checked:
-            variable.check(value)
-        for variable, value in checked:
-            variable.set(context, value)
+        """Checks all of ``values``, then sets the variables at their addresses.
+
+        Their order does not matter: entries of one array are set together, and what changes other variables is set
+        first (a mass, which scales the inertia).
+
+        Raises:
+            VariableError: a value is refused, or an array is given both whole and by entries.
+        """
+        for address, value in values.items():
+            self[address].check(value)
+        whole: dict[str, Any] = {}
+        for address, value in values.items():
+            entry = _ENTRY.fullmatch(address)
+            if entry is None:
+                whole[address] = value
+            elif entry[1] in values:
+                raise VariableError(f"{entry[1]} is set both whole and by its entry {address}")
+            else:
+                array = whole.setdefault(entry[1], np.array(self[entry[1]].get(context)))
+                array.flat[int(entry[2])] = float(np.asarray(value))
+        for address in sorted(whole, key=lambda address: self[address].order):
+            self[address].set(context, whole[address])
 
     def complement(self, addresses: Sequence[str]) -> list[str]:
         """Equation (9): the addresses of all that is held constant when ``addresses`` are varied."""
-        chosen = {self[address].address for address in addresses}
+        chosen = {self[address].address.partition("[")[0] for address in addresses}
         return [v.address for v in self._listed.values() if not v.derived and v.address not in chosen]
 
     def table(self, context: Context, *, pattern: str = "") -> str:
@@ -95,8 +112,8 @@ class Variables(Mapping[str, Variable]):
                 continue
             kind = variable.kind + (" (derived)" if variable.derived else "")
             shape = "x".join(map(str, variable.shape)) or "scalar"
-            lower, upper = variable.bounds
-            bounds = "" if np.isinf(variable.bounds).all() else f"[{lower:g}, {upper:g}]"
+            bounded = any(np.isfinite(bound).any() for bound in variable.bounds)
+            bounds = variable.bounds_text() if bounded else ""
             value = variable.get(context) + 0.0  # no negative zeros
             text = (
                 f"{value:.6g}"
@@ -135,10 +152,15 @@ def _entry(variable: Variable, index: int) -> Variable:
         array.flat[index] = float(value)
         variable.set(context, array)
 
+    def bound(which: int) -> float:
+        return float(np.broadcast_to(np.asarray(variable.bounds[which], dtype=float), variable.shape).flat[index])
+
     return replace(
         variable,
         address=f"{variable.address}[{index}]",
         shape=(),
         read=read,
         write=None if variable.derived else write,
+        bounds=(bound(0), bound(1)),
+        carried_by=variable.carried_by,
     )

@@ -89,7 +89,7 @@ class Selector:
             lambda context: float(self.positions.index(self.get(context))),
             write,
             bounds=(0.0, len(self.positions) - 1.0),
-            hidden=True,
+            carried_by=self.name,
         )
 
 
