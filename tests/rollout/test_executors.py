@@ -174,6 +174,8 @@ def test_ctrl_c_keeps_what_is_finished(executor, tmp_path):
     script.write_text(
         textwrap.dedent(f"""
             import logging
+            import signal
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # Ignored where the tests run in the background.
             from tests.testbeds import AcrobotScenario
             import vtbdrake as vtb
             from vtbdrake.rollout import make_executor

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
+import numpy as np
+
 from vtbdrake.state import Variable, Variables
 
 
@@ -46,7 +48,7 @@ class Parameter:
             raise ValueError(
                 f"{self.address} has shape {variable.shape}; a parameter is one number: {self.address}[0], say"
             )
-        lower, upper = variable.bounds
+        lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
         if self.lower < lower or self.upper > upper:
             raise ValueError(
                 f"the range [{self.lower:g}, {self.upper:g}] of {self.address} exceeds its bounds "

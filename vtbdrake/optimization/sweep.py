@@ -76,11 +76,13 @@ class Sweep:
         Raises:
             ValueError: no point has finished all its conditions.
         """
-        scores: dict[tuple[float, ...], list[float]] = {}
-        for point, h in zip(self.points, self.h, strict=True):
-            scores.setdefault(tuple(point), []).append(h)
+        scores: dict[tuple[float, ...], dict[int, float]] = {}
+        for point, condition, h in zip(self.points, self.condition, self.h, strict=True):
+            scores.setdefault(tuple(point.tolist()), {})[int(condition)] = float(h)
         finished = {
-            point: min(hs) for point, hs in scores.items() if len(hs) == len(self.conditions) and not np.isnan(hs).any()
+            point: min(hs.values())
+            for point, hs in scores.items()
+            if len(hs) == len(self.conditions) and not np.isnan(list(hs.values())).any()
         }
         if not finished:
             raise ValueError("no point of the sweep has a quality under all conditions" + self._first_failure())

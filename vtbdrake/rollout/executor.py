@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.runner import CancelledError, RolloutRunner
+from vtbdrake.rollout.runner import CancelledError, RolloutRunner, same_scenario
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import VirtualTestbed
 
@@ -56,7 +56,7 @@ class SerialExecutor(Executor):
         self._testbed = testbed
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        runner = RolloutRunner(task, self._testbed)
+        runner = RolloutRunner(task, _testbed_of(task, self._testbed))
         for index, parameters in enumerate(points):
             yield index, runner.run(parameters)
 
@@ -72,7 +72,7 @@ class ThreadExecutor(Executor):
         self._testbed = testbed
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        testbed = self._testbed if self._testbed is not None else task.scenario.build()
+        testbed = _testbed_of(task, self._testbed)
         waiting: queue.SimpleQueue[tuple[int, Parameters]] = queue.SimpleQueue()
         done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException] = queue.SimpleQueue()
         cancel = threading.Event()
@@ -104,6 +104,11 @@ class ThreadExecutor(Executor):
             cancel.set()
             for thread in threads:
                 thread.join()
+
+
+def _testbed_of(task: RolloutTask, known: VirtualTestbed | None) -> VirtualTestbed:
+    """The testbed that is known, if it is the task's."""
+    return known if known is not None and same_scenario(known, task) else task.scenario.build()
 
 
 def choose_executor(testbed: VirtualTestbed) -> str:

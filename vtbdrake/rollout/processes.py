@@ -31,7 +31,11 @@ class _Worker:
     """A fresh interpreter at the other end of a socket. It does not import the main module again."""
 
     def __init__(self) -> None:
-        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.rollout.worker import main; main()"
+        # Ctrl-C reaches the whole group of processes; the main one decides what it means.
+        program = (
+            "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+            f"sys.path[:] = {sys.path!r}; from vtbdrake.rollout.worker import main; main()"
+        )
         ours, theirs = socket.socketpair()
         with ours, theirs:
             self.process = subprocess.Popen(
@@ -41,19 +45,26 @@ class _Worker:
             )
             self.connection = Connection(ours.detach())
         self._ready = False
+        self._time_limit = float("inf")
         self.task: bytes | None = None
         self.job: int | None = None
         self.deadline = float("inf")
 
     def give(self, task: bytes, index: int, parameters: Parameters, *, time_limit: float) -> None:
+        # Before anything is sent: a worker that was interrupted in here must not pass for an idle one.
+        self.job = index
+        self._time_limit = time_limit
+        self.deadline = float("inf")
         if not self._ready:
             self._await_ready()
-        if self.task is not task:
+        if self.task != task:
             self.connection.send_bytes(b"T" + task)
             self.task = task
-        self.connection.send_bytes(b"R" + pickle.dumps(dict(parameters)))
-        self.job = index
-        self.deadline = time.monotonic() + time_limit
+        self.connection.send_bytes(b"R" + pickle.dumps((index, dict(parameters))))
+
+    def begin(self) -> None:
+        """The worker has its testbed and begins its rollout: from here the time counts."""
+        self.deadline = time.monotonic() + self._time_limit
 
     def _await_ready(self) -> None:
         try:
@@ -132,6 +143,7 @@ class ProcessExecutor(Executor):
                 try:
                     worker.give(task, index, points[index], time_limit=self._time_limit)
                 except OSError:  # It died while it was idle.
+                    worker.job = None
                     waiting.appendleft(index)
                     self._replace(worker)
 
@@ -146,7 +158,13 @@ class ProcessExecutor(Executor):
         for connection, worker in busy.items():
             if connection in ready:
                 try:
-                    replies.append((worker, pickle.loads(connection.recv_bytes())))
+                    reply = pickle.loads(connection.recv_bytes())
+                    if reply is None:
+                        worker.begin()
+                    else:
+                        index, outcome = reply
+                        assert index == worker.job, "a worker answers to another rollout than its own"
+                        replies.append((worker, outcome))
                 except (EOFError, OSError):
                     code = worker.process.wait()
                     replies.append((worker, f"its worker process died (exit code {code})"))

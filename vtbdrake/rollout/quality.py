@@ -21,7 +21,7 @@ class Quality:
     Attributes:
         f: the quality function. It gets the quality variables in the order of ``of``, floats or arrays.
         of: sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
-            DPS's or the simulation's; ``time`` is t.
+            DPS's or the simulation's; ``time`` is the simulation's clock.
     """
 
     f: Callable[..., float]

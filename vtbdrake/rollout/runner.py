@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from vtbdrake.rollout.quality import best_sample
+from vtbdrake.rollout.quality import QualityError, best_sample
 from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import VirtualTestbed
@@ -39,6 +39,10 @@ class RolloutRunner:
     def __init__(self, task: RolloutTask, testbed: VirtualTestbed | None = None) -> None:
         self.task = task
         self.testbed = testbed if testbed is not None else task.scenario.build()
+        if not same_scenario(self.testbed, task):
+            raise ValueError(
+                "the testbed was built from another scenario than the task's; leave it out, and it is built"
+            )
         if self.testbed.visualized:
             raise ValueError("a rollout does not draw: build the scenario without meshcat")
         self._variables = self.testbed.variables()
@@ -48,6 +52,8 @@ class RolloutRunner:
         self._s0 = self.testbed.default_context()
         if task.start is not None:
             self.testbed.restore(self._s0, task.start)
+            # In a rollout there is no reality: a copy of the running robot throws its switches.
+            self.testbed.switch(self._s0, "sim")
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
         self._config = self.testbed.simulator_fields.config()
@@ -71,9 +77,11 @@ class RolloutRunner:
                 if cancel is not None and cancel.is_set():
                     raise CancelledError
                 status = self._advance(t)
-                if samples.take(t) and not self.task.run_on:
+                terminated = _terminated(status)
+                reached = self._context.get_time() - self._s0.get_time() if terminated else float(t)
+                if samples.take(reached) and not self.task.run_on:
                     break
-                if status is not None and status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                if terminated and status is not None:
                     end, message = TERMINATED, status.FormatMessage()
                     break
         except SimulationError as failure:
@@ -93,7 +101,9 @@ class RolloutRunner:
         try:
             self._reset(parameters)
             for time_ in self._times[: last + 1]:
-                self._advance(time_)
+                status = self._advance(time_)
+                if status is not None and _terminated(status):
+                    raise SimulationError(status.FormatMessage())
         except SimulationError as failure:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
         return self.testbed.snapshot(self._context)
@@ -140,6 +150,15 @@ class RolloutRunner:
         return self._context
 
 
+def same_scenario(testbed: VirtualTestbed, task: RolloutTask) -> bool:
+    """Whether the testbed is that of the task."""
+    return testbed.scenario is not None and testbed.scenario.record() == task.scenario.record()
+
+
+def _terminated(status: SimulatorStatus | None) -> bool:
+    return status is not None and status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition
+
+
 class _FailuresAsOutcomes:
     """Turns what comes out of a simulation that goes wrong into SimulationError.
 
@@ -161,6 +180,7 @@ class _Samples:
     def __init__(self, runner: RolloutRunner) -> None:
         self._runner = runner
         self._times: list[float] = []
+        self._clock = np.nan
         self._quality: list[float] = []
         self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
 
@@ -170,10 +190,17 @@ class _Samples:
         with _FailuresAsOutcomes():
             values = [read(runner.context) for read in runner._quality_readers]
             recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
-        if not all(np.isfinite(value).all() for value in values):
-            raise SimulationError(f"a quality variable is not finite at t = {t:g} s")
-        quality = task.quality(values, time=t) if task.quality is not None else None
-        self._times.append(float(t))
+        quality = None
+        if task.quality is not None:
+            try:
+                quality = task.quality(values, time=t)
+            except QualityError as error:
+                # f may know what NaN means (nothing was detected); where it does not, the simulation is to blame.
+                if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
+                    raise
+                raise SimulationError(f"a quality variable is not finite: {error}") from error
+        self._times.append(t)
+        self._clock = runner.context.get_time()
         for address, value in recorded.items():
             self._record[address].append(value)
         if quality is None:
@@ -193,8 +220,9 @@ class _Samples:
             best = best_sample(quality, threshold=task.threshold)
             t_star, h = self._times[best], float(quality[best])
             if task.keep_state:
-                at_end = best == len(self._times) - 1
                 runner = self._runner
+                # A rollout that failed after t* has moved on.
+                at_end = best == len(self._times) - 1 and runner.context.get_time() == self._clock
                 state = runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
         return RolloutResult(
             parameters=parameters,

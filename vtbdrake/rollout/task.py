@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from math import inf, isfinite, isnan
 
@@ -25,7 +26,7 @@ class RolloutTask:
             error control is part of the trajectory.
         record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
         run_on: simulate to t_m although the threshold was exceeded.
-        start: s0 from a snapshot; None takes the scenario's defaults.
+        start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults.
         keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
     """
 
@@ -41,6 +42,8 @@ class RolloutTask:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "record", tuple(self.record))
+        # Its own: a scenario that is changed afterwards is another one.
+        object.__setattr__(self, "scenario", copy.deepcopy(self.scenario))
         if not (isfinite(self.horizon) and self.horizon > 0.0):
             raise ValueError(f"the horizon t_m must be positive and finite, not {self.horizon} s")
         if not (isfinite(self.sample_period) and 0.0 < self.sample_period <= self.horizon):

@@ -21,6 +21,7 @@ from math import inf
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 CONTINUOUS = "continuous"
 DISCRETE = "discrete"
@@ -41,7 +42,7 @@ class Element:
     shape: tuple[int, ...] = ()
     start: int = 0
     unit: str = "1"
-    bounds: tuple[float, float] = (-inf, inf)
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
 
 
 def parameter(

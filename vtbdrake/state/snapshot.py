@@ -9,7 +9,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.sensors import RgbdSensor
 
 from vtbdrake.state.archive import read_archive, write_archive
 from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
@@ -106,8 +109,9 @@ def take(
     """The snapshot of ``context``.
 
     Raises:
-        SnapshotError: a system of ours has abstract state without a codec.
+        SnapshotError: a system keeps something abstract that neither a codec nor a hidden variable carries.
     """
+    _refuse_lost(diagram, context, variables)
     groups: dict[str, np.ndarray] = {}
     for path, system in leaves(diagram):
         leaf_context = system.GetMyContextFromRoot(context)
@@ -149,6 +153,9 @@ def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Var
     context.SetTime(snapshot.time)
     for path, system in leaves(diagram):
         leaf_context = system.GetMyMutableContextFromRoot(context)
+        if not isinstance(system, SceneGraph | RgbdSensor):
+            # What a snapshot cannot hold, the memory of a discrete plant's last step, is to be that of a new context.
+            system.SetDefaultContext(leaf_context)
         for group, index in numeric_groups(leaf_context):
             write_group(leaf_context, group, index, snapshot.groups[f"{path}/{group}/{index}"])
         for index, codec in _codecs(path, system, leaf_context).items():
@@ -169,6 +176,20 @@ def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
         yield DISCRETE, index
     for index in range(leaf_context.num_numeric_parameter_groups()):
         yield PARAMETER, index
+
+
+def _refuse_lost(diagram: Diagram, context: Context, variables: Variables) -> None:
+    """Plants, SceneGraph and cameras come back by address, and so do switches, whose address begins their path."""
+    carried = {variable.address for variable in variables.values() if variable.hidden}
+    for path, system in leaves(diagram):
+        leaf_context = system.GetMyContextFromRoot(context)
+        if isinstance(system, MultibodyPlant | SceneGraph | RgbdSensor) or path.rpartition(".")[0] in carried:
+            continue
+        if leaf_context.num_abstract_parameters() or (leaf_context.num_abstract_states() and not is_python(system)):
+            raise SnapshotError(
+                f"{path} ({type(system).__name__}) keeps an abstract value that a snapshot cannot hold: keep it in "
+                "numeric state, or in abstract state of a system of yours with a codec"
+            )
 
 
 def _codecs(path: str, system: System, leaf_context: Context) -> dict[int, Codec]:

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
+from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 
 from vtbdrake.state import Variable
 from vtbdrake.state.element import PARAMETER, Element
-from vtbdrake.state.systems import leaf_variables
+from vtbdrake.state.systems import leaf_variables, leaves
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
@@ -166,6 +166,7 @@ class VirtualTestbedBuilder:
             MeshcatVisualizer.AddToBuilder(self.builder, self.scene_graph, meshcat, parameters)
         diagram = self.builder.Build()
         diagram.set_name("vtb")
+        self._refuse_what_cannot_be_repeated(diagram)
         return VirtualTestbed(
             diagram=diagram,
             interface=self.interface,
@@ -181,6 +182,17 @@ class VirtualTestbedBuilder:
             plant_roles=self._plant_roles(),
             visualized=meshcat is not None,
         )
+
+    @staticmethod
+    def _refuse_what_cannot_be_repeated(diagram: Diagram) -> None:
+        for path, system in leaves(diagram):
+            if "@" in path:
+                raise ValueError(f"the system {path} has no name, by which copies could find it: use AddNamedSystem")
+            if isinstance(system, RandomSource):
+                raise ValueError(
+                    f"{path} is a RandomSource, whose generator no copy can continue; compute noise from (seed, "
+                    "stream, tick), as the sensors in vtbdrake.components do"
+                )
 
     def _finish_plant(self) -> None:
         if self.plant is not None and not self.plant.is_finalized():
@@ -214,9 +226,11 @@ class VirtualTestbedBuilder:
         source = self.builder.AddNamedSystem(f"u.{signal.name}", ConstantVectorSource(default))
         self.builder.Connect(source.get_output_port(), self._dps.GetInputPort(signal.name))
         shape = () if signal.size == 1 else (default.size,)
-        bounds = (float(signal.vector(signal.lower).min()), float(signal.vector(signal.upper).max()))
+        bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
         element = Element("", PARAMETER, 0, shape, unit=signal.unit, bounds=bounds)
-        return list(leaf_variables(source.get_name(), source, declared=[element]))
+        (variable,) = leaf_variables(source.get_name(), source, declared=[element])
+        variable.check(default.reshape(shape))
+        return [variable]
 
     def _plant_roles(self) -> dict[str, str]:
         if self.plant is None:

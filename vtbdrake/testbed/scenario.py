@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import math
 import os
@@ -10,8 +11,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
+import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.geometry import Meshcat
@@ -97,10 +99,11 @@ class Scenario(ABC):
             SignalError: the signals of DPS and world do not fit.
         """
         self.validate()
-        builder = VirtualTestbedBuilder(self.interface(), simulator=self.simulator)
-        builder.set_dps(self.make_dps())
-        self.add_world(builder)
-        return builder.build(mode=mode, scenario=self, meshcat=meshcat, prefix=prefix)
+        own = copy.deepcopy(self)  # A scenario that is changed afterwards is another one.
+        builder = VirtualTestbedBuilder(own.interface(), simulator=own.simulator)
+        builder.set_dps(own.make_dps())
+        own.add_world(builder)
+        return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
 
     def name(self) -> str:
         """``package.module:Class``."""
@@ -167,7 +170,7 @@ def _load_yaml(path: Path) -> Scenario:
         schema = _scenario_class(name)
         _resolve_types(schema)
         return yaml_load_typed(schema=schema, filename=path, child_name=name)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         if isinstance(error, ScenarioError):
             raise
         raise ScenarioError(f"{path} does not fit {name}: {error}") from error
@@ -178,8 +181,16 @@ def _resolve_types(schema: type) -> None:
     hints = get_type_hints(schema)
     for item in fields(schema):
         item.type = hints[item.name]
-        if is_dataclass(item.type):
-            _resolve_types(item.type)  # type: ignore[arg-type]
+        for part in _parts(item.type):
+            if isinstance(part, type) and is_dataclass(part):
+                _resolve_types(part)
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """A type, and those that it is made of: of list[Rock] | None also list[Rock], Rock and None."""
+    yield hint
+    for argument in get_args(hint):
+        yield from _parts(argument)
 
 
 def _refuse_twins(node: yaml.Node, path: Path) -> None:
@@ -197,7 +208,11 @@ def _refuse_twins(node: yaml.Node, path: Path) -> None:
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, dict | list | tuple) and not value:
+        yield name, None
+    elif isinstance(value, dict):
         for key, item in value.items():
             yield from _flat(item, f"{name}.{key}".lstrip("."))
     elif isinstance(value, list | tuple):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
@@ -87,7 +87,7 @@ class VirtualTestbed:
         self._beliefs = beliefs
         self._variables = collect(
             diagram,
-            plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}",
+            plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
             skip=lambda path: path.startswith(("T_sense.", "T_act.", "u.")),
             extra=[
                 Variable("time", X, (), "s", lambda context: context.get_time()),
@@ -104,16 +104,19 @@ class VirtualTestbed:
         """A new context: s0 from defaults."""
         return self.diagram.CreateDefaultContext()
 
-    def simulator(self, context: Context | None = None) -> Simulator:
+    def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
         """A new Drake Simulator of the testbed with its own integrator settings.
 
-        Raises:
-            ValueError: Drake does not know the integration scheme.
+        Args:
+            restored: ``context`` continues another one; initialization events, which would overwrite its state, have
+                happened before.
         """
         simulator = Simulator(self.diagram, context if context is not None else self.default_context())
         time = simulator.get_context().get_time()
         ApplySimulatorConfig(self.simulator_fields.config(), simulator)
         simulator.get_mutable_context().SetTime(time)
+        if restored:
+            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return simulator
 
     # -- addresses
@@ -229,7 +232,12 @@ class VirtualTestbed:
         """
         if self.scenario is not None and snapshot.scenario:
             mine, theirs = self.scenario.record(), snapshot.scenario
-            differing = [f"{k}: {theirs.get(k)!r} there, {v!r} here" for k, v in mine.items() if theirs.get(k) != v]
+            keys = ["scenario"] if theirs["scenario"] != mine["scenario"] else [*mine, *(theirs.keys() - mine.keys())]
+            differing = [
+                f"{key}: {theirs.get(key, 'nothing')!r} there, {mine.get(key, 'nothing')!r} here"
+                for key in keys
+                if key not in mine or key not in theirs or mine[key] != theirs[key]
+            ]
             if differing:
                 raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
         snapshots.apply(snapshot, self.diagram, context, self._variables)
@@ -237,12 +245,20 @@ class VirtualTestbed:
     def start_from_belief(self, context: Context) -> None:
         """s_sim(t0) from s_dps(t): sets the simulated world to what the DPS in ``context`` believes.
 
+        An estimate beyond the bounds of what it is about (a joint a little past its stop) is taken to the bound.
+
         Raises:
             ValueError: the testbed declares no belief, or a variable refuses what is believed of it.
         """
         if not self._beliefs:
             raise ValueError("this testbed does not declare what of its DPS sets its simulated world (see `believe`)")
-        self.write(context, {b.target: b.value(self._variables, context) for b in self._beliefs})
+        self.write(
+            context,
+            {
+                belief.target: np.clip(belief.value(self._variables, context), *self._variables[belief.target].bounds)
+                for belief in self._beliefs
+            },
+        )
 
     def copier_from(self, source: VirtualTestbed) -> StateCopier:
         """Copies contexts of ``source`` (this testbed, or another of the same scenario) to contexts of this one."""

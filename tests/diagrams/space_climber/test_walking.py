@@ -100,3 +100,13 @@ def test_walk_command_of_zero_stands() -> None:
 def test_repeats_bit_for_bit() -> None:
     first, second = (simulate(duration=2.0, gravity=3.71) for _ in range(2))
     np.testing.assert_array_equal(first.position, second.position)
+
+
+def test_an_imu_that_is_mounted_askew_feels_gravity_askew() -> None:
+    testbed = SpaceClimberScenario(payload=False).build()
+    root = testbed.default_context()
+    askew = {"sim.sense.imu.mount[3]": np.pi / 2, "u.walk": 0.0, "dps.impl.gait.posture_gain": 0.0}
+    testbed.write(root, askew)
+    testbed.simulator(root).AdvanceTo(2.0)
+    # Rolled by 90 deg, its y axis points up.
+    np.testing.assert_allclose(testbed.read(root, "sim.sense.imu.imu")[3:], [0.0, LUNAR_GRAVITY, 0.0], atol=0.03)

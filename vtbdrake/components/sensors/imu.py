@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from math import atan2, sqrt
+from math import atan2, cos, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
-from pydrake.systems.framework import Context, DiscreteValues
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state import discrete_state
+from vtbdrake.state import discrete_state, parameter
 
 Vector3 = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]
@@ -41,6 +41,9 @@ class Imu(SampledSensor):
     with R_mid the orientation halfway between. It needs no accelerations (which are direct feedthrough of the actuation
     in a continuous plant, and empty after a restore in a discrete one). The first sample has no predecessor: it
     shows w = 0 and f = -R_WF' g, and so does the output before it, for the plant's default pose.
+
+    F starts where ``frame`` is on B. From then on the parameter ``mount``, [x, y, z, roll, pitch, yaw] of F in B, says
+    where the sensor sits; moving ``frame`` does not move it.
     """
 
     def __init__(self, plant: MultibodyPlant, frame: Frame, *, period: float, stream: int = 0) -> None:
@@ -49,8 +52,7 @@ class Imu(SampledSensor):
         self._g_W: Vector3 = tuple(plant.gravity_field().gravity_vector().tolist())
         self._body = int(body.index())
         X_BF = frame.GetFixedPoseInBodyFrame()
-        self._p_BF: Vector3 = tuple(X_BF.translation().tolist())
-        self._q_BF: Wxyz = tuple(X_BF.rotation().ToQuaternion().wxyz().tolist())
+        mount = [*X_BF.translation().tolist(), *RollPitchYaw(X_BF.rotation()).vector().tolist()]
         q_WF = tuple(frame.CalcPoseInWorld(default_context).rotation().ToQuaternion().wxyz().tolist())
         super().__init__(
             "imu",
@@ -62,7 +64,9 @@ class Imu(SampledSensor):
         )
         # [number of samples (0 or 1 is all that matters), v_WF, q_WF (wxyz)] at the last sample.
         self._memory = int(self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])))
+        self._mount = int(self.DeclareNumericParameter(BasicVector(mount)))
         self.variables += (
+            parameter("mount", self._mount, shape=(6,), unit="m, rad"),
             discrete_state("sampled", self._memory, start=0, bounds=(0.0, 1.0)),
             discrete_state("last_velocity", self._memory, shape=(3,), start=1, unit="m/s"),
             discrete_state("last_orientation", self._memory, shape=(4,), start=4),
@@ -114,10 +118,11 @@ class Imu(SampledSensor):
             V_WB = self._velocities_port.Eval(context)[self._body]
             wx, wy, wz = V_WB.rotational().tolist()
             vx, vy, vz = V_WB.translational().tolist()
-        if any(self._p_BF):
-            px, py, pz = _rotate(q_WB, self._p_BF)
+        x, y, z, *rpy = context.get_numeric_parameter(self._mount).value().tolist()
+        if x or y or z:
+            px, py, pz = _rotate(q_WB, (x, y, z))
             vx, vy, vz = vx + wy * pz - wz * py, vy + wz * px - wx * pz, vz + wx * py - wy * px
-        return _product(q_WB, self._q_BF), (vx, vy, vz)
+        return (_product(q_WB, _quaternion(*rpy)) if any(rpy) else q_WB), (vx, vy, vz)
 
 
 # Plain floats: for three and four numbers several times faster than numpy.
@@ -130,6 +135,14 @@ def _negative(v: Vector3) -> Vector3:
 def _unit(w: float, x: float, y: float, z: float) -> Wxyz:
     scale = 1.0 / sqrt(w * w + x * x + y * y + z * z)
     return (w * scale, x * scale, y * scale, z * scale)
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> Wxyz:
+    """Of Rz(yaw) Ry(pitch) Rx(roll)."""
+    qx = (cos(roll / 2), sin(roll / 2), 0.0, 0.0)
+    qy = (cos(pitch / 2), 0.0, sin(pitch / 2), 0.0)
+    qz = (cos(yaw / 2), 0.0, 0.0, sin(yaw / 2))
+    return _product(qz, _product(qy, qx))
 
 
 def _product(a: Wxyz, b: Wxyz) -> Wxyz:
