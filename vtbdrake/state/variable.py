@@ -93,7 +93,7 @@ class Variable:
     def bounds_text(self) -> str:
         """The closed interval of the bounds, to be read; of an array with several, the first."""
         lower, upper = (float(np.ravel(bound)[0]) for bound in self.bounds)
-        more = ", ..." if any(np.size(bound) > 1 for bound in self.bounds) else ""
+        more = ", ..." if any(np.unique(bound).size > 1 for bound in self.bounds) else ""
         return f"[{lower:g}, {upper:g}]{more}"
 
     def set(self, context: Context, value: ArrayLike) -> None:
