@@ -1,0 +1,124 @@
+"""Where a problem starts, how far its rollouts go, under which condition, and what half a sweep may say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vtbdrake as vtb
+from tests.testbeds import PendulumScenario
+from vtbdrake.rollout import Executor, SerialExecutor
+
+THETA = "sim.sys.Pendulum.theta.position"
+OMEGA = "sim.sys.Pendulum.theta.velocity"
+DAMPING = "sim.sys.Pendulum.theta.damping"
+
+
+def _angle(theta):
+    return abs(theta)
+
+
+def _problem(**changes):
+    arguments = dict(
+        scenario=PendulumScenario(),
+        parameters=[vtb.Parameter(OMEGA, 0.0, 8.0)],
+        quality=vtb.Quality(_angle, THETA),
+        horizon=3.0,
+    )
+    return vtb.Problem(**{**arguments, **changes})
+
+
+def test_a_problem_starts_from_its_snapshot():
+    scenario = PendulumScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {THETA: 0.7, OMEGA: 5.0, DAMPING: 0.03})
+    context.SetTime(2.0)
+    problem = _problem(scenario=scenario, start=testbed.snapshot(context), horizon=0.5)
+    rollout = problem.rollout([0.25], record=[THETA, OMEGA, DAMPING, "time"])
+    first = {address: values[0] for address, values in rollout.record.items()}
+    # What is varied is the problem's, all else the snapshot's.
+    assert first == {THETA: 0.7, OMEGA: 0.25, DAMPING: 0.03, "time": 2.0}
+    assert rollout.times[0] == 0.0
+    sweep = problem.sweep(values=[0.25], executor="serial", progress=False)
+    np.testing.assert_array_equal(sweep.rollouts[0].quality, rollout.quality)
+    assert problem.state([0.25], 0.0)[THETA] == 0.7
+    assert problem.motion({OMEGA: 0.25}).states[0].tolist() == [0.7, 0.25]
+
+
+def test_a_sweep_that_runs_on_has_all_exceedances():
+    problem = _problem(threshold=1.0, conditions=[{DAMPING: 0.0}])
+    stopped = problem.sweep(values=[2.0, 5.0], executor="serial", progress=False)
+    whole = problem.sweep(values=[2.0, 5.0], executor="serial", progress=False, run_on=True)
+    assert [rollout.exceedances.size for rollout in stopped.rollouts] == [0, 1]
+    below, above = whole.rollouts
+    assert below.exceedances.size == 0
+    assert above.times[-1] == 3.0
+    # It swings to both sides: the quality goes above the threshold, and falls below it again, several times.
+    crossings = np.diff(above.quality > 1.0)
+    assert np.count_nonzero(crossings) >= 3
+    np.testing.assert_array_equal(above.exceedances, above.times[above.quality > 1.0])
+    np.testing.assert_array_equal(whole.t_star, stopped.t_star)
+    np.testing.assert_array_equal(whole.h, stopped.h)
+
+
+def test_a_rollout_is_under_the_condition_asked_for():
+    problem = _problem(conditions=[{THETA: 0.1}, {THETA: 0.2, DAMPING: 0.5}])
+    sweep = problem.sweep(values=[1.0], executor="serial", progress=False)
+    for number, theta in enumerate((0.1, 0.2)):
+        rollout = problem.rollout([1.0], condition=number, record=[THETA])
+        assert rollout.record[THETA][0] == theta
+        assert rollout.condition == problem.conditions[number]
+        assert rollout.parameters == {**problem.conditions[number], OMEGA: 1.0}
+        assert rollout.h == sweep.h[number]
+        assert problem.state([1.0], 0.0, condition=number)[THETA] == theta
+    assert sweep.h[0] != sweep.h[1]
+
+
+class Interrupted(Executor):
+    """Ctrl-C comes after some rollouts."""
+
+    def __init__(self, rollouts):
+        self._rollouts = rollouts
+
+    def run(self, task, points):
+        yield from SerialExecutor().run(task, points[: self._rollouts])
+        raise KeyboardInterrupt
+
+
+def test_a_point_that_has_not_finished_its_conditions_is_not_the_best():
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}])
+    speeds = [1.0, 2.0, 3.0]
+    half = problem.sweep(values=speeds, executor=Interrupted(5), progress=False)
+    assert half.points[:, 0].tolist() == [1.0, 1.0, 2.0, 2.0, 3.0]
+    # The fastest swings highest, but only its first condition is known.
+    assert np.argmax(half.h) == 4
+    assert half.best() == ({OMEGA: 2.0}, half.h[3])
+    whole = problem.sweep(values=speeds, executor="serial", progress=False)
+    assert whole.best() == ({OMEGA: 3.0}, whole.h[5])
+    with pytest.raises(ValueError, match="no point of the sweep has a quality under all conditions"):
+        problem.sweep(values=speeds, executor=Interrupted(1), progress=False).best()
+
+
+def test_an_interrupted_sweep_has_no_boundary():
+    problem = _problem(threshold=1.0)
+    half = problem.sweep(values=[1.0, 2.0, 3.0], executor=Interrupted(2), progress=False)
+    assert (len(half), half.complete) == (2, False)
+    with pytest.raises(ValueError, match="the sweep was interrupted"):
+        half.boundary()
+    # Of the same rollouts, were they all, it is known.
+    assert replace(half, complete=True).boundary().lower == 2.0
+
+
+def test_an_interrupted_sweep_is_still_one_after_its_file(tmp_path):
+    half = _problem().sweep(values=[1.0, 2.0], executor=Interrupted(1), progress=False)
+    half.save(tmp_path / "half.vtb")
+    loaded = vtb.Sweep.load(tmp_path / "half.vtb")
+    assert not loaded.complete
+    with pytest.raises(ValueError, match="the sweep was interrupted"):
+        loaded.boundary()
+
+
+def test_an_interrupted_search_says_nothing():
+    with pytest.raises(KeyboardInterrupt):
+        _problem(threshold=1.0).boundary(resolution=1.0, coarse=4.0, executor=Interrupted(2), progress=False)

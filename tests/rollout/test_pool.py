@@ -1,0 +1,117 @@
+"""An executor outlives its tasks, the errors in them, and its workers."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.rollout import ProcessExecutor, Quality, QualityError, RolloutTask, SerialExecutor, ThreadExecutor
+
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+ELBOW = "sim.sys.Acrobot.elbow.position"
+THETA = "sim.sys.Pendulum.theta.position"
+
+
+def _angle(theta):
+    return abs(theta)
+
+
+def _square(theta):
+    return theta**2
+
+
+ANGLE = RolloutTask(AcrobotScenario(), 0.5, Quality(_angle, SHOULDER))
+# All that a task has is different: the testbed, the quality, the horizon and the sample times.
+OTHER = RolloutTask(AcrobotScenario(period=0.04), 0.8, Quality(_square, ELBOW), sample_period=0.1, record=(SHOULDER,))
+POINTS = [{SHOULDER: value} for value in (0.2, 0.9, 1.6)]
+
+
+def _results(executor, task, points):
+    """One result per point; each has been yielded exactly once."""
+    found = list(executor.run(task, points))
+    assert sorted(index for index, _ in found) == list(range(len(points)))
+    return [result for _, result in sorted(found, key=lambda item: item[0])]
+
+
+def _assert_right(executor, task, points):
+    expected = _results(SerialExecutor(), task, points)
+    results = _results(executor, task, points)
+    assert all(a.identical(b) for a, b in zip(results, expected, strict=True))
+    assert not any(result.failed for result in results)
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+def test_a_second_task_gets_its_own_results(make):
+    with make() as executor:
+        _assert_right(executor, ANGLE, POINTS)
+        _assert_right(executor, OTHER, POINTS)
+        _assert_right(executor, ANGLE, POINTS)
+
+
+def _slow_and_refuses_large_angles(theta):
+    if theta > 3.0:
+        raise RuntimeError("too large")
+    time.sleep(0.1)
+    return abs(theta)
+
+
+@pytest.mark.parametrize("make", [lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+def test_after_an_error_in_the_quality_the_pool_serves_another_task(make):
+    # The first point is refused at once, while the second one is on its way for 6 s.
+    troubled = RolloutTask(AcrobotScenario(), 3.0, Quality(_slow_and_refuses_large_angles, SHOULDER))
+    with make() as executor:
+        _assert_right(executor, ANGLE, POINTS[:2])
+        begin = time.monotonic()
+        with pytest.raises(QualityError, match="_large_angles at t = 0 s, .* raises RuntimeError: too large"):
+            list(executor.run(troubled, [{SHOULDER: 3.1}, {SHOULDER: 0.1}]))
+        error_after = time.monotonic() - begin
+        assert not any(worker.job is not None for worker in getattr(executor, "_workers", []))
+        _assert_right(executor, OTHER, POINTS)
+    assert error_after < 4.0
+
+
+def test_a_worker_that_died_while_idle_costs_nothing(caplog):
+    with ProcessExecutor(2) as executor:
+        _assert_right(executor, ANGLE, POINTS)
+        dead = executor._workers[0].process
+        dead.kill()
+        dead.wait()
+        _assert_right(executor, OTHER, POINTS)
+        assert len(executor._workers) == 2
+        assert all(worker.process.poll() is None for worker in executor._workers)
+    # No rollout was lost with it.
+    assert caplog.text == ""
+
+
+def test_a_closed_executor_has_no_processes_left():
+    executor = ProcessExecutor(2)
+    _assert_right(executor, ANGLE, POINTS[:2])
+    processes = [worker.process for worker in executor._workers]
+    assert len(processes) == 2
+    executor.close()
+    assert all(process.poll() is not None for process in processes)
+
+
+def test_an_error_in_one_thread_is_raised_when_the_others_have_stopped():
+    calls = []
+    both = threading.Barrier(2)
+
+    def f(theta):
+        if not calls:
+            calls.append(theta)
+            both.wait(timeout=10.0)
+            raise RuntimeError("too large")
+        if len(calls) == 1:
+            both.wait(timeout=10.0)
+        calls.append(theta)
+        time.sleep(0.2)
+        return abs(theta)
+
+    task = RolloutTask(PendulumScenario(stiffness=1.0), 1.0, Quality(f, THETA))
+    with ThreadExecutor(2) as executor, pytest.raises(QualityError, match="too large"):
+        list(executor.run(task, [{THETA: value} for value in np.linspace(0.1, 1.0, 4)]))
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rollout-")]
+    # The other thread was in its first sample, and has neither gone on nor begun another rollout.
+    assert len(calls) <= 3
