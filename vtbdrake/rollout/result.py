@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf, nan
 from typing import Any
 
 import numpy as np
+from pydrake.math import RigidTransform
 
 from vtbdrake.rollout.quality import exceedances
 from vtbdrake.state import Snapshot
@@ -66,6 +68,7 @@ class RolloutResult:
             and all(np.array_equal(v, other.parameters[k]) for k, v in self.parameters.items())
             and _same(self.t_star, other.t_star)
             and _same(self.h, other.h)
+            and self.threshold == other.threshold
             and _same(self.times, other.times)
             and _same(self.quality, other.quality)
             and self.record.keys() == other.record.keys()
@@ -77,5 +80,10 @@ class RolloutResult:
 
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, list):
-        return bool(a == b)
-    return bool(np.array_equal(a, b, equal_nan=True))
+        return isinstance(b, list) and len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, RigidTransform):
+        return isinstance(b, RigidTransform) and a.IsExactlyEqualTo(b)
+    if isinstance(a, float | int | np.ndarray):
+        return bool(np.array_equal(a, b, equal_nan=True))
+    # Drake's images and other objects compare by identity; their bytes do not.
+    return pickle.dumps(a) == pickle.dumps(b)
