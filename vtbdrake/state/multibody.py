@@ -48,7 +48,9 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Va
                 yield _pose_entry(plant, body, address, entry)
     for index in range(plant.num_frames()):
         frame = plant.get_frame(FrameIndex(index))
-        if isinstance(frame, FixedOffsetFrame) and frame.name() and not frame.is_ephemeral():
+        # A name that begins with underscores is the parser's, not the model's.
+        named = frame.name() and not frame.name().startswith("__")
+        if isinstance(frame, FixedOffsetFrame) and named and not frame.is_ephemeral():
             yield _frame_pose(plant, frame, element_address(plant, frame, prefix))
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
