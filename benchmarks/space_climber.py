@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 import vtbdrake as vtb
-from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio, seconds, spread
+from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, seconds, spread
 from benchmarks.plain_climber import build_plain_climber
 from diagrams.space_climber import SpaceClimberScenario
 from diagrams.space_climber.payload import HORIZON, MASS, PITCH, SAMPLE_PERIOD, payload_problem, tipped_over
@@ -18,7 +18,7 @@ DISTANCE = "sim.sys.climber.base.x"
 REFERENCE = vtb.SimulatorFields("cenic", 0.1, 1e-6)
 
 
-def testbed_overhead(repeats: int = 9) -> Benchmark:
+def testbed_overhead(repeats: int = 25) -> Benchmark:
     """The testbed against the same systems wired by hand in plain Drake, same integrator, 15 s of walking."""
     scenario = SpaceClimberScenario()
     testbed = scenario.build()
@@ -39,7 +39,8 @@ def testbed_overhead(repeats: int = 9) -> Benchmark:
     x_plain = plain.plant.GetPositions(plain.plant.GetMyContextFromRoot(other.get_context()))[4]
     return Benchmark(
         name="testbed_overhead",
-        value=ratio(a, b),
+        # The machine's speed drifts: each run against its neighbour.
+        value=float(np.median(a / b)),
         unit="1",
         goal=1.03,
         better=LOWER,
