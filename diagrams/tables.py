@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from vtbdrake.state.files import whole_file
 
 # Name of a row -> the function that produces it: itself, or as "package.module:function", imported when it is its turn.
 Registry = Mapping[str, str | Callable[..., Any]]
@@ -61,12 +62,8 @@ def _function(entry: str | Callable[..., Any]) -> Callable[..., Any]:
 
 def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes a JSON list of objects, whole or not at all; null stands for what is not finite, so for an open end."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
+    with whole_file(path) as partial:
         partial.write_text(json.dumps([_plain(dict(row)) for row in rows], indent=2, allow_nan=False) + "\n")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _plain(value: Any) -> Any:

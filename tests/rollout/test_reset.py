@@ -1,11 +1,12 @@
 """A rollout starts from s0 and nothing else, ends where the plant does, and its result is compared as a whole."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.testbeds import AcrobotScenario, SampledFeedback
+from tests.rollout.test_runner import SelfWilledScenario
+from tests.testbeds import AcrobotScenario
 from vtbdrake.rollout import Quality, RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.state import Snapshot
 
@@ -14,25 +15,8 @@ VELOCITY = "sim.sys.Acrobot.shoulder.velocity"
 FRICTION = "sim.sys.Acrobot.lower_link.friction"
 
 
-class Initialized(SampledFeedback):
-    """Its torque is 7 N m once it is initialized, and its law's from the first sample on."""
-
-    def __init__(self):
-        super().__init__(0.02)
-        self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
-
-    def _initialize(self, context, state):
-        state.get_mutable_discrete_state(0).SetFromVector([7.0])
-
-
-@dataclass
-class InitializedScenario(AcrobotScenario):
-    def make_dps(self):
-        return Initialized()
-
-
 def test_initialization_events_do_not_touch_a_restored_s0():
-    scenario = InitializedScenario()
+    scenario = SelfWilledScenario()
     task = RolloutTask(scenario, 0.1, record=("dps.torque",))
     fresh = RolloutRunner(task)
     assert fresh.run({}).record["dps.torque"][0] == 7.0
@@ -43,7 +27,7 @@ def test_initialization_events_do_not_touch_a_restored_s0():
 
 
 def test_what_is_set_in_a_restored_s0_is_not_initialized_away():
-    scenario = InitializedScenario()
+    scenario = SelfWilledScenario()
     task = RolloutTask(scenario, 0.1, record=("dps.torque",))
     start = RolloutRunner(task).state({}, 0.05)
     result = RolloutRunner(replace(task, start=start)).run({"dps.torque": 2.5})

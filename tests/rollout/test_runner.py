@@ -222,7 +222,7 @@ def test_a_system_may_end_the_rollout():
 
 
 class SelfWilled(SampledFeedback):
-    """Sets its own gain when it is initialized."""
+    """Its torque is 7 N m once it is initialized, and its law's from the first sample on."""
 
     def __init__(self):
         super().__init__(0.02)

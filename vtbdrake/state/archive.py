@@ -7,10 +7,11 @@ import os
 import zipfile
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from vtbdrake.state.files import whole_file
 
 _HEADER = "header.json"
 
@@ -28,17 +29,11 @@ def write_archive(
     arrays: Mapping[str, np.ndarray],
 ) -> None:
     """Writes ``arrays`` and ``header`` (plain data) as a file of ``kind``."""
-    target = Path(path)
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-    try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, **header}))
-            for key, value in arrays.items():
-                with archive.open(f"{key}.npy", "w") as entry:
-                    np.lib.format.write_array(entry, value, allow_pickle=False)
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, **header}))
+        for key, value in arrays.items():
+            with archive.open(f"{key}.npy", "w") as entry:
+                np.lib.format.write_array(entry, value, allow_pickle=False)
 
 
 def read_archive(

@@ -6,7 +6,6 @@ import html
 import os
 from collections.abc import Mapping
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +22,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from vtbdrake.state.files import whole_file
 from vtbdrake.testbed import VirtualTestbed
 
 if TYPE_CHECKING:
@@ -138,13 +138,8 @@ def save_html(
     legend: Mapping[str, str] | None = None,
 ) -> None:
     """Writes the `page`, whole or not at all."""
-    target = Path(path)
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-    try:
+    with whole_file(path) as partial:
         partial.write_text(page(meshcat, title=title, legend=legend), encoding="utf-8")
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _caption(title: str, legend: Mapping[str, str]) -> str:
