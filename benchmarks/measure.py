@@ -51,7 +51,7 @@ class Benchmark:
 
 
 def interleaved(
-    a: Callable[[], Any], b: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1
+    a: Callable[[], Any], b: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1, first: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Wall times of ``a`` and ``b`` in seconds, each of shape (repeats,).
 
@@ -59,15 +59,16 @@ def interleaved(
 
     Args:
         warm_up: runs of each that are not counted.
+        first: 1 if ``b`` begins.
 
     Raises:
         ValueError: there are no repeats.
     """
-    return interleaved_values(lambda: seconds(a), lambda: seconds(b), repeats=repeats, warm_up=warm_up)
+    return interleaved_values(lambda: seconds(a), lambda: seconds(b), repeats=repeats, warm_up=warm_up, first=first)
 
 
 def interleaved_values(
-    a: Callable[[], float], b: Callable[[], float], *, repeats: int = 5, warm_up: int = 1
+    a: Callable[[], float], b: Callable[[], float], *, repeats: int = 5, warm_up: int = 1, first: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """As `interleaved`, of functions that measure themselves and return the number."""
     if repeats < 1:
@@ -77,7 +78,7 @@ def interleaved_values(
         b()
     values: dict[int, list[float]] = {0: [], 1: []}
     for i in range(repeats):
-        for which in ((0, 1), (1, 0))[i % 2]:
+        for which in ((0, 1), (1, 0))[(i + first) % 2]:
             values[which].append((a, b)[which]())
     return np.array(values[0]), np.array(values[1])
 

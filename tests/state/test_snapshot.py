@@ -52,7 +52,7 @@ def test_every_numeric_group_of_every_system_is_in_it():
     testbed = AcrobotScenario(time_step=0.005).build()
     context = testbed.default_context()
     groups = testbed.snapshot(context).groups
-    entries = sum(a.size for a in groups.values())
+    entries = sum(array.size for key, array in groups.items() if "/abstract/" not in key)
     expected = sum(context.get_discrete_state(i).size() for i in range(context.num_discrete_state_groups()))
     expected += sum(context.get_numeric_parameter(i).size() for i in range(context.num_numeric_parameter_groups()))
     assert entries == expected > 0

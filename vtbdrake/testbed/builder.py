@@ -18,7 +18,7 @@ from vtbdrake.state.systems import leaf_variables, leaves
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
-from vtbdrake.testbed.switch import ActSide, Selector, SenseSwitch
+from vtbdrake.testbed.switch import Switches
 from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
@@ -156,8 +156,8 @@ class VirtualTestbedBuilder:
                 )
         self._finish_plant()
         sense_position, act_position = MODES[mode]
-        sense = {s.name: self._switch_sense(s, sense_position) for s in self.interface.sense}
-        act = self._switch_act(act_position)
+        switches = Switches(self.builder, self.interface, sense_position, act_position, self._dps)
+        self._connect_switches(switches, self._dps)
         commands = [v for s in self.interface.commands for v in self._connect_command(s)]
         if meshcat is not None:
             if self.scene_graph is None:
@@ -173,8 +173,8 @@ class VirtualTestbedBuilder:
             dps=self._dps,
             plant=self.plant,
             scene_graph=self.scene_graph,
-            sense={name: switch.selector for name, switch in sense.items()},
-            act=act,
+            sense=switches.sense,
+            act=switches.act,
             simulator=self.simulator,
             scenario=scenario,
             beliefs=tuple(self._beliefs),
@@ -198,24 +198,16 @@ class VirtualTestbedBuilder:
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
 
-    def _switch_sense(self, signal: Signal, position: str) -> SenseSwitch:
-        assert self._dps is not None
-        switch = SenseSwitch(self.builder, signal, position)
-        self.builder.Connect(self._sensors[signal.name], switch.sim_port)
-        self.builder.ExportInput(switch.real_port, f"real.sense.{signal.name}")
-        self.builder.Connect(switch.output_port, self._dps.GetInputPort(signal.name))
-        return switch
-
-    def _switch_act(self, position: str) -> dict[str, Selector]:
-        assert self._dps is not None
-        if not self.interface.act:
-            return {}
-        side = ActSide(self.builder, self.interface.act, position, self._dps)
-        for name, port in self._actuators.items():
-            self.builder.Connect(side.sim_ports[name], port)
-            self.builder.ExportOutput(side.real_ports[name], f"real.act.{name}")
-        self.builder.ExportOutput(side.active_port, "real.act.active")
-        return side.selectors
+    def _connect_switches(self, switches: Switches, dps: System) -> None:
+        for name, sensor in self._sensors.items():
+            self.builder.Connect(sensor, switches.sim_sense[name])
+            self.builder.ExportInput(switches.real_sense[name], f"real.sense.{name}")
+            self.builder.Connect(switches.dps_sense[name], dps.GetInputPort(name))
+        for name, actuator in self._actuators.items():
+            self.builder.Connect(switches.sim_act[name], actuator)
+            self.builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
+        if self._actuators:
+            self.builder.ExportOutput(switches.active, "real.act.active")
 
     def _connect_command(self, signal: Signal) -> list[Variable]:
         assert self._dps is not None

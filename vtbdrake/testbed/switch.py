@@ -1,40 +1,37 @@
-"""T_sense and T_act (Figure 4): for every signal, a selector in the Context and the switch that it throws."""
+"""T_sense and T_act (Figure 4): for every signal, its position in the Context and the switch that it throws."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
+    BasicVector_,
     Context,
     DiagramBuilder,
     InputPort,
     InputPortIndex,
     LeafSystem,
+    LeafSystem_,
     OutputPort,
     System,
+    SystemScalarConverter,
 )
-from pydrake.systems.primitives import (
-    ConstantValueSource,
-    ConstantVectorSource,
-    Demultiplexer,
-    Multiplexer,
-    PortSwitch,
-    ZeroOrderHold,
-)
+from pydrake.systems.primitives import ConstantValueSource, PortSwitch
+from pydrake.systems.scalar_conversion import TemplateSystem
 
+from vtbdrake.state.element import Codec
 from vtbdrake.state.variable import Variable, VariableError, X
-from vtbdrake.testbed.signal import Signal
+from vtbdrake.testbed.signal import Interface, Signal
 
 SIM, REAL, TWIN = "sim", "real", "twin"
 SENSE_POSITIONS = (SIM, REAL)
 ACT_POSITIONS = (SIM, REAL, TWIN)
 
-# A ZeroOrderHold whose update never comes is a C++ system that keeps an abstract value in the Context.
-_NEVER = 1e300
+T_SENSE, T_ACT, BOARD = "T_sense.", "T_act.", "switches"
 
 
 @dataclass(frozen=True)
@@ -44,32 +41,81 @@ class Command:
     value: Any = None
 
 
-class Selector:
-    """The position of one switch, kept in the Context as abstract state of a C++ system."""
+@TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
+def SwitchBoard_(T: type) -> type:
+    """The positions of all switches, and what a switched-off actuator signal gets, as state in the Context.
 
-    def __init__(self, builder: DiagramBuilder, name: str, positions: tuple[str, ...], position: str) -> None:
+    Every system of a Diagram costs time in each step of a simulation, whether it computes or not: so there is one for
+    all signals, and its ports show its state, which needs no Python while time runs.
+
+    .. pydrake_system::
+
+        name: SwitchBoard
+        output_ports:
+        - <switch> (InputPortIndex, as the selector port of a PortSwitch wants it)
+        - <constant>
+        - active (1 for every actuator signal whose switch lets it command, else 0)
+    """
+
+    class Impl(LeafSystem_[T]):
+        def _construct(
+            self,
+            switches: Mapping[str, int],
+            constants: Mapping[str, np.ndarray],
+            active: np.ndarray,
+            converter: SystemScalarConverter | None = None,
+        ) -> None:
+            LeafSystem_[T].__init__(self, converter)
+            self._arguments = switches, constants, active
+            for name, port in switches.items():
+                self.DeclareStateOutputPort(name, self.DeclareAbstractState(Value(InputPortIndex(port))))
+            for name, value in {**constants, "active": active}.items():
+                # A constant is state that never changes: a parameter would need a calculation to reach a port.
+                state = self.DeclareDiscreteState(BasicVector_[T](np.array(value)))
+                self.DeclareStateOutputPort(name, state)
+            self.variables = ()
+            self.codecs = dict.fromkeys(range(len(switches)), _POSITION_CODEC)
+
+        def _construct_copy(self, other: Any, converter: SystemScalarConverter | None = None) -> None:
+            switches, constants, active = other._arguments
+            Impl._construct(self, switches, constants, active, converter=converter)
+
+    return Impl
+
+
+SwitchBoard = SwitchBoard_[None]
+_POSITION_CODEC = Codec(
+    encode=lambda port: {"port": np.array(int(port))}, decode=lambda arrays: InputPortIndex(int(arrays["port"]))
+)
+
+
+class Selector:
+    """The position of one switch: abstract state ``index`` of the switch board, port 1 being the first position.
+
+    ``flag`` is its entry in the board's ``active``; None for a sensor signal.
+    """
+
+    def __init__(self, board: System, name: str, positions: tuple[str, ...], index: int, flag: int | None) -> None:
         self.name = name
         self.positions = positions
-        self._system = builder.AddNamedSystem(
-            f"{name}.selector", ZeroOrderHold(1.0, Value(self._port(position)), _NEVER)
-        )
-
-    def _port(self, position: str) -> InputPortIndex:
-        # Port 0 of a PortSwitch is its selector port.
-        return InputPortIndex(1 + self.positions.index(position))
-
-    @property
-    def output_port(self) -> OutputPort:
-        return self._system.get_output_port()
+        self._board = board
+        self._index = index
+        self._flag = flag
 
     def get(self, context: Context) -> str:
         """The position in a context of the testbed."""
-        state = self._system.GetMyContextFromRoot(context).get_abstract_state(0).get_value()
+        state = self._board.GetMyContextFromRoot(context).get_abstract_state(self._index).get_value()
         return self.positions[int(state) - 1]
 
     def set(self, context: Context, position: str) -> None:
         """Throws the switch in a context of the testbed; ``position`` is one of `positions`."""
-        self._system.GetMyMutableContextFromRoot(context).SetAbstractState(0, self._port(position))
+        board = self._board.GetMyMutableContextFromRoot(context)
+        board.SetAbstractState(self._index, _port(self.positions, position))
+        if self._flag is not None:
+            group = board.num_discrete_state_groups() - 1
+            active = np.array(board.get_discrete_state(group).value())
+            active[self._flag] = float(position != SIM)
+            board.SetDiscreteState(group, active)
 
     def variable(self) -> Variable:
         """The position as an element of s: 0 is sim, 1 is real, 2 is twin."""
@@ -89,8 +135,12 @@ class Selector:
             lambda context: float(self.positions.index(self.get(context))),
             write,
             bounds=(0.0, len(self.positions) - 1.0),
-            carried_by=self.name,
         )
+
+
+def _port(positions: tuple[str, ...], position: str) -> InputPortIndex:
+    # Port 0 of a PortSwitch is its selector port.
+    return InputPortIndex(1 + positions.index(position))
 
 
 class AbstractSwitch(LeafSystem):
@@ -148,93 +198,89 @@ class CommandGate(LeafSystem):
         output.set_value(Command() if position == SIM else Command(self._command.Eval(context)))
 
 
-class SenseSwitch:
-    """T_sense of one signal: `sim` and `real` lead to the DPS."""
+class Switches:
+    """T_sense and T_act of all signals.
 
-    def __init__(self, builder: DiagramBuilder, signal: Signal, position: str) -> None:
-        name = f"T_sense.{signal.name}"
-        self.signal = signal
-        self.selector = Selector(builder, name, SENSE_POSITIONS, position)
-        ports, self.output_port = _add_switch(builder, name, signal, self.selector, SENSE_POSITIONS)
-        self.sim_port, self.real_port = ports
+    T_sense: `sim` and `real` lead to the DPS. T_act: the DPS leads to the simulated actuators, to the real ports, or
+    (twin) to both.
 
-
-class ActSide:
-    """T_act of all signals: the DPS leads to the simulated actuators, to the real ports, or (twin) to both.
-
-    The constants of all signals (idle commands, no commands, flags) come from one source: every system that a Diagram
-    has costs time at each of its steps, whether it computes or not.
+    Attributes:
+        sense, act: the selectors, by signal.
+        sim_sense, real_sense: where the simulated and the real sensors go, by signal.
+        dps_sense: what the DPS reads, by signal.
+        sim_act, real_act: what the simulated and the real actuators get, by signal.
+        active: port of the flags of all actuator signals.
     """
 
-    def __init__(self, builder: DiagramBuilder, signals: Sequence[Signal], position: str, dps: System) -> None:
+    def __init__(
+        self, builder: DiagramBuilder, interface: Interface, sense_position: str, act_position: str, dps: System
+    ) -> None:
         self._builder = builder
-        self.selectors: dict[str, Selector] = {}
-        self.sim_ports: dict[str, OutputPort] = {}
-        self.real_ports: dict[str, OutputPort] = {}
-        active = []
-        constants = self._add_constants([signal for signal in signals if signal.is_vector])
-        for signal in signals:
-            name, command = f"T_act.{signal.name}", dps.GetOutputPort(signal.name)
-            selector = self.selectors[signal.name] = Selector(builder, name, ACT_POSITIONS, position)
-            idle = constants[f"{signal.name}.idle"] if signal.is_vector else self._add_value(f"{name}.idle", signal)
-            self.sim_ports[signal.name] = self._add(f"{name}.sim", signal, selector, command, idle, command)
+        sense = {f"{T_SENSE}{signal.name}": signal for signal in interface.sense}
+        act = {f"{T_ACT}{signal.name}": signal for signal in interface.act}
+        ports = {name: int(_port(SENSE_POSITIONS, sense_position)) for name in sense}
+        ports |= {name: int(_port(ACT_POSITIONS, act_position)) for name in act}
+        constants = {}
+        for name, signal in act.items():
             if signal.is_vector:
-                none = constants[f"{signal.name}.none"]
-                self.real_ports[signal.name] = self._add(f"{name}.real", signal, selector, none, command, command)
+                constants[f"{name}.idle"] = signal.vector(signal.idle)
+                constants[f"{name}.none"] = signal.vector(np.nan)
+        active = np.full(len(act), float(act_position != SIM))
+        self._board = builder.AddNamedSystem(BOARD, SwitchBoard(ports, constants, active))
+        self.sense = {
+            s.name: Selector(self._board, n, SENSE_POSITIONS, i, None) for i, (n, s) in enumerate(sense.items())
+        }
+        self.act = {
+            s.name: Selector(self._board, n, ACT_POSITIONS, len(sense) + i, i) for i, (n, s) in enumerate(act.items())
+        }
+        self.sim_sense: dict[str, InputPort] = {}
+        self.real_sense: dict[str, InputPort] = {}
+        self.dps_sense: dict[str, OutputPort] = {}
+        for name, signal in sense.items():
+            inputs, output = self._add_switch(name, name, signal, SENSE_POSITIONS)
+            self.sim_sense[signal.name], self.real_sense[signal.name] = inputs
+            self.dps_sense[signal.name] = output
+        self.sim_act: dict[str, OutputPort] = {}
+        self.real_act: dict[str, OutputPort] = {}
+        for name, signal in act.items():
+            command = dps.GetOutputPort(signal.name)
+            idle = self._idle(name, signal)
+            self.sim_act[signal.name] = self._choose(name, f"{name}.sim", signal, command, idle, command)
+            if signal.is_vector:
+                none = self._board.GetOutputPort(f"{name}.none")
+                self.real_act[signal.name] = self._choose(name, f"{name}.real", signal, none, command, command)
             else:
-                self.real_ports[signal.name] = self._add_gate(f"{name}.real", signal, selector, command)
-            yes, no = constants["yes"], constants["no"]
-            active.append(self._add(f"{name}.active", _FLAG, selector, no, yes, yes))
-        self.active_port = active[0] if len(active) == 1 else self._add_mux(active)
+                self.real_act[signal.name] = self._gate(name, signal, command)
+        self.active = self._board.GetOutputPort("active")
 
-    def _add_constants(self, signals: Sequence[Signal]) -> dict[str, OutputPort]:
-        values = {"no": np.zeros(1), "yes": np.ones(1)}
-        for signal in signals:
-            values[f"{signal.name}.idle"] = signal.vector(signal.idle)
-            values[f"{signal.name}.none"] = signal.vector(np.nan)
-        source = self._builder.AddNamedSystem(
-            "T_act.constants", ConstantVectorSource(np.concatenate(list(values.values())))
-        )
-        split = self._builder.AddNamedSystem("T_act.split", Demultiplexer([value.size for value in values.values()]))
-        self._builder.Connect(source.get_output_port(), split.get_input_port())
-        return {name: split.get_output_port(i) for i, name in enumerate(values)}
+    def _idle(self, name: str, signal: Signal) -> OutputPort:
+        if signal.is_vector:
+            return self._board.GetOutputPort(f"{name}.idle")
+        source = ConstantValueSource(Value(signal.idle))
+        return self._builder.AddNamedSystem(f"{name}.idle", source).get_output_port()
 
-    def _add(self, name: str, signal: Signal, selector: Selector, *sources: OutputPort) -> OutputPort:
-        inputs, output = _add_switch(self._builder, name, signal, selector, ACT_POSITIONS)
+    def _choose(self, switch: str, name: str, signal: Signal, *sources: OutputPort) -> OutputPort:
+        inputs, output = self._add_switch(switch, name, signal, ACT_POSITIONS)
         for source, port in zip(sources, inputs, strict=True):
             self._builder.Connect(source, port)
         return output
 
-    def _add_value(self, name: str, signal: Signal) -> OutputPort:
-        return self._builder.AddNamedSystem(name, ConstantValueSource(Value(signal.idle))).get_output_port()
-
-    def _add_gate(self, name: str, signal: Signal, selector: Selector, command: OutputPort) -> OutputPort:
-        gate = self._builder.AddNamedSystem(name, CommandGate(signal))
-        self._builder.Connect(selector.output_port, gate.GetInputPort("port_selector"))
+    def _gate(self, switch: str, signal: Signal, command: OutputPort) -> OutputPort:
+        gate = self._builder.AddNamedSystem(f"{switch}.real", CommandGate(signal))
+        self._builder.Connect(self._board.GetOutputPort(switch), gate.GetInputPort("port_selector"))
         self._builder.Connect(command, gate.GetInputPort("command"))
         return gate.get_output_port()
 
-    def _add_mux(self, flags: Sequence[OutputPort]) -> OutputPort:
-        mux = self._builder.AddNamedSystem("T_act.active", Multiplexer(len(flags)))
-        for i, flag in enumerate(flags):
-            self._builder.Connect(flag, mux.get_input_port(i))
-        return mux.get_output_port()
-
-
-# 1 for a signal that commands the real actuator, else 0.
-_FLAG = Signal("active", size=1)
-
-
-def _add_switch(
-    builder: DiagramBuilder, name: str, signal: Signal, selector: Selector, positions: tuple[str, ...]
-) -> tuple[list[InputPort], OutputPort]:
-    system: System
-    if signal.is_vector:
-        system = PortSwitch(signal.size)
-        inputs = [system.DeclareInputPort(position) for position in positions]
-    else:
-        system = AbstractSwitch(signal, len(positions))
-        inputs = [system.get_input_port(1 + i) for i in range(len(positions))]
-    builder.AddNamedSystem(name, system)
-    builder.Connect(selector.output_port, system.get_input_port(0))
-    return inputs, system.get_output_port()
+    def _add_switch(
+        self, switch: str, name: str, signal: Signal, positions: tuple[str, ...]
+    ) -> tuple[list[InputPort], OutputPort]:
+        system: System
+        if signal.is_vector:
+            system = PortSwitch(signal.size)
+            inputs = [system.DeclareInputPort(position) for position in positions]
+        else:
+            system = AbstractSwitch(signal, len(positions))
+            inputs = [system.get_input_port(1 + i) for i in range(len(positions))]
+        self._builder.AddNamedSystem(name, system)
+        self._builder.Connect(self._board.GetOutputPort(switch), system.get_input_port(0))
+        return inputs, system.get_output_port()

@@ -21,7 +21,7 @@ from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
-from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, TWIN, Selector
+from vtbdrake.testbed.switch import ACT_POSITIONS, BOARD, REAL, SENSE_POSITIONS, SIM, T_ACT, T_SENSE, TWIN, Selector
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -88,7 +88,7 @@ class VirtualTestbed:
         self._variables = collect(
             diagram,
             plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
-            skip=lambda path: path.startswith(("T_sense.", "T_act.", "u.")),
+            skip=lambda path: path.startswith((T_SENSE, T_ACT, "u.")),
             extra=[
                 Variable("time", X, (), "s", lambda context: context.get_time()),
                 *(selector.variable() for selector in [*self._sense.values(), *self._act.values()]),
@@ -192,7 +192,7 @@ class VirtualTestbed:
             *self._changes("T_act", self._act, ACT_POSITIONS, act),
         ]
         for selector, position in changes:
-            name = selector.name.removeprefix("T_sense.")
+            name = selector.name.removeprefix(T_SENSE)
             if name != selector.name and position == REAL:
                 port = self.diagram.GetInputPort(f"real.sense.{name}")
                 if not port.HasValue(context):
@@ -267,7 +267,8 @@ class VirtualTestbed:
     @cached_property
     def python_systems(self) -> tuple[str, ...]:
         """Paths of the systems that are written in Python and have work to do while time runs."""
-        return tuple(path for path, system in leaves(self.diagram) if is_python(system))
+        # The board of the switches has no work to do.
+        return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
 
 
 def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:

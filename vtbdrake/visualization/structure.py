@@ -10,6 +10,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, System
 
 from vtbdrake.testbed import Signal, VirtualTestbed
+from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
 
 ROLES = ("sense", "sys", "act", "env")
 
@@ -71,10 +72,10 @@ def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Str
         world=_world(testbed),
         sense=tuple(
             # Input 0 of a switch is its selector, input 1 what it takes while it stands on sim.
-            Wire(s, positions["sense"][s.name], ends.source(f"T_sense.{s.name}", 1))
+            Wire(s, positions["sense"][s.name], ends.source(f"{T_SENSE}{s.name}", 1))
             for s in interface.sense
         ),
-        act=tuple(Wire(s, positions["act"][s.name], ends.target(f"T_act.{s.name}.sim")) for s in interface.act),
+        act=tuple(Wire(s, positions["act"][s.name], ends.target(f"{T_ACT}{s.name}.sim")) for s in interface.act),
         commands=tuple(
             Wire(s, "", ends.source("dps", int(dps.GetInputPort(s.name).get_index()))) for s in interface.commands
         ),
@@ -126,7 +127,7 @@ def _world(testbed: VirtualTestbed) -> dict[str, tuple[str, ...]]:
 def _is_framework(testbed: VirtualTestbed, system: System) -> bool:
     name = str(system.get_name())
     own = system in (testbed.dps, testbed.plant, testbed.scene_graph) or isinstance(system, MeshcatVisualizer)
-    return own or name.startswith(("T_sense.", "T_act.", "u."))
+    return own or name == BOARD or name.startswith((T_SENSE, T_ACT, "u."))
 
 
 def _plant_instances(testbed: VirtualTestbed) -> Iterator[tuple[str, str]]:
