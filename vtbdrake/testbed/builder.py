@@ -10,15 +10,14 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+from pydrake.systems.primitives import RandomSource
 
 from vtbdrake.state import Variable
-from vtbdrake.state.element import PARAMETER, Element
-from vtbdrake.state.systems import leaf_variables, leaves
+from vtbdrake.state.systems import leaves
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
-from vtbdrake.testbed.switch import Switches
+from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
@@ -156,9 +155,13 @@ class VirtualTestbedBuilder:
                 )
         self._finish_plant()
         sense_position, act_position = MODES[mode]
-        switches = Switches(self.builder, self.interface, sense_position, act_position, self._dps)
+        defaults = {s.name: s.vector(0.0 if s.default is None else s.default) for s in self.interface.commands}
+        u = {name: value for name, value in defaults.items() if name not in self._commands}
+        switches = Switches(self.builder, self.interface, sense_position, act_position, self._dps, u)
         self._connect_switches(switches, self._dps)
-        commands = [v for s in self.interface.commands for v in self._connect_command(s)]
+        commands = tuple(switches.command_variables(self.interface.commands))
+        for command in commands:
+            command.check(u[command.address.removeprefix(COMMAND)].reshape(command.shape))
         if meshcat is not None:
             if self.scene_graph is None:
                 raise ValueError("there is nothing to draw: the testbed has no plant with a SceneGraph")
@@ -178,7 +181,7 @@ class VirtualTestbedBuilder:
             simulator=self.simulator,
             scenario=scenario,
             beliefs=tuple(self._beliefs),
-            extra_variables=(*commands, *self._extra),
+            extra_variables=commands + tuple(self._extra),
             plant_roles=self._plant_roles(),
             visualized=meshcat is not None,
         )
@@ -208,21 +211,8 @@ class VirtualTestbedBuilder:
             self.builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
         if self._actuators:
             self.builder.ExportOutput(switches.active, "real.act.active")
-
-    def _connect_command(self, signal: Signal) -> list[Variable]:
-        assert self._dps is not None
-        if signal.name in self._commands:
-            self.builder.Connect(self._commands[signal.name], self._dps.GetInputPort(signal.name))
-            return []
-        default = signal.vector(0.0 if signal.default is None else signal.default)
-        source = self.builder.AddNamedSystem(f"u.{signal.name}", ConstantVectorSource(default))
-        self.builder.Connect(source.get_output_port(), self._dps.GetInputPort(signal.name))
-        shape = () if signal.size == 1 else (default.size,)
-        bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
-        element = Element("", PARAMETER, 0, shape, unit=signal.unit, bounds=bounds)
-        (variable,) = leaf_variables(source.get_name(), source, declared=[element])
-        variable.check(default.reshape(shape))
-        return [variable]
+        for name, port in {**switches.commands, **self._commands}.items():
+            self.builder.Connect(port, dps.GetInputPort(name))
 
     def _plant_roles(self) -> dict[str, str]:
         if self.plant is None:

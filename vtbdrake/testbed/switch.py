@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,8 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantValueSource, PortSwitch
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from vtbdrake.state.element import Codec
+from vtbdrake.state.element import DISCRETE, Codec, Element
+from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variable import Variable, VariableError, X
 from vtbdrake.testbed.signal import Interface, Signal
 
@@ -31,7 +32,7 @@ SIM, REAL, TWIN = "sim", "real", "twin"
 SENSE_POSITIONS = (SIM, REAL)
 ACT_POSITIONS = (SIM, REAL, TWIN)
 
-T_SENSE, T_ACT, BOARD = "T_sense.", "T_act.", "switches"
+T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,10 @@ class Command:
 
 @TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
 def SwitchBoard_(T: type) -> type:
-    """The positions of all switches, and what a switched-off actuator signal gets, as state in the Context.
+    """The positions of all switches, the commands u, and what an actuator gets that the DPS does not command.
 
     Every system of a Diagram costs time in each step of a simulation, whether it computes or not: so there is one for
-    all signals, and its ports show its state, which needs no Python while time runs.
+    all of them, and its ports show its state, which needs no Python while time runs.
 
     .. pydrake_system::
 
@@ -210,17 +211,27 @@ class Switches:
         dps_sense: what the DPS reads, by signal.
         sim_act, real_act: what the simulated and the real actuators get, by signal.
         active: port of the flags of all actuator signals.
+        commands: where the constant commands u come from, by signal.
+
+    Args:
+        u: the commands that are constants, by signal, with their defaults.
     """
 
     def __init__(
-        self, builder: DiagramBuilder, interface: Interface, sense_position: str, act_position: str, dps: System
+        self,
+        builder: DiagramBuilder,
+        interface: Interface,
+        sense_position: str,
+        act_position: str,
+        dps: System,
+        u: Mapping[str, np.ndarray],
     ) -> None:
         self._builder = builder
         sense = {f"{T_SENSE}{signal.name}": signal for signal in interface.sense}
         act = {f"{T_ACT}{signal.name}": signal for signal in interface.act}
         ports = {name: int(_port(SENSE_POSITIONS, sense_position)) for name in sense}
         ports |= {name: int(_port(ACT_POSITIONS, act_position)) for name in act}
-        constants = {}
+        constants = {f"{COMMAND}{name}": value for name, value in u.items()}
         for name, signal in act.items():
             if signal.is_vector:
                 constants[f"{name}.idle"] = signal.vector(signal.idle)
@@ -252,6 +263,17 @@ class Switches:
             else:
                 self.real_act[signal.name] = self._gate(name, signal, command)
         self.active = self._board.GetOutputPort("active")
+        self.commands = {name: self._board.GetOutputPort(f"{COMMAND}{name}") for name in u}
+
+    def command_variables(self, signals: Sequence[Signal]) -> Iterator[Variable]:
+        """The constant commands as variables ``u.<signal>``."""
+        for index, name in enumerate(self.commands):
+            signal = next(signal for signal in signals if signal.name == name)
+            size = signal.vector(0.0).size
+            shape = () if size == 1 else (size,)
+            bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
+            element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
+            yield from leaf_variables(f"{COMMAND}{name}", self._board, declared=[element])
 
     def _idle(self, name: str, signal: Signal) -> OutputPort:
         if signal.is_vector:

@@ -88,7 +88,7 @@ class VirtualTestbed:
         self._variables = collect(
             diagram,
             plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
-            skip=lambda path: path.startswith((T_SENSE, T_ACT, "u.")),
+            skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
             extra=[
                 Variable("time", X, (), "s", lambda context: context.get_time()),
                 *(selector.variable() for selector in [*self._sense.values(), *self._act.values()]),

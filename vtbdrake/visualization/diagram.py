@@ -96,7 +96,7 @@ class _Flowchart:
 
     def _command(self, number: int, wire: Wire) -> None:
         name = f"u.{wire.signal.name}"
-        if wire.part == name:
+        if not wire.part:
             self._add(f'    u_{number}(["{_quoted(name)}"]) ==>|"{_quoted(wire.shape())}"| dps')
         else:
             self._add(f'    {self._node(wire.part)} ==>|"{_quoted(name)}, {_quoted(wire.shape())}"| dps')

@@ -166,7 +166,7 @@ class _Drawing:
     def _command(self, wire: Wire, y: int) -> None:
         name = f"u.{wire.signal.name}"
         self._parts.append(f"<g id={quoteattr(name)}>")
-        self._chip(CHIP, y, name if wire.part == name else f"{name} = {wire.part}", DPS, mirrored=False)
+        self._chip(CHIP, y, f"{name} = {wire.part}" if wire.part else name, DPS, mirrored=False)
         self._line([(CHIP + CHIP_WIDTH, y), (BOX, y)], DPS, thick=True, arrow=True)
         middle = (POLE + BOX) // 2
         self._write(middle, y - 9, _cut(wire.signal.name, 18), size=12, anchor="middle")

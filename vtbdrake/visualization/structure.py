@@ -17,7 +17,10 @@ ROLES = ("sense", "sys", "act", "env")
 
 @dataclass(frozen=True)
 class Wire:
-    """A signal, where its switch stands ("" for a command, which has none), and the simulated system at its end."""
+    """A signal, where its switch stands ("" for a command, which has none), and the simulated system at its end.
+
+    The constant commands of the testbed have no system at their end.
+    """
 
     signal: Signal
     position: str
@@ -94,7 +97,8 @@ class _Ends:
             self._targets[source] = target
 
     def source(self, system: str, port: int) -> str:
-        return self._sources.get((system, port), "")
+        name = self._sources.get((system, port), "")
+        return "" if name == BOARD else name
 
     def target(self, system: str) -> str:
         return self._targets.get(system, "")
@@ -127,7 +131,7 @@ def _world(testbed: VirtualTestbed) -> dict[str, tuple[str, ...]]:
 def _is_framework(testbed: VirtualTestbed, system: System) -> bool:
     name = str(system.get_name())
     own = system in (testbed.dps, testbed.plant, testbed.scene_graph) or isinstance(system, MeshcatVisualizer)
-    return own or name == BOARD or name.startswith((T_SENSE, T_ACT, "u."))
+    return own or name == BOARD or name.startswith((T_SENSE, T_ACT))
 
 
 def _plant_instances(testbed: VirtualTestbed) -> Iterator[tuple[str, str]]:
