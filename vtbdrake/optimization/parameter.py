@@ -2,38 +2,108 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
 from vtbdrake.state import Variable, Variables
 
+# What begins the address of a scenario's field: `scenario.gravity`.
+FIELD = "scenario."
+
 
 @dataclass(frozen=True)
 class Parameter:
-    """One varied element of s0: a scalar variable of the testbed, or an entry of an array (``address[3]``).
+    """One varied number of s0: a scalar variable of the testbed, an entry of an array (``address[3]``), or a field.
 
     Attributes:
-        address: of the variable.
+        address: of the variable; or ``scenario.<field>``, for what needs another Diagram (gravity, geometry).
         lower, upper: the range, in the variable's unit.
+        integer: only whole numbers, both ends included.
+        log: searched on a logarithmic scale.
 
     Raises:
-        ValueError: the range is empty, reversed or not finite.
+        ValueError: the range is empty, reversed or not finite, its ends are not whole for an integer, or its lower end is
+            not positive on a logarithmic scale.
     """
 
     address: str
     lower: float
     upper: float
+    integer: bool = field(default=False, kw_only=True)
+    log: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "lower", float(self.lower))
-        object.__setattr__(self, "upper", float(self.upper))
+        kind = int if self.integer else float
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
             raise ValueError(
                 f"the range of {self.address} must be finite and not empty, lower < upper, but it is "
-                f"[{self.lower}, {self.upper}]"
+                f"[{float(self.lower)}, {float(self.upper)}]"
             )
+        if self.integer and not (float(self.lower).is_integer() and float(self.upper).is_integer()):
+            raise ValueError(
+                f"{self.address} is an integer, so its range ends in whole numbers, unlike {self.range_text}"
+            )
+        if self.log and self.lower <= 0.0:
+            raise ValueError(f"a logarithmic range begins above 0, but that of {self.address} is {self.range_text}")
+        object.__setattr__(self, "lower", kind(self.lower))
+        object.__setattr__(self, "upper", kind(self.upper))
+
+    @property
+    def is_field(self) -> bool:
+        """Whether it is a field of the scenario."""
+        return self.address.startswith(FIELD)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether values between two values have a meaning, as gradients need it."""
+        return not self.integer
+
+    @property
+    def range_text(self) -> str:
+        """The range, to be read."""
+        return f"[{self.lower:g}, {self.upper:g}]"
+
+    def check(self, value: Any) -> float | int:
+        """``value`` as a number of the range.
+
+        Raises:
+            ValueError: it is no number, lies outside the range, or is not whole for an integer.
+        """
+        try:
+            number = float(value)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.address} takes a number in {self.range_text}, not {value!r}") from error
+        if not self.lower <= number <= self.upper:
+            raise ValueError(f"{self.address} = {number:g} lies outside its range {self.range_text}")
+        if self.integer and not number.is_integer():
+            raise ValueError(f"{self.address} takes whole numbers, not {number:g}")
+        return int(number) if self.integer else number
+
+    def from_unit(self, u: float) -> float | int:
+        """The value at ``u`` in [0, 1] of the range; of an integer, each value has an equal share."""
+        u = min(max(float(u), 0.0), 1.0)
+        if self.integer and not self.log:
+            count = int(self.upper) - int(self.lower) + 1
+            return int(self.lower) + min(int(u * count), count - 1)
+        if self.log:
+            value = math.exp(math.log(self.lower) + u * (math.log(self.upper) - math.log(self.lower)))
+        else:
+            value = self.lower + u * (self.upper - self.lower)
+        value = min(max(value, self.lower), self.upper)
+        return round(value) if self.integer else value
+
+    def to_unit(self, value: Any) -> float:
+        """The place of ``value`` in the range, in [0, 1]; the inverse of `from_unit`."""
+        if self.log:
+            return math.log(value / self.lower) / math.log(self.upper / self.lower)
+        if self.integer:
+            return (float(value) - self.lower + 0.5) / (int(self.upper) - int(self.lower) + 1)
+        return (float(value) - self.lower) / (self.upper - self.lower)
 
     def find(self, variables: Variables) -> Variable:
         """The variable that it varies.
@@ -41,17 +111,91 @@ class Parameter:
         Raises:
             ValueError: there is none, it is derived or an array, or the range exceeds its bounds.
         """
-        variable = variables[self.address]
-        if variable.derived:
-            raise ValueError(f"{self.address} is derived from other variables and cannot be varied")
-        if variable.shape:
-            raise ValueError(
-                f"{self.address} has shape {variable.shape}; a parameter is one number: {self.address}[0], say"
-            )
+        variable = _scalar(self.address, variables)
         lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
         if self.lower < lower or self.upper > upper:
             raise ValueError(
-                f"the range [{self.lower:g}, {self.upper:g}] of {self.address} exceeds its bounds "
+                f"the range {self.range_text} of {self.address} exceeds its bounds "
                 f"{variable.bounds_text()} {variable.unit}"
             )
         return variable
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One varied element of s0 that takes one of several values without an order: numbers, words, True or False.
+
+    Attributes:
+        address: of a scalar variable (the options are numbers then), or ``scenario.<field>``.
+        options: at least two different values.
+
+    Raises:
+        ValueError: there are fewer than two options, or two are equal.
+    """
+
+    address: str
+    options: tuple[Any, ...]
+
+    def __init__(self, address: str, options: Sequence[Any]) -> None:
+        object.__setattr__(self, "address", address)
+        object.__setattr__(self, "options", tuple(options))
+        for option in self.options:
+            if not isinstance(option, bool | int | float | str):
+                raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")
+        if len({(type(option) is bool, option) for option in self.options}) < max(2, len(self.options)):
+            raise ValueError(f"{address} needs at least two different options, not {list(self.options)}")
+
+    @property
+    def is_field(self) -> bool:
+        """Whether it is a field of the scenario."""
+        return self.address.startswith(FIELD)
+
+    is_continuous = False
+
+    @property
+    def range_text(self) -> str:
+        """The options, to be read."""
+        return "{" + ", ".join(repr(option) for option in self.options) + "}"
+
+    def check(self, value: Any) -> Any:
+        """The option that equals ``value``.
+
+        Raises:
+            ValueError: there is none.
+        """
+        for option in self.options:
+            if option == value and isinstance(option, bool) == isinstance(value, bool):
+                return option
+        raise ValueError(f"{self.address} is one of {self.range_text}, not {value!r}")
+
+    def from_unit(self, u: float) -> Any:
+        """The option at ``u`` in [0, 1]; each has an equal share."""
+        count = len(self.options)
+        return self.options[min(int(min(max(float(u), 0.0), 1.0) * count), count - 1)]
+
+    def to_unit(self, value: Any) -> float:
+        """A place of ``value`` in [0, 1]; `from_unit` leads back."""
+        return (self.options.index(self.check(value)) + 0.5) / len(self.options)
+
+    def find(self, variables: Variables) -> Variable:
+        """The variable that it varies.
+
+        Raises:
+            ValueError: there is none, it is derived or an array, or it refuses an option.
+        """
+        variable = _scalar(self.address, variables)
+        for option in self.options:
+            variable.check(option)
+        return variable
+
+
+Dimension = Parameter | Choice
+
+
+def _scalar(address: str, variables: Variables) -> Variable:
+    variable = variables[address]
+    if variable.derived:
+        raise ValueError(f"{address} is derived from other variables and cannot be varied")
+    if variable.shape:
+        raise ValueError(f"{address} has shape {variable.shape}; a parameter is one number: {address}[0], say")
+    return variable

@@ -1,0 +1,87 @@
+"""What every solver of problem (18) is: something that asks for points and is told how good they are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any
+
+# A point s^0: one value per parameter, in their order.
+Point = tuple[Any, ...]
+
+
+class SolverError(ValueError):
+    """A solver that is unknown, or cannot solve the problem."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good a point is.
+
+    Attributes:
+        point: s^0.
+        values: one number per objective, larger is better whatever the user's direction (a cost appears negated); NaN
+            if the point has none, since a simulation failed.
+        violations: one number per constraint, at most 0 where it holds; NaN if the simulation failed.
+        gradient: of the first value, shape (n,), where the solver asked for it.
+        exact: False if the point was dropped by racing, and ``values`` only bounds it from above.
+    """
+
+    point: Point
+    values: tuple[float, ...]
+    violations: tuple[float, ...] = ()
+    gradient: tuple[float, ...] | None = None
+    exact: bool = True
+
+    @property
+    def failed(self) -> bool:
+        return not all(isfinite(value) for value in self.values)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it has a value and keeps all constraints."""
+        return not self.failed and all(violation <= 0.0 for violation in self.violations)
+
+
+class Solver(ABC):
+    """Asks for batches of points, and is told of each batch before it asks for the next.
+
+    What it asks for depends on its seed and on what it was told, and on nothing else: not on the number of workers, and
+    not on time. So a study is the same in series and in parallel, and can be resumed by telling it again.
+
+    Attributes:
+        name: as the user named it, or as it was chosen.
+        wants_gradient: whether `Evaluation.gradient` is to be filled.
+    """
+
+    name: str
+    wants_gradient: bool = False
+
+    @property
+    def method(self) -> str:
+        """What it works with at the moment; a solver that changes its method names the present one."""
+        return self.name
+
+    @abstractmethod
+    def ask(self) -> list[Point]:
+        """The points to be judged next; empty when it is finished."""
+
+    @abstractmethod
+    def tell(self, evaluations: Sequence[Evaluation]) -> None:
+        """The evaluations of the last batch, in its order, and after them any that were given by hand."""
+
+    @property
+    def success(self) -> bool | None:
+        """Whether it ended by its own criterion (converged, or its design is complete); None while it works."""
+        return None
+
+    @property
+    def message(self) -> str:
+        """How it ended, in its own words."""
+        return ""
+
+    def close(self) -> None:
+        """Gives back what it holds; it is not asked again."""
+        return
