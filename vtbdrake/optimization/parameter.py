@@ -27,8 +27,8 @@ class Parameter:
         log: searched on a logarithmic scale.
 
     Raises:
-        ValueError: the range is empty, reversed or not finite, its ends are not whole for an integer, or its lower end is
-            not positive on a logarithmic scale.
+        ValueError: the range is empty, reversed or not finite, an integer has ends that are not whole, or the lower end
+            of a logarithmic scale is not positive.
     """
 
     address: str

@@ -2,13 +2,15 @@
 
 from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, choose_executor, make_executor
 from vtbdrake.rollout.processes import ProcessExecutor, WorkerError
-from vtbdrake.rollout.quality import Quality, QualityError
+from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.task import RolloutTask
 
 __all__ = [
+    "Constraint",
     "Executor",
+    "Measure",
     "ProcessExecutor",
     "Quality",
     "QualityError",

@@ -1,13 +1,16 @@
-"""The quality function f(q(t)) of a rollout, and equations (14) to (17) on its trajectory."""
+"""The quality function f(q(t)) of a rollout, equations (12) to (17), and what else is measured of it."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import inf, isfinite
+from dataclasses import dataclass, field
+from math import inf, isfinite, isnan
 from typing import Any
 
 import numpy as np
+
+from vtbdrake.rollout.readings import READINGS, check_reading
 
 
 class QualityError(ValueError):
@@ -15,46 +18,135 @@ class QualityError(ValueError):
 
 
 @dataclass(frozen=True)
-class Quality:
-    """f(q(t)) >= 0, equation (12): larger is better.
+class Measure:
+    """A function of quality variables, sampled over a rollout and read as one number.
 
     Attributes:
-        f: the quality function. It gets the quality variables in the order of ``of``, floats or arrays.
+        f: the function. It gets the quality variables in the order of ``of``, floats or arrays.
         of: sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
             DPS's or the simulation's; ``time`` is the simulation's clock.
+        reading: how the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
+            time, by the trapezoidal rule, up to where the rollout ends).
     """
 
     f: Callable[..., float]
-    of: tuple[str, ...]
+    of: Sequence[str]
+    reading: str = field(default="best", kw_only=True)
 
-    def __init__(self, f: Callable[..., float], of: str | Sequence[str]) -> None:
-        object.__setattr__(self, "f", f)
-        object.__setattr__(self, "of", (of,) if isinstance(of, str) else tuple(of))
-        if not callable(f):
-            raise QualityError(f"a quality is a function of {', '.join(self.of)}, not {f!r}")
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "of", (self.of,) if isinstance(self.of, str) else tuple(self.of))
+        if not callable(self.f):
+            raise QualityError(f"a quality is a function of {', '.join(self.of)}, not {self.f!r}")
         if not self.of:
             raise QualityError("a quality needs at least one quality variable: give of=[address, ...]")
+        check_reading(self.reading)
+
+    @property
+    def name(self) -> str:
+        """Of its function."""
+        return str(getattr(self.f, "__name__", type(self.f).__name__))
 
     def __call__(self, values: Sequence[Any], *, time: float) -> float:
         """f of the quality variables' values at ``time``.
 
         Raises:
-            QualityError: f raises, or returns what is not a number, is NaN, infinite or negative.
+            QualityError: f raises, or returns what is not a number, is NaN or infinite.
         """
         try:
-            quality = float(self.f(*values))
+            sample = float(self.f(*values))
         except Exception as error:
             raise QualityError(f"{self._at(values, time)} raises {type(error).__name__}: {error}") from error
-        if not isfinite(quality) or quality < 0.0:
-            raise QualityError(
-                f"{self._at(values, time)} is {quality}, but a quality is finite and not negative: state f so that "
-                "larger is better and the worst is 0"
-            )
-        return quality
+        self._check(sample, lambda: self._at(values, time))
+        return sample
+
+    def _check(self, sample: float, where: Callable[[], str]) -> None:
+        if not isfinite(sample):
+            raise QualityError(f"{where()} is {sample}, but it must be finite")
 
     def _at(self, values: Sequence[Any], time: float) -> str:
         arguments = ", ".join(f"{address} = {value}" for address, value in zip(self.of, values, strict=True))
-        return f"the quality function {getattr(self.f, '__name__', self.f)} at t = {time:g} s, {arguments},"
+        return f"the quality function {self.name} at t = {time:g} s, {arguments},"
+
+    @abstractmethod
+    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
+        """The one number that the samples at ``times`` are read as."""
+
+
+@dataclass(frozen=True)
+class Quality(Measure):
+    """f(q(t)) >= 0, equation (12): larger is better. Or, with ``minimize``, a cost c >= 0: smaller is better.
+
+    With a cost the f of equations (12) to (18) is 1 / (1 + c), so that they hold as they stand; what is reported is
+    the cost.
+
+    Attributes:
+        minimize: f is a cost.
+        upper: the most that f can be, if that is known: it lets racing drop a candidate that can no longer win.
+    """
+
+    minimize: bool = field(default=False, kw_only=True)
+    upper: float = field(default=inf, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isnan(self.upper) or self.upper <= 0.0:
+            raise QualityError(f"the most that a quality can be is positive, not {self.upper}")
+        if self.minimize and self.upper != inf:
+            raise QualityError("the best that a cost can be is 0; upper belongs to a quality that is maximized")
+
+    def _check(self, sample: float, where: Callable[[], str]) -> None:
+        if not isfinite(sample) or sample < 0.0:
+            remedy = (
+                "a cost is finite and not negative: state it so that 0 is the best"
+                if self.minimize
+                else "a quality is finite and not negative: state f so that larger is better and the worst is 0, or "
+                "state a cost with minimize=True"
+            )
+            raise QualityError(f"{where()} is {sample}, but {remedy}")
+        if sample > self.upper:
+            raise QualityError(f"{where()} is {sample}, more than its stated upper end of {self.upper:g}")
+
+    def quality(self, samples: np.ndarray) -> np.ndarray:
+        """f' >= 0, larger is better, of samples of f or of the cost."""
+        return 1.0 / (1.0 + np.asarray(samples)) if self.minimize else np.asarray(samples)
+
+    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
+        return READINGS[self.reading](times, samples, not self.minimize)[1]
+
+    def bound(self, horizon: float) -> float:
+        """The best that `read` can return for a rollout of ``horizon`` seconds."""
+        if self.minimize:
+            return 0.0
+        return self.upper * horizon if self.reading == "integral" else self.upper
+
+
+@dataclass(frozen=True)
+class Constraint(Measure):
+    """What a rollout has to keep: f(q(t)) at most, or at least, a limit; by default at every sample time.
+
+    Attributes:
+        at_most, at_least: the limits, in the unit of f; one of them or both.
+        reading: as of `Measure`; ``worst`` means at every sample time, ``best`` at one.
+    """
+
+    reading: str = field(default="worst", kw_only=True)
+    at_most: float = field(default=inf, kw_only=True)
+    at_least: float = field(default=-inf, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        limits = f"at_least {self.at_least:g}, at_most {self.at_most:g}"
+        if not self.at_least <= self.at_most or (self.at_least == -inf and self.at_most == inf):
+            raise QualityError(f"a constraint takes at_most, at_least or both, in this order, not {limits}")
+
+    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
+        """The violation: at most 0 where the constraint holds."""
+        violations = []
+        if self.at_most < inf:
+            violations.append(READINGS[self.reading](times, samples, False)[1] - self.at_most)
+        if self.at_least > -inf:
+            violations.append(self.at_least - READINGS[self.reading](times, samples, True)[1])
+        return max(violations)
 
 
 def exceedances(times: np.ndarray, quality: np.ndarray, *, threshold: float = inf) -> np.ndarray:

@@ -29,11 +29,14 @@ class RolloutResult:
         end: why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
             the testbed asked for the end) or ``failed``.
         message: the reason of a failure or termination.
-        t_star: t* in seconds from t0, equation (16); NaN if the rollout failed or had no quality.
-        h: f'(s^0, t*), equation (17); NaN as t_star.
+        t_star: t* in seconds from t0, equation (16); of a quality that is read at the end or as an integral the end, of
+            one that is read at its worst the time of that. NaN if the rollout failed or had no quality.
+        h: f'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
+        value: h in the user's terms: the cost, if f is one, else h.
+        measures: what else was asked to be measured, in its order; empty if the rollout failed.
         threshold: f_m.
         times: sample times from t0, in seconds, shape (n,).
-        quality: the quality trajectory f' at ``times``, equation (13), shape (n,).
+        quality: the quality trajectory f' at ``times``, equation (13), shape (n,); of a cost, 1 / (1 + cost).
         record: by address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
         state: s(t*) if it was asked for.
         wall_time: seconds it took.
@@ -45,6 +48,8 @@ class RolloutResult:
     quality: np.ndarray
     t_star: float = nan
     h: float = nan
+    value: float = nan
+    measures: tuple[float, ...] = ()
     threshold: float = inf
     message: str = ""
     record: Mapping[str, Any] = field(default_factory=dict)
@@ -68,6 +73,8 @@ class RolloutResult:
             and all(np.array_equal(v, other.parameters[k]) for k, v in self.parameters.items())
             and _same(self.t_star, other.t_star)
             and _same(self.h, other.h)
+            and _same(self.value, other.value)
+            and _same(list(self.measures), list(other.measures))
             and self.threshold == other.threshold
             and _same(self.times, other.times)
             and _same(self.quality, other.quality)

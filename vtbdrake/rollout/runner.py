@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from vtbdrake.rollout.quality import QualityError, best_sample
+from vtbdrake.rollout.quality import Measure, Quality, QualityError, best_sample
+from vtbdrake.rollout.readings import READINGS
 from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import VirtualTestbed
@@ -46,7 +47,9 @@ class RolloutRunner:
         if self.testbed.visualized:
             raise ValueError("a rollout does not draw: build the scenario without meshcat")
         self._variables = self.testbed.variables()
-        self._quality_readers = [self.testbed.reader(a) for a in (task.quality.of if task.quality else ())]
+        # f first, then what else is measured.
+        self._measures = [*([task.quality] if task.quality else []), *task.measures]
+        self._readers = {a: self.testbed.reader(a) for measure in self._measures for a in measure.of}
         self._recorders = {address: self.testbed.reader(address) for address in task.record}
         self._times = task.sample_times()
         self._s0 = self.testbed.default_context()
@@ -181,62 +184,82 @@ class _Samples:
         self._runner = runner
         self._times: list[float] = []
         self._clock = np.nan
-        self._quality: list[float] = []
+        self._samples: list[list[float]] = [[] for _ in runner._measures]
         self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
 
     def take(self, t: float) -> bool:
-        """Reads f' and what is to be recorded; says whether the threshold is exceeded."""
+        """Samples f, the measures and what is to be recorded; says whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
         with _FailuresAsOutcomes():
-            values = [read(runner.context) for read in runner._quality_readers]
+            values = {address: read(runner.context) for address, read in runner._readers.items()}
             recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
-        quality = None
-        if task.quality is not None:
-            try:
-                quality = task.quality(values, time=t)
-            except QualityError as error:
-                # f may know what NaN means (nothing was detected); where it does not, the simulation is to blame.
-                if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
-                    raise
-                raise SimulationError(f"a quality variable is not finite: {error}") from error
+        new = [_sample(measure, [values[a] for a in measure.of], t) for measure in runner._measures]
         self._times.append(t)
         self._clock = runner.context.get_time()
         for address, value in recorded.items():
             self._record[address].append(value)
-        if quality is None:
-            return False
-        self._quality.append(quality)
-        return quality > task.threshold
+        for samples, sample in zip(self._samples, new, strict=True):
+            samples.append(sample)
+        return task.quality is not None and bool(task.quality.quality(np.array(new[0])) > task.threshold)
 
     def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
-        task = self._runner.task
-        quality = np.array(self._quality)
-        t_star, h, state = np.nan, np.nan, None
-        above = bool((quality > task.threshold).any())
-        if above:
+        task, f = self._runner.task, self._runner.task.quality
+        times = np.array(self._times)
+        quality = f.quality(np.array(self._samples[0])) if f is not None else np.array([])
+        t_star, h, value, state = np.nan, np.nan, np.nan, None
+        measures: tuple[float, ...] = ()
+        if bool((quality > task.threshold).any()):
             # t* = min G1 stands, whatever happens to a rollout that runs on.
             end = THRESHOLD
-        if quality.size and end != FAILED:
-            best = best_sample(quality, threshold=task.threshold)
-            t_star, h = self._times[best], float(quality[best])
-            if task.keep_state:
-                runner = self._runner
-                # A rollout that failed after t* has moved on.
-                at_end = best == len(self._times) - 1 and runner.context.get_time() == self._clock
-                state = runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
+        if times.size and end != FAILED:
+            if f is not None:
+                t_star, value = _t_star(f, times, np.array(self._samples[0]), quality, task.threshold)
+                h = float(f.quality(np.array(value)))
+                if task.keep_state:
+                    state = self._state(parameters, t_star)
+            pairs = zip(task.measures, self._samples[len(self._samples) - len(task.measures) :], strict=True)
+            measures = tuple(measure.read(times, np.array(samples)) for measure, samples in pairs)
         return RolloutResult(
             parameters=parameters,
             end=end,
             message=message,
             t_star=t_star,
             h=h,
+            value=value,
+            measures=measures,
             threshold=task.threshold,
-            times=np.array(self._times),
+            times=times,
             quality=quality,
             record={address: _stack(values) for address, values in self._record.items()},
             state=state,
             wall_time=time.perf_counter() - begin,
         )
+
+    def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
+        runner = self._runner
+        # A rollout that failed after t* has moved on.
+        at_end = t_star == self._times[-1] and runner.context.get_time() == self._clock
+        return runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
+
+
+def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
+    try:
+        return measure(values, time=t)
+    except QualityError as error:
+        # f may know what NaN means (nothing was detected); where it does not, the simulation is to blame.
+        if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
+            raise
+        raise SimulationError(f"a quality variable is not finite: {error}") from error
+
+
+def _t_star(
+    f: Quality, times: np.ndarray, samples: np.ndarray, quality: np.ndarray, threshold: float
+) -> tuple[float, float]:
+    """(t*, f or the cost there), equations (14) to (17); for another reading than ``best``, its time and number."""
+    if f.reading != "best":
+        return READINGS[f.reading](times, samples, not f.minimize)
+    index = best_sample(quality, threshold=threshold)
+    return float(times[index]), float(samples[index])
 
 
 def _stack(values: list[Any]) -> Any:

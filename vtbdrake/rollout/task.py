@@ -8,7 +8,7 @@ from math import inf, isfinite, isnan
 
 import numpy as np
 
-from vtbdrake.rollout.quality import Quality
+from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
@@ -21,13 +21,15 @@ class RolloutTask:
         scenario: builds the testbed.
         horizon: t_m in seconds from t0.
         quality: f and its variables; None for a rollout that only records.
-        threshold: f_m: the first sample above it, strictly, ends the rollout.
+        threshold: f_m: the first sample of f' above it, strictly, ends the rollout. Only for a quality that is read at
+            its best.
         sample_period: in seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
             error control is part of the trajectory.
         record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
         run_on: simulate to t_m although the threshold was exceeded.
         start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults.
         keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
+        measures: what else is sampled and read as one number each: further objectives, constraints.
     """
 
     scenario: Scenario
@@ -39,9 +41,11 @@ class RolloutTask:
     run_on: bool = False
     start: Snapshot | None = None
     keep_state: bool = False
+    measures: tuple[Measure, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "record", tuple(self.record))
+        object.__setattr__(self, "measures", tuple(self.measures))
         # Its own: a scenario that is changed afterwards is another one.
         object.__setattr__(self, "scenario", copy.deepcopy(self.scenario))
         if not (isfinite(self.horizon) and self.horizon > 0.0):
@@ -53,6 +57,11 @@ class RolloutTask:
             )
         if isnan(self.threshold) or self.threshold < 0.0:
             raise ValueError(f"the threshold f_m must not be negative, as f is not, but it is {self.threshold}")
+        if self.quality is not None and self.quality.reading != "best" and self.threshold < inf:
+            raise ValueError(
+                f"a threshold ends a rollout at its best so far, but {self.quality.name} is read as "
+                f"{self.quality.reading!r}: leave the threshold out, or read it as 'best'"
+            )
 
     def sample_times(self) -> np.ndarray:
         """From 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
