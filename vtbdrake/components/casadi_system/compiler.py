@@ -1,0 +1,73 @@
+"""A casadi.Function as machine code: written as C, compiled once, and kept for the next time."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+from pathlib import Path
+
+import casadi
+
+from vtbdrake.state.files import whole_file
+
+# Products and sums are rounded one by one, as the interpreted function does it.
+_FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
+_ONE_AT_A_TIME = threading.Lock()
+
+
+class CompilerError(RuntimeError):
+    """There is no C compiler, or it failed."""
+
+
+def compiled(function: casadi.Function) -> casadi.Function:
+    """The same function as machine code.
+
+    The library is kept in `cache_folder` under a digest of its C code and of how it was compiled: a function is
+    compiled once per machine. Processes may do so at the same time.
+
+    Raises:
+        ValueError: the function has no C code, such as a `casadi.Callback`.
+        CompilerError: the compiler is missing or fails; the environment variable CC names another one than ``cc``.
+    """
+    try:
+        generator = casadi.CodeGenerator(f"{function.name()}.c", {})
+        generator.add(function)
+        source = generator.dump()
+    except RuntimeError as error:
+        raise ValueError(
+            f"{function.name()} cannot be written as C code; leave out compile=True. CasADi says: {error}"
+        ) from error
+    command = (*shlex.split(os.environ.get("CC") or "cc"), *_FLAGS)
+    recipe = "\n".join((source, *command, platform.system(), platform.machine()))
+    library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
+    with _ONE_AT_A_TIME:
+        if not library.exists():
+            _compile(source, command, library)
+    return casadi.external(function.name(), str(library))
+
+
+def cache_folder() -> Path:
+    """Where the libraries are kept: ``vtbdrake/casadi`` in XDG_CACHE_HOME, or in ``~/.cache``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vtbdrake" / "casadi"
+
+
+def _compile(source: str, command: tuple[str, ...], library: Path) -> None:
+    if shutil.which(command[0]) is None:
+        raise CompilerError(
+            f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc), name "
+            "yours in the environment variable CC, or leave out compile=True."
+        )
+    # Nobody else may write there: what lies in the folder is going to be executed.
+    library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, whole_file(library) as partial:
+        c_file = Path(folder) / "function.c"
+        c_file.write_text(source, encoding="utf-8")
+        result = subprocess.run([*command, str(c_file), "-o", str(partial), "-lm"], capture_output=True, text=True)
+        if result.returncode:
+            raise CompilerError(f"{shlex.join(command)} failed ({result.returncode}): {result.stderr.strip()}")

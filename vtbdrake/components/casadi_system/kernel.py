@@ -1,0 +1,93 @@
+"""A function y(z) and its Jacobian on arrays, at the lowest cost that Python allows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+
+from vtbdrake.components.casadi_system.compiler import compiled
+
+# casadi.SX or casadi.MX, for which CasADi's functions are overloaded one by one.
+Expression = Any
+
+_GENERATING = threading.Lock()
+
+
+class Kernel:
+    """y(z), for z of shape (n,) and y of shape (m,).
+
+    CasADi gives up the interpreter lock while it evaluates, and a system is evaluated in several threads at once: so
+    every thread has arrays of its own.
+    """
+
+    def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool):
+        """``y`` (m, 1) is an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other."""
+        self._name = name
+        self._arguments = list(arguments)
+        self._y = y
+        self._compile = compile
+        self._jacobian: _Buffers | None = None
+        self._value = self._buffers(name, y)
+
+    def value(self, blocks: Sequence[ArrayLike]) -> NDArray[np.float64]:
+        """y where z is the blocks one after the other. The thread's next call overwrites it."""
+        buffers = self._value
+        np.concatenate(blocks, out=buffers.z)
+        buffers.evaluate()
+        return buffers.y
+
+    def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
+        """y of AutoDiffXd, by the chain rule dy = (dy/dz) dz, where dy/dz is CasADi's."""
+        z = np.concatenate(blocks)
+        value, gradient = (ExtractValue(z), ExtractGradient(z)) if z.size else (np.zeros((0, 1)), np.zeros((0, 0)))
+        y = self.value([value.ravel()])
+        return InitializeAutoDiff(y, self._dy_dz(value.ravel()) @ gradient).ravel()
+
+    def _dy_dz(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        with _GENERATING:
+            if self._jacobian is None:
+                parts = [casadi.jacobian(self._y, argument) for argument in self._arguments]
+                jacobian = casadi.densify(casadi.horzcat(*parts)) if parts else casadi.DM(self._y.numel(), 0)
+                self._jacobian = self._buffers(f"{self._name}_jacobian", jacobian)
+        buffers = self._jacobian
+        buffers.z[:] = z
+        buffers.evaluate()
+        return buffers.y.reshape(z.size, -1).T if z.size else np.zeros((self._y.numel(), 0))
+
+    def _buffers(self, name: str, expression: Expression) -> _Buffers:
+        function = casadi.Function(name, self._arguments, [expression])
+        # A function of scalar operations cannot fail; others (a root finder, a solver) report it.
+        may_fail = not function.is_a("SXFunction")
+        return _Buffers(compiled(function) if self._compile else function, may_fail)
+
+
+class _Buffers(threading.local):
+    """The arrays on which one thread evaluates a function: ``z`` holds its arguments, ``y`` its result."""
+
+    def __init__(self, function: casadi.Function, may_fail: bool) -> None:
+        # What evaluates keeps the buffer alive as little as the buffer keeps the arrays.
+        buffer: Any  # whose stubs ask for a size that it does not take
+        buffer, evaluate = function.buffer()
+        self._buffer = buffer
+        self.z = np.zeros(function.nnz_in())
+        self.y = np.zeros(function.nnz_out())
+        start = 0
+        for i in range(function.n_in()):
+            end = start + function.nnz_in(i)
+            buffer.set_arg(i, self.z[start:end].data)
+            start = end
+        buffer.set_res(0, self.y.data)
+        self.evaluate = partial(_checked, buffer, evaluate, function.name(), self.z) if may_fail else evaluate
+
+
+def _checked(buffer: casadi.FunctionBuffer, evaluate: Callable[[], None], name: str, z: NDArray[np.float64]) -> None:
+    evaluate()
+    if buffer.ret():
+        raise RuntimeError(f"CasADi could not evaluate {name} at {z.tolist()}")

@@ -1,0 +1,240 @@
+"""What the arguments and the results of casadi.Functions are to a system: ports, state, parameters, time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.components.casadi_system.kernel import Expression, Kernel
+from vtbdrake.state.element import Element, discrete_state, parameter
+
+NEXT = "_next"
+INPUT, STATE, PARAMETER, TIME = "input", "state", "parameter", "time"
+
+Shape = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Arguments that are read from the Context together, one after the other."""
+
+    source: str
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Something to be computed from ``blocks``, of ``size`` entries. ``shows`` names the state that it is, if any."""
+
+    size: int
+    blocks: tuple[Block, ...]
+    kernel: Kernel
+    shows: str | None
+
+
+class Model:
+    """The functions of a system, whatever its scalar type.
+
+    Attributes:
+        shapes: (rows, columns) of every argument and state.
+        period: of the updates (s), or None.
+        variables: state and parameters by address.
+        inputs: the names of the arguments that are input ports.
+        state, parameters: default values, by name; flat, row after row.
+        outputs: by name.
+        update: all next states, one after the other, or None.
+    """
+
+    def __init__(
+        self,
+        output: casadi.Function | None,
+        update: casadi.Function | None,
+        *,
+        state: Mapping[str, ArrayLike],
+        period: float | None,
+        parameters: Mapping[str, ArrayLike],
+        time: str | None,
+        units: Mapping[str, str],
+        bounds: Mapping[str, tuple[float, float]],
+        compile: bool,
+    ) -> None:
+        functions = {n: f for n, f in (("output", output), ("update", update)) if f is not None}
+        if not functions:
+            raise ValueError("a CasadiSystem needs a function: give output, update, or both.")
+        for role, function in functions.items():
+            _check_function(role, function)
+        _check_sampling(update, state, period)
+        self.period = period
+        self.shapes = _argument_shapes(functions.values())
+        arguments = tuple(self.shapes)
+        if update is not None:
+            self.shapes |= _next_shapes(update, self.shapes, tuple(state))
+        clock = () if time is None else (time,)
+        _check_names(PARAMETER, parameters, arguments)
+        _check_names(TIME, clock, arguments)
+        _check_names("units of", units, (*state, *parameters))
+        _check_names("bounds of", bounds, (*state, *parameters))
+        _check_disjoint({STATE: state, PARAMETER: parameters, TIME: clock})
+        if time is not None and self.shapes[time] != (1, 1):
+            raise ValueError(f"time is a scalar, but the argument {time!r} is {_size(self.shapes[time])}.")
+        self.state = {name: _flat(STATE, name, value, self.shapes[name]) for name, value in state.items()}
+        self.parameters = {name: _flat(PARAMETER, name, value, self.shapes[name]) for name, value in parameters.items()}
+        self.variables = tuple(self._elements(units, bounds))
+        given = {*state, *parameters, time}
+        self.inputs = tuple(name for name in arguments if name not in given)
+        self._blocks = (
+            *([Block(TIME, clock)] if clock else []),
+            *([Block(PARAMETER, tuple(parameters))] if parameters else []),
+            *(Block(STATE, (name,)) for name in state),
+            *(Block(INPUT, (name,)) for name in self.inputs),
+        )
+        self.update = None
+        if update is not None:
+            symbols, values = self._evaluated(update)
+            following = casadi.vertcat(*(values[f"{name}{NEXT}"] for name in state))
+            self.update = self._result("update", symbols, following, compile)
+        if output is not None:
+            symbols, values = self._evaluated(output)
+        else:
+            symbols = self._symbols(casadi.SX)
+            values = {name: symbols[name] for name in state}
+        self.outputs = {name: self._result(name, symbols, value, compile) for name, value in values.items()}
+
+    def size(self, name: str) -> int:
+        """The number of entries of an argument or state."""
+        rows, columns = self.shapes[name]
+        return rows * columns
+
+    def state_index(self, name: str) -> int:
+        """The number of a state's group in the Context. All parameters are group 0, one after the other."""
+        return list(self.state).index(name)
+
+    def _elements(self, units: Mapping[str, str], bounds: Mapping[str, tuple[float, float]]) -> Iterator[Element]:
+        def declared(name: str) -> dict[str, Any]:
+            rows, columns = self.shapes[name]
+            shape = (rows, columns) if columns > 1 else (rows,) if rows > 1 else ()
+            return {"shape": shape, "unit": units.get(name, "1"), "bounds": bounds.get(name, (-inf, inf))}
+
+        start = 0
+        for name in self.parameters:
+            yield parameter(name, 0, start=start, **declared(name))
+            start += self.size(name)
+        for index, name in enumerate(self.state):
+            yield discrete_state(name, index, **declared(name))
+
+    def _symbols(self, kind: type) -> dict[str, Expression]:
+        return {name: kind.sym(f"a{k}", self.size(name)) for k, name in enumerate(self.shapes)}  # type: ignore[attr-defined]
+
+    def _evaluated(self, function: casadi.Function) -> tuple[dict[str, Expression], dict[str, Expression]]:
+        """Symbols of all arguments, and the results; as columns that hold a matrix row after row."""
+        symbols = self._symbols(casadi.SX if function.is_a("SXFunction") else casadi.MX)
+        arguments = [casadi.reshape(symbols[n], *self.shapes[n][::-1]).T for n in function.name_in()]
+        values = function.call(arguments, True, False)
+        names = function.name_out()
+        return symbols, {n: casadi.vec(casadi.densify(v).T) for n, v in zip(names, values, strict=True)}
+
+    def _result(self, name: str, symbols: Mapping[str, Expression], y: Expression, compile: bool) -> Result:
+        # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
+        occurring = {symbol.name() for symbol in casadi.symvar(y)}
+        used = {n for n, s in symbols.items() if occurring & {entry.name() for entry in casadi.symvar(s)}}
+        blocks = tuple(block for block in self._blocks if used.intersection(block.names))
+        arguments = [symbols[n] for block in blocks for n in block.names]
+        shows = None
+        if len(blocks) == 1 and blocks[0].source == STATE and y.numel() == self.size(blocks[0].names[0]):
+            shows = blocks[0].names[0] if casadi.is_equal(y, arguments[0]) else None
+        return Result(y.numel(), blocks, Kernel(name, arguments, y, compile=compile and shows is None), shows)
+
+
+def _check_function(role: str, function: object) -> None:
+    if not isinstance(function, casadi.Function):
+        raise ValueError(f"{role} is a casadi.Function, not {function!r}.")
+    if function.has_free():
+        raise ValueError(
+            f"{function.name()} has the free variables {_listed(function.get_free())}: make them arguments."
+        )
+    for i, name in enumerate(function.name_in()):
+        if not function.sparsity_in(i).is_dense() or function.numel_in(i) == 0:
+            raise ValueError(
+                f"{function.name()}: the argument {name!r} is {function.sparsity_in(i).dim()}, but must be dense "
+                "and have entries."
+            )
+    for i, name in enumerate(function.name_out()):
+        if function.numel_out(i) == 0:
+            raise ValueError(f"{function.name()}: the result {name!r} is empty; leave it out.")
+
+
+def _check_sampling(update: object, state: Mapping[str, ArrayLike], period: float | None) -> None:
+    if update is None:
+        if state:
+            raise ValueError(f"the state {_listed(state)} never changes: give update, or make it a parameter.")
+        if period is not None:
+            raise ValueError(f"period is {period} s, but there is no update that it belongs to; leave it out.")
+    elif period is None or not 0 < period < inf:
+        raise ValueError(f"period is {period} s, but update needs a positive one.")
+    elif not state:
+        raise ValueError("update needs state: give the initial values by name, such as state={'x': [0.0, 0.0]}.")
+
+
+def _argument_shapes(functions: Iterable[casadi.Function]) -> dict[str, Shape]:
+    shapes: dict[str, Shape] = {}
+    for function in functions:
+        for i, name in enumerate(function.name_in()):
+            shape = function.size_in(i)
+            if shapes.setdefault(name, shape) != shape:
+                raise ValueError(
+                    f"the argument {name!r} is {_size(shapes[name])} in output, but {_size(shape)} in update; they are "
+                    "one port, state or parameter of the system."
+                )
+    return shapes
+
+
+def _next_shapes(update: casadi.Function, shapes: Mapping[str, Shape], state: tuple[str, ...]) -> dict[str, Shape]:
+    """Of the states, after `update`."""
+    expected, given = [f"{name}{NEXT}" for name in state], update.name_out()
+    if set(expected) != set(given):
+        raise ValueError(
+            f"{update.name()} gives {_listed(given)}, but the next values of the state {_listed(state)} are expected: "
+            f"{_listed(expected)}."
+        )
+    following = {name: update.size_out(f"{name}{NEXT}") for name in state}
+    for name, shape in following.items():
+        if shapes.get(name, shape) != shape:
+            raise ValueError(f"the state {name!r} is {_size(shapes[name])}, but {name + NEXT!r} is {_size(shape)}.")
+    return following
+
+
+def _check_names(role: str, names: Iterable[str], arguments: Iterable[str]) -> None:
+    unknown = [name for name in names if name not in arguments]
+    if unknown:
+        raise ValueError(f"{role} {_listed(unknown)}: no such argument; there are {_listed(arguments)}.")
+
+
+def _check_disjoint(roles: Mapping[str, Iterable[str]]) -> None:
+    seen: dict[str, str] = {}
+    for role, names in roles.items():
+        for name in names:
+            if name in seen:
+                raise ValueError(f"{name!r} is {seen[name]} and {role}, but can be one thing only.")
+            seen[name] = role
+
+
+def _flat(role: str, name: str, value: ArrayLike, shape: Shape) -> NDArray[np.float64]:
+    array = np.asarray(value, dtype=float)
+    accepted = {shape} | ({(max(shape),)} if 1 in shape else set()) | ({()} if shape == (1, 1) else set())
+    if array.shape not in accepted:
+        raise ValueError(f"{role} {name!r} has a value of shape {array.shape}, but is {_size(shape)}.")
+    return array.ravel()
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(repr(str(name)) for name in names) or "none"
+
+
+def _size(shape: Shape) -> str:
+    return f"{shape[0]}x{shape[1]}"

@@ -1,0 +1,180 @@
+"""Any casadi.Function as a Drake system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.systems.framework import (
+    BasicVector_,
+    Context,
+    DependencyTicket,
+    DiscreteStateIndex,
+    LeafSystem_,
+    NumericParameterIndex,
+    SystemScalarConverter,
+)
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, Block, Model, Result
+
+
+@TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]
+def CasadiSystem_(T: type) -> type:
+    """`CasadiSystem` by scalar type."""
+
+    class Impl(LeafSystem_[T]):
+        r"""Controllers, estimators and other systems written in CasADi.
+
+        .. pydrake_system::
+
+            name: CasadiSystem
+            input_ports:
+            - <every argument that is neither state, nor parameter, nor time>
+            output_ports:
+            - <every result of output; without output, every state>
+
+        Without state, y = output(u, p, t). With discrete state, y = output(x, u, p, t), and at t = 0, T, 2 T, ...
+        x\ :sub:`next` = update(x, u, p, t). What an argument is, its name decides::
+
+            law = casadi.Function("law", [q, v, k], [-k[0] * q - k[1] * v], ["q", "v", "gain"], ["torque"])
+            CasadiSystem(law, parameters={"gain": [100.0, 10.0]}, units={"gain": "N m/rad, N m s/rad"})
+
+            filter = casadi.Function("filter", [x, u], [x + 0.1 * (u - x)], ["x", "u"], ["x_next"])
+            CasadiSystem(update=filter, state={"x": [0.0, 0.0]}, period=0.02)
+
+        A matrix travels as a vector, row after row (C order, as numpy's ``ravel`` and as the variables by address);
+        CasADi's own order is column after column. Parameters and state are variables by address.
+
+        An output depends on those arguments whose symbols occur in it, and on nothing else: so an output of the state
+        alone is no direct feedthrough, and is computed only when the state changes. An output that is a state (and
+        every output when ``output`` is left out) costs nothing. Every other output is computed for itself; what has
+        much in common is cheaper as one vector. If the function is an MX graph with calls in it, all results of a
+        call depend on all its arguments; `casadi.Function.expand` makes that exact, and is often faster.
+
+        With AutoDiffXd the derivatives are CasADi's, by the chain rule.
+
+        Args:
+            output: its results become output ports; its arguments are dense.
+            update: its results are the next values of all states, the one of ``x`` being named ``x_next``.
+            state: the initial values, by name.
+            period: of the updates (s).
+            parameters: the default values, by name.
+            time: the name of the argument that is the time (s).
+            units: of states and parameters, by name; "1" if left out.
+            bounds: (lower, upper) of the entries of states and parameters, by name; infinite if left out.
+            compile: evaluates machine code. The first time, it is made by the C compiler ``cc`` (or CC, from the
+                environment), and kept in ``~/.cache/vtbdrake`` (or XDG_CACHE_HOME).
+
+        Raises:
+            ValueError: names, sizes or arguments that do not fit together.
+            CompilerError: there is no C compiler, or it fails.
+        """
+
+        def _construct(
+            self,
+            output: casadi.Function | None = None,
+            *,
+            update: casadi.Function | None = None,
+            state: Mapping[str, ArrayLike] | None = None,
+            period: float | None = None,
+            parameters: Mapping[str, ArrayLike] | None = None,
+            time: str | None = None,
+            units: Mapping[str, str] | None = None,
+            bounds: Mapping[str, tuple[float, float]] | None = None,
+            compile: bool = False,
+            converter: SystemScalarConverter | None = None,
+        ) -> None:
+            model = Model(
+                output,
+                update,
+                state=state or {},
+                period=period,
+                parameters=parameters or {},
+                time=time,
+                units=units or {},
+                bounds=bounds or {},
+                compile=compile,
+            )
+            Impl._declare(self, model, converter)
+
+        def _construct_copy(self, other: Any, converter: SystemScalarConverter | None = None) -> None:
+            Impl._declare(self, other._model, converter)
+
+        def _declare(self, model: Model, converter: SystemScalarConverter | None) -> None:
+            LeafSystem_[T].__init__(self, converter)
+            self._model = model
+            self.variables = model.variables
+            self._ports = {name: self.DeclareVectorInputPort(name, model.size(name)) for name in model.inputs}
+            for value in model.state.values():
+                self.DeclareDiscreteState(BasicVector_[T](value))
+            if model.parameters:
+                self.DeclareNumericParameter(BasicVector_[T](np.concatenate(list(model.parameters.values()))))
+            for name, result in model.outputs.items():
+                if result.shows is not None:
+                    self.DeclareStateOutputPort(name, DiscreteStateIndex(model.state_index(result.shows)))
+                else:
+                    tickets = {self._ticket(block) for block in result.blocks} or {self.nothing_ticket()}
+                    self.DeclareVectorOutputPort(name, result.size, self._calc(result), prerequisites_of_calc=tickets)
+            if model.update is not None:
+                self.DeclarePeriodicDiscreteUpdateEvent(model.period, 0.0, self._update(model.update))
+
+        def _calc(self, result: Result) -> Callable[[Context, Any], None]:
+            evaluate, readers = self._evaluator(result), self._readers(result)
+
+            def calc(context: Context, output: Any) -> None:
+                output.set_value(evaluate([read(context) for read in readers]))
+
+            return calc
+
+        def _update(self, result: Result) -> Callable[[Context, Any], None]:
+            evaluate, readers = self._evaluator(result), self._readers(result)
+            ends = np.cumsum([value.size for value in self._model.state.values()]).tolist()
+            groups = [(i, slice(start, end)) for i, (start, end) in enumerate(pairwise([0, *ends]))]
+
+            def update(context: Context, state: Any) -> None:
+                following = evaluate([read(context) for read in readers])
+                for i, entries in groups:
+                    state.set_value(i, following[entries])
+
+            return update
+
+        def _evaluator(self, result: Result) -> Callable[[Sequence[ArrayLike]], NDArray[Any]]:
+            return result.kernel.value if T is float else result.kernel.autodiff
+
+        def _readers(self, result: Result) -> list[Callable[[Context], ArrayLike]]:
+            # All values are read before the kernel's arrays are touched: reading an input may evaluate this system too.
+            return [self._reader(block) for block in result.blocks] or [lambda context: ()]
+
+        def _reader(self, block: Block) -> Callable[[Context], ArrayLike]:
+            name = block.names[0]
+            # A view is cheaper, but there is none of AutoDiffXd.
+            entries = BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector
+            if block.source == INPUT:
+                return self._ports[name].Eval
+            if block.source == STATE:
+                index = self._model.state_index(name)
+                return lambda context: entries(context.get_discrete_state(index))
+            if block.source == PARAMETER:
+                return lambda context: entries(context.get_numeric_parameter(0))
+            return lambda context: (context.get_time(),)
+
+        def _ticket(self, block: Block) -> DependencyTicket:
+            name = block.names[0]
+            if block.source == INPUT:
+                return self._ports[name].ticket()
+            if block.source == STATE:
+                return self.discrete_state_ticket(DiscreteStateIndex(self._model.state_index(name)))
+            if block.source == PARAMETER:
+                return self.numeric_parameter_ticket(NumericParameterIndex(0))
+            return self.time_ticket()
+
+    return Impl
+
+
+CasadiSystem = CasadiSystem_[None]
