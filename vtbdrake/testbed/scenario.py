@@ -7,11 +7,11 @@ import importlib
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Self, get_args, get_type_hints
 
 import numpy as np
 import yaml
@@ -20,6 +20,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import GetIntegrationSchemes
 from pydrake.systems.framework import System
 
+from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
@@ -112,6 +113,26 @@ class Scenario(ABC):
     def record(self) -> dict[str, Any]:
         """What identifies it, as plain data: its name and all fields, nested ones by dotted names."""
         return {"scenario": self.name(), **dict(_flat(asdict(self)))}
+
+    def with_fields(self, values: Mapping[str, Any]) -> Self:
+        """A copy in which some fields have other values; nested ones by dotted names (``simulator.accuracy``).
+
+        Fields that are a bool, int, float or str can be given; an int will do for a float, and numpy's scalars for
+        Python's.
+
+        Raises:
+            ScenarioError: there is no such field, the value is of another type, or the scenario refuses it.
+        """
+        changed = copy.deepcopy(self)
+        known = {name: (owner, kinds) for name, owner, kinds in _scalar_fields(changed)}
+        for name, value in values.items():
+            if name not in known:
+                near = suggestion(f"scenario.{name}", [f"scenario.{k}" for k in known])
+                raise ScenarioError(f"{type(self).__name__} has no field {name!r} of a plain type{near}")
+            owner, kinds = known[name]
+            setattr(owner, name.rpartition(".")[2], _scalar(value, kinds, f"{type(self).__name__}.{name}"))
+        changed.validate()
+        return changed
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a YAML file that `load_scenario` reads."""
@@ -220,3 +241,32 @@ def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(item, f"{name}[{i}]")
     else:
         yield name, value
+
+
+_SCALARS: dict[str, type] = {"bool": bool, "int": int, "float": float, "str": str}
+
+
+def _scalar_fields(owner: Any, prefix: str = "") -> Iterator[tuple[str, Any, tuple[type, ...]]]:
+    """Dotted name, owner and types of every field of a plain type, of ``owner`` and of the dataclasses in it."""
+    for item in fields(owner):
+        value = getattr(owner, item.name)
+        if is_dataclass(value):
+            yield from _scalar_fields(value, f"{prefix}{item.name}.")
+            continue
+        # By their names: in another process, those of a class from a notebook cannot be looked up.
+        kind = item.type.__name__ if isinstance(item.type, type) else str(item.type)
+        names = [part.strip() for part in kind.split("|")]
+        kinds = tuple(_SCALARS[part] for part in names if part in _SCALARS)
+        if kinds:
+            yield f"{prefix}{item.name}", owner, kinds
+
+
+def _scalar(value: Any, kinds: tuple[type, ...], name: str) -> Any:
+    if isinstance(value, np.generic | np.ndarray) and np.ndim(value) == 0:
+        value = value.item()
+    if type(value) is int and int not in kinds and float in kinds:
+        value = float(value)
+    if type(value) not in kinds:
+        expected = " or ".join(kind.__name__ for kind in kinds)
+        raise ScenarioError(f"{name} takes a value of type {expected}, not {value!r} of type {type(value).__name__}")
+    return value
