@@ -1,7 +1,9 @@
 """Gamma: one rollout, and many side by side."""
 
-from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, choose_executor, make_executor
-from vtbdrake.rollout.processes import ProcessExecutor, WorkerError
+from vtbdrake.rollout.choice import choose_executor, make_executor
+from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, WorkerError
+from vtbdrake.rollout.futures import FuturesExecutor
+from vtbdrake.rollout.processes import ProcessExecutor
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.runner import RolloutRunner
@@ -10,6 +12,7 @@ from vtbdrake.rollout.task import RolloutTask
 __all__ = [
     "Constraint",
     "Executor",
+    "FuturesExecutor",
     "Measure",
     "ProcessExecutor",
     "Quality",

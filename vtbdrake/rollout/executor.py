@@ -1,4 +1,4 @@
-"""Where rollouts run: one after another, in threads that share a Diagram, or in processes that keep theirs.
+"""Where rollouts run: one after another, or in threads that share a Diagram. Others have modules of their own.
 
 The results are the same, to the last bit, whichever runs them.
 """
@@ -8,17 +8,24 @@ from __future__ import annotations
 import os
 import queue
 import threading
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
 from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.runner import CancelledError, RolloutRunner, same_scenario
+from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.testbeds import KEPT, Runners, Testbeds
 from vtbdrake.testbed import VirtualTestbed
 
 Parameters = Mapping[str, Any]
+
+
+class WorkerError(RuntimeError):
+    """Workers cannot do what they are asked for."""
 
 
 def cores() -> int:
@@ -27,13 +34,20 @@ def cores() -> int:
 
 
 class Executor(ABC):
-    """Runs rollouts of a task. It may be used for several tasks and is closed at the end (it is a context manager)."""
+    """Runs rollouts of a task. It may be used for several tasks and is closed at the end (it is a context manager).
+
+    What a rollout needs is kept from call to call, so that a call with a single point costs little more than its
+    rollout. A task is known by its identity: hand in the same object each time.
+    """
 
     @abstractmethod
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
         """Runs one rollout per point and yields (index of the point, result) as they finish.
 
-        A rollout that fails is a result; an error in the quality function is raised, and ends the others.
+        A point is a mapping address -> value; ``scenario.<field>`` is a field of the task's scenario, for which
+        another testbed is built, and kept. A rollout that fails is a result, also when no testbed can be built with
+        its fields; an error in the quality function, or a field that does not exist or that the scenario refuses, is
+        raised, and ends the others.
         """
 
     def close(self) -> None:
@@ -50,97 +64,112 @@ class Executor(ABC):
 
 
 class SerialExecutor(Executor):
-    """One rollout after another, in this thread."""
+    """One rollout after another, in this thread.
 
-    def __init__(self, testbed: VirtualTestbed | None = None) -> None:
-        self._testbed = testbed
+    Args:
+        testbed: is used where it is the task's; others are built.
+        kept: how many testbeds are kept, for points with different scenario fields.
+    """
+
+    def __init__(self, testbed: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
+        self._runners = Runners(Testbeds(testbed, kept=kept))
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        runner = RolloutRunner(task, _testbed_of(task, self._testbed))
-        for index, parameters in enumerate(points):
-            yield index, runner.run(parameters)
+        for index, point in enumerate(points):
+            yield index, self._runners.run(task, point)
+
+    def close(self) -> None:
+        self._runners.clear()
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One rollout for a thread; it puts exactly one item into ``done``."""
+
+    task: RolloutTask
+    index: int
+    point: Parameters
+    cancel: threading.Event
+    done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException]
 
 
 class ThreadExecutor(Executor):
     """Threads that share one Diagram, each with a Context of its own.
 
     The fastest where all systems are Drake's: a system in Python makes the threads wait for each other.
+
+    Args:
+        workers: how many threads; the number of cores if left out.
+        testbed: is used where it is the task's; others are built.
+        kept: how many testbeds are kept, for points with different scenario fields.
     """
 
-    def __init__(self, workers: int | None = None, *, testbed: VirtualTestbed | None = None) -> None:
-        self._count = _checked(workers)
-        self._testbed = testbed
+    def __init__(self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, kept: int = KEPT) -> None:
+        self._count = checked_workers(workers)
+        self._runners = Runners(Testbeds(testbed, kept=kept))
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._threads: list[threading.Thread] = []
+        # The threads know nothing of the executor: one that is forgotten without being closed must not live on in them.
+        weakref.finalize(self, _stop, self._jobs, self._threads)
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        testbed = _testbed_of(task, self._testbed)
-        waiting: queue.SimpleQueue[tuple[int, Parameters]] = queue.SimpleQueue()
-        done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException] = queue.SimpleQueue()
-        cancel = threading.Event()
-        for item in enumerate(points):
-            waiting.put(item)
-
-        def work() -> None:
-            try:
-                runner = RolloutRunner(task, testbed)
-                while not cancel.is_set():
-                    index, parameters = waiting.get_nowait()
-                    done.put((index, runner.run(parameters, cancel=cancel)))
-            except (queue.Empty, CancelledError):
-                return
-            except BaseException as error:  # Raised again where the results are read.
-                done.put(error)
-
-        count = min(self._count, len(points))
-        threads = [threading.Thread(target=work, name=f"rollout-{i}", daemon=True) for i in range(count)]
-        for thread in threads:
+        if len(points) == 1:  # It would gain nothing from a change of threads.
+            yield 0, self._runners.run(task, points[0])
+            return
+        while len(self._threads) < min(self._count, len(points)):
+            name = f"rollout-{len(self._threads)}"
+            thread = threading.Thread(target=_work, args=(self._jobs, self._runners), name=name, daemon=True)
             thread.start()
+            self._threads.append(thread)
+        cancel = threading.Event()
+        done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException] = queue.SimpleQueue()
+        open_jobs = 0
         try:
-            for _ in points:
+            for index, point in enumerate(points):
+                self._jobs.put(_Job(task, index, point, cancel, done))
+                open_jobs += 1
+            while open_jobs:
                 result = done.get()
+                open_jobs -= 1
                 if isinstance(result, BaseException):
                     raise result
                 yield result
         finally:
             cancel.set()
-            for thread in threads:
-                thread.join()
+            for _ in range(open_jobs):
+                done.get()
+
+    def close(self) -> None:
+        _stop(self._jobs, self._threads)
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        self._runners.clear()
 
 
-def _testbed_of(task: RolloutTask, known: VirtualTestbed | None) -> VirtualTestbed:
-    """The testbed that is known, if it is the task's."""
-    return known if known is not None and same_scenario(known, task) else task.scenario.build()
+def _stop(jobs: queue.SimpleQueue[_Job | None], threads: Sequence[threading.Thread]) -> None:
+    for _ in threads:
+        jobs.put(None)
 
 
-def choose_executor(testbed: VirtualTestbed) -> str:
-    """The kind of executor that suits a testbed: threads, or processes where systems in Python have work to do."""
-    return "processes" if testbed.python_systems else "threads"
+def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
+    while (job := jobs.get()) is not None:
+        try:
+            if job.cancel.is_set():
+                raise CancelledError
+            job.done.put((job.index, runners.run(job.task, job.point, cancel=job.cancel)))
+        except BaseException as error:  # Raised again where the results are read.
+            job.done.put(error)
+        # While it waits for the next one, it keeps nothing of the last.
+        del job
 
 
-def make_executor(
-    executor: str | Executor, *, testbed: VirtualTestbed, rollouts: int, workers: int | None = None
-) -> Executor:
-    """An executor by name (``auto``, ``serial``, ``threads``, ``processes``), or the one given.
+def checked_workers(workers: int | None) -> int:
+    """How many workers; the number of cores if left out.
 
     Raises:
-        ValueError: the name is unknown.
+        ValueError: there are none.
     """
-    from vtbdrake.rollout.processes import ProcessExecutor
-
-    if isinstance(executor, Executor):
-        return executor
-    if executor == "auto":
-        alone = min(rollouts, workers if workers is not None else cores()) <= 1
-        executor = "serial" if alone else choose_executor(testbed)
-    if executor == "serial":
-        return SerialExecutor(testbed)
-    if executor == "threads":
-        return ThreadExecutor(workers, testbed=testbed)
-    if executor == "processes":
-        return ProcessExecutor(workers)
-    raise ValueError(f"an executor is one of auto, serial, threads, processes, or an Executor, not {executor!r}")
-
-
-def _checked(workers: int | None) -> int:
     if workers is not None and workers < 1:
         raise ValueError(f"an executor needs at least one worker, not {workers}")
     return workers if workers is not None else cores()

@@ -13,24 +13,19 @@ from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-import cloudpickle
-import numpy as np
-
-from vtbdrake.rollout.executor import Executor, Parameters, _checked
-from vtbdrake.rollout.result import FAILED, RolloutResult
+from vtbdrake.rollout.blob import Blobs
+from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
+from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.testbeds import KEPT, Testbeds, failed
 
 _log = logging.getLogger(__name__)
-
-
-class WorkerError(RuntimeError):
-    """Worker processes cannot do what they are asked for."""
 
 
 class _Worker:
     """A fresh interpreter at the other end of a socket. It does not import the main module again."""
 
-    def __init__(self) -> None:
+    def __init__(self, kept: int) -> None:
         # Ctrl-C reaches the whole group of processes; the main one decides what it means.
         program = (
             "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -39,7 +34,7 @@ class _Worker:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", program, str(theirs.fileno())],
+                [sys.executable, "-c", program, str(theirs.fileno()), str(kept)],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
@@ -91,13 +86,14 @@ class ProcessExecutor(Executor):
     Args:
         workers: how many; the number of cores if left out.
         time_limit: in seconds of wall time for one rollout.
+        kept: how many testbeds each process keeps, for points with different scenario fields.
     """
 
-    def __init__(self, workers: int | None = None, *, time_limit: float = float("inf")) -> None:
-        if not time_limit > 0.0:
-            raise ValueError(f"the time limit must be positive, not {time_limit} s")
-        self._count = _checked(workers)
-        self._time_limit = time_limit
+    def __init__(self, workers: int | None = None, *, time_limit: float = float("inf"), kept: int = KEPT) -> None:
+        self._count = checked_workers(workers)
+        self._time_limit = checked_time_limit(time_limit)
+        self._kept = Testbeds(kept=kept).kept
+        self._blobs = Blobs()
         self._workers: list[_Worker] = []
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
@@ -106,11 +102,11 @@ class ProcessExecutor(Executor):
         Raises:
             WorkerError: the task cannot be sent to another process, or cannot be built there.
         """
-        blob = _pickled(task)
+        blob = self._blobs.get(task).content
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
         while len(self._workers) < min(self._count, len(points)):
-            self._workers.append(_Worker())
+            self._workers.append(_Worker(self._kept))
         try:
             while waiting or any(worker.job is not None for worker in self._workers):
                 self._hand_out(blob, waiting, points)
@@ -123,7 +119,7 @@ class ProcessExecutor(Executor):
                     elif isinstance(reply, str):
                         self._replace(worker)
                         if index in losses:
-                            yield index, _lost(points[index], f"{losses[index]}; then {reply}")
+                            yield index, failed(points[index], f"{losses[index]}; then {reply}")
                         else:
                             _log.warning("rollout %d is tried again: %s", index, reply)
                             losses[index] = reply
@@ -174,7 +170,7 @@ class ProcessExecutor(Executor):
 
     def _replace(self, worker: _Worker) -> None:
         worker.kill()
-        self._workers[self._workers.index(worker)] = _Worker()
+        self._workers[self._workers.index(worker)] = _Worker(self._kept)
 
     def close(self) -> None:
         for worker in self._workers:
@@ -182,18 +178,12 @@ class ProcessExecutor(Executor):
         self._workers.clear()
 
 
-def _pickled(task: RolloutTask) -> bytes:
-    try:
-        # cloudpickle also takes functions and scenarios that are defined in a notebook or a script.
-        return bytes(cloudpickle.dumps(task))
-    except Exception as error:
-        raise WorkerError(
-            f"the problem cannot be sent to another process ({type(error).__name__}: {error}): use executor='threads' "
-            "or 'serial', or keep what cannot be pickled out of its quality function and scenario"
-        ) from error
+def checked_time_limit(time_limit: float) -> float:
+    """In seconds.
 
-
-def _lost(parameters: Parameters, message: str) -> RolloutResult:
-    return RolloutResult(
-        parameters=dict(parameters), end=FAILED, message=message, times=np.array([]), quality=np.array([])
-    )
+    Raises:
+        ValueError: it is not positive.
+    """
+    if not time_limit > 0.0:
+        raise ValueError(f"the time limit must be positive, not {time_limit} s")
+    return time_limit

@@ -4,45 +4,47 @@ from __future__ import annotations
 
 import pickle
 import sys
+from collections.abc import Callable
+from functools import cache, partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from vtbdrake.rollout.runner import RolloutRunner
+from vtbdrake.rollout.result import RolloutResult
+from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.testbeds import Runners, Testbeds
 
 
-def serve(connection: Connection) -> None:
+def serve(connection: Connection, runners: Runners) -> None:
     """Answers until the other end closes, which it also does by dying.
 
-    A task (T) has no answer. A rollout (R) has two: None when it begins, then (its index, its result or an exception).
+    A task (T) has no answer. A rollout (R) has two: None when it begins, then (its index, its result or an exception);
+    where no testbed can be had for it, only the second.
     """
-    runner: RolloutRunner | None = None
-    trouble: BaseException | None = None
+    load: Callable[[], RolloutTask] | None = None
     while True:
         try:
             message = connection.recv_bytes()
             kind, content = message[:1], message[1:]
             if kind == b"T":
-                runner, trouble = None, None
-                try:
-                    runner = RolloutRunner(pickle.loads(content))
-                except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-                    trouble = error
-            else:
-                index, parameters = pickle.loads(content)
-                connection.send_bytes(pickle.dumps(None))
-                connection.send_bytes(_answer(runner, trouble, index, parameters))
+                # The same task each time, for its runner is known by it; what cannot be read raises each time.
+                load = cache(partial(pickle.loads, content))
+                continue
+            index, point = pickle.loads(content)
+            assert load is not None, "a worker got a rollout before its task"
+            connection.send_bytes(answer(index, partial(_rollout, runners, load, point, connection)))
         except (EOFError, OSError):
             return
 
 
-def _answer(
-    runner: RolloutRunner | None, trouble: BaseException | None, index: int, parameters: dict[str, Any]
-) -> bytes:
+def _rollout(runners: Runners, load: Callable[[], RolloutTask], point: Any, connection: Connection) -> RolloutResult:
+    return runners.run(load(), point, begin=partial(connection.send_bytes, pickle.dumps(None)))
+
+
+def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
+    """(index, the result of ``rollout`` or the exception that it raised), pickled so that it can be read again."""
     try:
-        if runner is None:
-            raise trouble or RuntimeError("a worker got a rollout before its task")
-        result = runner.run(parameters)
-    except (Exception, SystemExit) as error:
+        result = rollout()
+    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
         return _pickled_error(index, error)
     try:
         return pickle.dumps((index, result))
@@ -65,4 +67,4 @@ def _pickled_error(index: int, error: BaseException) -> bytes:
 def main() -> None:
     connection = Connection(int(sys.argv[1]))
     connection.send_bytes(b"ready")
-    serve(connection)
+    serve(connection, Runners(Testbeds(kept=int(sys.argv[2]))))
