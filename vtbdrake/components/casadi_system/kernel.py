@@ -29,12 +29,12 @@ class Kernel:
 
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool):
         """``y`` (m, 1) is an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other."""
-        self._name = name
+        self._name = casadi.Function.fix_name(name)
         self._arguments = list(arguments)
         self._y = y
         self._compile = compile
         self._jacobian: _Buffers | None = None
-        self._value = self._buffers(name, y)
+        self._value = self._buffers(self._name, y)
 
     def value(self, blocks: Sequence[ArrayLike]) -> NDArray[np.float64]:
         """y where z is the blocks one after the other. The thread's next call overwrites it."""

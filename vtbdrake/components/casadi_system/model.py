@@ -98,13 +98,15 @@ class Model:
         if update is not None:
             symbols, values = self._evaluated(update)
             following = casadi.vertcat(*(values[f"{name}{NEXT}"] for name in state))
-            self.update = self._result("update", symbols, following, compile)
+            self.update = self._result(update.name(), symbols, following, compile)
         if output is not None:
+            prefix = output.name()
             symbols, values = self._evaluated(output)
         else:
+            prefix = "state"
             symbols = self._symbols(casadi.SX)
             values = {name: symbols[name] for name in state}
-        self.outputs = {name: self._result(name, symbols, value, compile) for name, value in values.items()}
+        self.outputs = {n: self._result(f"{prefix}_{n}", symbols, value, compile) for n, value in values.items()}
 
     def size(self, name: str) -> int:
         """The number of entries of an argument or state."""
@@ -135,7 +137,10 @@ class Model:
         """Symbols of all arguments, and the results; as columns that hold a matrix row after row."""
         symbols = self._symbols(casadi.SX if function.is_a("SXFunction") else casadi.MX)
         arguments = [casadi.reshape(symbols[n], *self.shapes[n][::-1]).T for n in function.name_in()]
-        values = function.call(arguments, True, False)
+        try:
+            values = function.call(arguments, True, False)
+        except RuntimeError:  # it was made with never_inline
+            values = function.call(arguments)
         names = function.name_out()
         return symbols, {n: casadi.vec(casadi.densify(v).T) for n, v in zip(names, values, strict=True)}
 
@@ -161,7 +166,7 @@ def _check_function(role: str, function: object) -> None:
     for i, name in enumerate(function.name_in()):
         if not function.sparsity_in(i).is_dense() or function.numel_in(i) == 0:
             raise ValueError(
-                f"{function.name()}: the argument {name!r} is {function.sparsity_in(i).dim()}, but must be dense "
+                f"{function.name()}: the argument {name!r} is {function.sparsity_in(i).dim(True)}, but must be dense "
                 "and have entries."
             )
     for i, name in enumerate(function.name_out()):

@@ -1,0 +1,147 @@
+"""Compiled functions: the same values, made once, and clear words where that fails."""
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import casadi
+import numpy as np
+import pytest
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
+
+from vtbdrake.components.casadi_system import CasadiSystem, CompilerError
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of the compiled functions, and the log of a compiler that writes down each of its runs."""
+    compiler = tmp_path / "logging_cc"
+    compiler.write_text(f'#!/bin/sh\necho run >> {tmp_path}/log\nexec {shutil.which("cc")} "$@"\n')
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def _function(kind=casadi.SX, factor=2.0):
+    x, u = kind.sym("x", 3), kind.sym("u", 3)
+    y = casadi.vertcat(casadi.sin(x) * u * factor, casadi.exp(-casadi.dot(x, u)), casadi.fmax(x[0], u[1]))
+    return casadi.Function("law", [x, u], [y], ["x", "u"], ["y"])
+
+
+def _eval(system, x, u):
+    context = system.CreateDefaultContext()
+    system.GetInputPort("x").FixValue(context, x)
+    system.GetInputPort("u").FixValue(context, u)
+    return system.GetOutputPort("y").Eval(context)
+
+
+def _runs(folder):
+    return len((folder / "log").read_text().splitlines())
+
+
+@pytest.mark.parametrize("kind", [casadi.SX, casadi.MX])
+def test_compiled_computes_what_interpreted_computes(cache, kind):
+    interpreted, machine = CasadiSystem(_function(kind)), CasadiSystem(_function(kind), compile=True)
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        x, u = rng.normal(size=(2, 3))
+        np.testing.assert_allclose(_eval(machine, x, u), _eval(interpreted, x, u), rtol=1e-14)
+    z = InitializeAutoDiff(rng.normal(size=6)).ravel()
+    gradients = [ExtractGradient(_eval(system.ToAutoDiffXd(), z[:3], z[3:])) for system in (machine, interpreted)]
+    np.testing.assert_allclose(*gradients, rtol=1e-14)
+    assert gradients[0].shape == (5, 6)
+
+
+def test_a_function_is_compiled_once(cache):
+    for _ in range(3):
+        CasadiSystem(_function(), compile=True)
+    assert _runs(cache) == 1
+    CasadiSystem(_function(factor=3.0), compile=True)
+    assert _runs(cache) == 2
+
+
+def test_what_the_compiled_function_need_not_compute_is_not_compiled(cache):
+    update = casadi.Function("hold", [casadi.SX.sym("u")], [1.0], ["u"], ["x_next"])
+    CasadiSystem(update=update, state={"x": 0.0}, period=0.1, compile=True)
+    assert _runs(cache) == 1  # the update; the state's port shows the state
+
+
+def test_processes_may_compile_at_once(cache):
+    code = textwrap.dedent("""
+        import casadi
+        from vtbdrake.components.casadi_system import CasadiSystem
+        x = casadi.SX.sym("x", 3)
+        system = CasadiSystem(casadi.Function("f", [x], [casadi.sin(x)], ["x"], ["y"]), compile=True)
+        context = system.CreateDefaultContext()
+        system.get_input_port().FixValue(context, [0.1, 0.2, 0.3])
+        print(system.get_output_port().Eval(context).tolist())
+    """)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    outputs = [process.communicate(timeout=120)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0]
+    assert outputs == [f"{np.sin([0.1, 0.2, 0.3]).tolist()}\n"] * 3
+    assert [path.suffix for path in (cache / "cache" / "vtbdrake" / "casadi").iterdir()] == [".so"]
+
+
+def test_a_missing_compiler_is_named_with_the_remedy(cache, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-cc")
+    with pytest.raises(CompilerError, match="there is no 'no-such-cc': install one .* or leave out compile=True"):
+        CasadiSystem(_function(), compile=True)
+
+
+def test_a_compiler_that_fails_leaves_nothing_behind(cache, monkeypatch):
+    monkeypatch.setenv("CC", f"{shutil.which('cc')} -no-such-flag")
+    with pytest.raises(CompilerError, match="no-such-flag"):
+        CasadiSystem(_function(), compile=True)
+    assert list((cache / "cache" / "vtbdrake" / "casadi").iterdir()) == []
+    monkeypatch.setenv("CC", "cc")
+    np.testing.assert_allclose(_eval(CasadiSystem(_function(), compile=True), np.zeros(3), np.ones(3))[3], 1.0)
+
+
+def test_python_inside_a_function_cannot_be_compiled(cache):
+    class Doubled(casadi.Callback):
+        def __init__(self):
+            super().__init__()
+            self.construct("doubled", {})
+
+        def eval(self, arguments):
+            return [2 * arguments[0]]
+
+    x, doubled = casadi.MX.sym("x"), Doubled()
+    function = casadi.Function("law", [x], [doubled(x)], ["x"], ["y"])
+    with pytest.raises(
+        ValueError, match="law_y contains CallbackInternal, for which there is no C code: leave out compile=True"
+    ):
+        CasadiSystem(function, compile=True)
+
+
+def test_a_function_that_reports_failure_is_an_error(tmp_path):
+    source = tmp_path / "picky.c"
+    source.write_text("""
+        int picky(const double** arg, double** res, long long* iw, double* w, int mem) {
+            if (arg[0][0] < 0) return 1;
+            res[0][0] = arg[0][0];
+            return 0;
+        }
+    """)
+    library = tmp_path / "picky.so"
+    subprocess.run(["cc", "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    x = casadi.MX.sym("x")
+    picky = casadi.external("picky", str(library))
+    system = CasadiSystem(casadi.Function("law", [x], [picky(x)], ["x"], ["y"]))
+    context = system.CreateDefaultContext()
+    system.get_input_port().FixValue(context, [2.0])
+    assert system.get_output_port().Eval(context) == [2.0]
+    system.get_input_port().FixValue(context, [-2.0])
+    with pytest.raises(RuntimeError, match=r"CasADi could not evaluate law_y at \[-2.0\]"):
+        system.get_output_port().Eval(context)
