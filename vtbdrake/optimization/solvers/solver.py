@@ -52,12 +52,15 @@ class Solver(ABC):
     not on time. So a study is the same in series and in parallel, and can be resumed by telling it again.
 
     Attributes:
-        name: as the user named it, or as it was chosen.
+        name: as the catalogue spells it.
         wants_gradient: whether `Evaluation.gradient` is to be filled.
+        reproducible: False for the few algorithms whose library draws its random numbers from the clock: those ask for
+            other points each time, whatever the seed.
     """
 
     name: str
     wants_gradient: bool = False
+    reproducible: bool = True
 
     @property
     def method(self) -> str:
@@ -66,11 +69,24 @@ class Solver(ABC):
 
     @abstractmethod
     def ask(self) -> list[Point]:
-        """The points to be judged next; empty when it is finished."""
+        """The points to be judged next; empty when it is finished.
+
+        Raises:
+            SolverError: it was not told yet of the points that it asked for before.
+            Exception: what the method itself raised, as it is.
+        """
 
     @abstractmethod
     def tell(self, evaluations: Sequence[Evaluation]) -> None:
-        """The evaluations of the last batch, in its order, and after them any that were given by hand."""
+        """The evaluations of the last batch, in its order, and after them any that were given by hand.
+
+        Points given by hand may also be told before the first `ask`. TPE and its kin learn from them, and so does
+        `auto` when it begins anew; a local method, a design and CMA-ES go on as they would have without.
+
+        Raises:
+            SolverError: the batch is not complete or not in its order, or there are not as many values or violations as
+                the problem has.
+        """
 
     @property
     def success(self) -> bool | None:

@@ -1,0 +1,84 @@
+"""The bookkeeping that all solvers share: batches, the budget, and how it ended."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, SolverError
+
+
+class BatchSolver(Solver):
+    """A solver that says what comes next (`_next`) and learns from it (`_learn`).
+
+    It asks for ``search.budget`` points at most. The batch that exceeds it is cut, so that no evaluation is wasted; the
+    method does not learn from a cut batch, since it is over then.
+    """
+
+    def __init__(self, search: Search, *, name: str) -> None:
+        self.name = name
+        self.search = search
+        self._asked: list[Point] = []
+        self._left = search.budget
+        self._cut = False
+        self._success: bool | None = None
+        self._message = ""
+
+    @abstractmethod
+    def _next(self) -> list[Point]:
+        """The next batch; empty after a call of `_end`."""
+
+    @abstractmethod
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        """The evaluations of a complete batch (none: before the first), and those given by hand."""
+
+    def _end(self, success: bool, message: str) -> None:
+        """It asks for no more points."""
+        self._success = success
+        self._message = message
+        self.close()
+
+    def ask(self) -> list[Point]:
+        if self._asked:
+            raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
+        if self._success is None and self._left == 0:
+            self._end(False, f"the budget of {self.search.budget} evaluations was spent before it converged")
+        if self._success is not None:
+            return []
+        points = self._next()
+        if self._left is not None:
+            self._cut = len(points) > self._left
+            points = points[: self._left]
+            self._left -= len(points)
+        self._asked = points
+        return list(points)
+
+    def tell(self, evaluations: Sequence[Evaluation]) -> None:
+        count = len(self._asked)
+        if [evaluation.point for evaluation in evaluations[:count]] != self._asked:
+            raise SolverError(
+                f"{self.name} asked for {count} points and is to be told of those first, in their order; "
+                f"it was told of {len(evaluations)}"
+            )
+        for evaluation in evaluations:
+            self._check(evaluation)
+        self._asked = []
+        if not self._cut:
+            self._learn(evaluations[:count], evaluations[count:])
+
+    def _check(self, evaluation: Evaluation) -> None:
+        for name, told, expected in (
+            ("values", evaluation.values, self.search.objectives),
+            ("violations", evaluation.violations, self.search.constraints),
+        ):
+            if len(told) != expected:
+                raise SolverError(f"an evaluation of this problem has {expected} {name}, not {len(told)}")
+
+    @property
+    def success(self) -> bool | None:
+        return self._success
+
+    @property
+    def message(self) -> str:
+        return self._message

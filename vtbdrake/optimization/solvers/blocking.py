@@ -1,0 +1,131 @@
+"""Solvers that call the function themselves, made to ask and be told."""
+
+from __future__ import annotations
+
+import threading
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+
+from vtbdrake.optimization.solvers.batch import BatchSolver
+from vtbdrake.optimization.solvers.ranking import usable
+from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Evaluation, Point
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Stopped(Exception):  # noqa: N818
+    """Ends a solver from within its callback, once it is closed."""
+
+
+class BlockingSolver(BatchSolver):
+    """A method that runs from its start to its end in one call (`_solve`), in a thread of its own.
+
+    The thread only ever waits: either the method computes its next points or the driver judges them. So what is asked
+    for depends on what was told, and not on timing. When it is closed before its end, the callback raises `Stopped`,
+    which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined.
+
+    Failed simulations: these methods need a number. A failed point counts as worse than the worst point so far, by the
+    spread of the values so far (at least 1), and keeps that number. What was given by hand is ignored.
+    """
+
+    def __init__(self, search: Search, *, name: str) -> None:
+        super().__init__(search, name=name)
+        self._requests: SimpleQueue[list[Point] | tuple[bool, str] | BaseException] = SimpleQueue()
+        self._answers: SimpleQueue[Sequence[Evaluation] | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._error: BaseException | None = None
+        self._known: dict[bytes, tuple[Evaluation, float, np.ndarray]] = {}
+        self._lowest, self._highest = np.inf, -np.inf
+        self._broken = np.ones(search.constraints)
+
+    @abstractmethod
+    def _solve(self) -> tuple[bool, str]:
+        """Runs the method, in its thread; returns whether it converged, and how it ended."""
+
+    # ---------------------------------------------------------------- in the method's thread
+
+    def _evaluate(self, U: np.ndarray) -> None:
+        """Has the points of the unit cube judged that are not known yet, shape (k, n), as one batch."""
+        new = list({u.tobytes(): u for u in U if u.tobytes() not in self._known}.values())
+        if not new:
+            return
+        for u, evaluation in zip(new, self._request([self.search.point(u) for u in new]), strict=True):
+            self._known[u.tobytes()] = (evaluation, *self._numbers(evaluation))
+
+    def _request(self, points: list[Point]) -> Sequence[Evaluation]:
+        if not self._stopping:
+            self._requests.put(points)
+            answer = self._answers.get()
+            if answer is not None:
+                return answer
+        raise Stopped
+
+    def _numbers(self, evaluation: Evaluation) -> tuple[float, np.ndarray]:
+        """The cost and the violations that the method sees."""
+        if usable(evaluation):
+            cost, violations = -evaluation.values[0], np.array(evaluation.violations)
+            self._lowest, self._highest = min(self._lowest, cost), max(self._highest, cost)
+            self._broken = np.maximum(self._broken, violations)
+            return cost, violations
+        if self._lowest > self._highest:
+            return 1.0, self._broken
+        return self._highest + max(self._highest - self._lowest, 1.0), self._broken
+
+    def _at(self, u: np.ndarray) -> tuple[Evaluation, float, np.ndarray]:
+        """The evaluation at ``u``, shape (n,), and its cost and violations, shape (constraints,)."""
+        self._evaluate(u[np.newaxis])
+        return self._known[u.tobytes()]
+
+    def _callback(self, function: Callable[P, R]) -> Callable[P, R]:
+        """``function``, whose exceptions are kept: some libraries swallow or wrap them."""
+
+        def kept(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return function(*args, **kwargs)
+            except BaseException as error:
+                self._error = self._error or error
+                raise
+
+        return kept
+
+    def _run(self) -> None:
+        outcome: tuple[bool, str] | BaseException
+        try:
+            outcome = self._solve()
+        except BaseException as error:
+            outcome = error
+        self._requests.put(self._error or outcome)
+
+    # ---------------------------------------------------------------- in the driver's thread
+
+    def _next(self) -> list[Point]:
+        if self._thread is None:
+            # A daemon, so that a program ends that forgot to close it.
+            self._thread = threading.Thread(target=self._run, name=f"solver {self.name}", daemon=True)
+            self._thread.start()
+        request = self._requests.get()
+        if isinstance(request, list):
+            return request
+        if isinstance(request, BaseException):
+            self._end(False, f"{type(request).__name__}: {request}")
+            raise request
+        self._end(*request)
+        return []
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        if asked:
+            self._answers.put(asked)
+
+    def close(self) -> None:
+        """Ends the method and its thread; harmless if both have ended."""
+        self._stopping = True
+        if self._thread is not None:
+            self._answers.put(None)
+            self._thread.join()

@@ -1,0 +1,222 @@
+"""Designs: points that are fixed before the first is judged."""
+
+from __future__ import annotations
+
+import itertools
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from math import prod
+
+import numpy as np
+
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
+from vtbdrake.optimization.solvers.batch import BatchSolver
+from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+
+# A power of two, so that a Sobol sequence is balanced batch by batch; enough to keep a machine busy.
+BATCH = 64
+
+
+class Design(BatchSolver):
+    """Asks for its points in batches and ends when there are no more.
+
+    Any parameters, any objectives, any constraints: a design does not look at what it is told.
+    """
+
+    def __init__(self, search: Search, *, name: str) -> None:
+        super().__init__(search, name=name)
+        search.require(name, no_start=True)
+        # The design itself says how long it is.
+        self._left = None
+        self._points = self._generate()
+
+    @abstractmethod
+    def _generate(self) -> Iterator[Point]:
+        """All its points."""
+
+    def _next(self) -> list[Point]:
+        points = list(itertools.islice(self._points, BATCH))
+        if not points:
+            self._end(True, "the design is complete")
+        return points
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        return
+
+
+class Grid(Design):
+    """All combinations of equally spaced values, both ends included; of integers and choices, all values.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        points: how many values a continuous parameter has: one number for all, one per parameter, or by address.
+            Left away: as many as the budget allows, and 11 without one. It thins out integers too where it names them
+            by address.
+
+    Raises:
+        SolverError: the grid is larger than the budget, or ``points`` does not fit the parameters.
+    """
+
+    def __init__(
+        self, search: Search, *, name: str, points: int | Sequence[int] | Mapping[str, int] | None = None
+    ) -> None:
+        self._axes = _axes(search, points)
+        count = prod(len(axis) for axis in self._axes)
+        if search.budget is not None and count > search.budget:
+            raise SolverError(
+                f"the grid has {count} points, and the budget is {search.budget} evaluations; give fewer points"
+            )
+        super().__init__(search, name=name)
+
+    def _generate(self) -> Iterator[Point]:
+        return itertools.product(*self._axes)
+
+
+class Listed(Design):
+    """Points that are known.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        points: in the order in which they are to be judged.
+    """
+
+    def __init__(self, search: Search, *, name: str, points: Sequence[Point]) -> None:
+        self._listed = points
+        super().__init__(search, name=name)
+
+    def _generate(self) -> Iterator[Point]:
+        return iter(self._listed)
+
+
+class Sobol(Design):
+    """A Sobol sequence, scrambled by the seed: quasi-random points, more even than random ones.
+
+    Its first points are the same however many are asked for. Numbers of points that are a power of two are balanced.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        points: how many; left away: the budget, or without one the first power of two that is at least 64 n.
+
+    Owen, A. B. (1998): Scrambling Sobol' and Niederreiter-Xing points. Journal of Complexity 14.
+    """
+
+    def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
+        self._count = _count(search, points)
+        super().__init__(search, name=name)
+
+    def _generate(self) -> Iterator[Point]:
+        # Imported here, since it takes long.
+        from scipy.stats import qmc
+
+        sequence = qmc.Sobol(self.search.size, scramble=True, rng=self.search.seed)
+        for begin in range(0, self._count, BATCH):
+            for u in sequence.random(BATCH)[: self._count - begin]:
+                yield self.search.point(u)
+
+
+class LatinHypercube(Design):
+    """One point in each of N equal slices of every parameter's range, combined at random.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        points: N; left away: the budget, or without one the first power of two that is at least 64 n.
+
+    McKay, M. D., Beckman, R. J. and Conover, W. J. (1979), Technometrics 21.
+    """
+
+    def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
+        self._count = _count(search, points)
+        super().__init__(search, name=name)
+
+    def _generate(self) -> Iterator[Point]:
+        from scipy.stats import qmc
+
+        for u in qmc.LatinHypercube(self.search.size, rng=self.search.seed).random(self._count):
+            yield self.search.point(u)
+
+
+class RandomSearch(Design):
+    """Independent uniform points: what every other solver has to beat.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        points: how many; left away: the budget, or without one no end.
+    """
+
+    def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
+        endless = points is None and search.budget is None
+        self._count = None if endless else _count(search, points)
+        super().__init__(search, name=name)
+
+    def _generate(self) -> Iterator[Point]:
+        generator = np.random.default_rng(self.search.seed)
+        for _ in itertools.count() if self._count is None else range(self._count):
+            yield self.search.point(generator.random(self.search.size))
+
+
+def _count(search: Search, points: int | None) -> int:
+    if points is None:
+        return search.budget or 1 << (64 * search.size - 1).bit_length()
+    if points < 1:
+        raise SolverError(f"a design has at least one point, not {points}")
+    if search.budget is not None and points > search.budget:
+        raise SolverError(f"the design has {points} points, and the budget is {search.budget} evaluations")
+    return points
+
+
+def _axes(search: Search, points: int | Sequence[int] | Mapping[str, int] | None) -> list[list[float] | list[object]]:
+    space = search.space
+    if isinstance(points, Mapping):
+        unknown = set(points) - {parameter.address for parameter in space}
+        if unknown:
+            raise SolverError(f"points are given for {sorted(unknown)}, which is no parameter")
+        counts = [points.get(parameter.address) for parameter in space]
+    elif isinstance(points, Sequence):
+        if len(points) != len(space):
+            raise SolverError(f"points has one number per parameter, {len(space)}, not {len(points)}")
+        counts = [count if parameter.is_continuous else None for count, parameter in zip(points, space, strict=True)]
+    else:
+        counts = [points if parameter.is_continuous else None for parameter in space]
+    fair = _fair_count(search)
+    return [_axis(parameter, count, fair) for parameter, count in zip(space, counts, strict=True)]
+
+
+def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
+    if isinstance(parameter, Choice):
+        if count is not None:
+            raise SolverError(f"{parameter.address} has {len(parameter.options)} options, and a grid takes all of them")
+        return list(parameter.options)
+    if parameter.integer and count is None:
+        return list(range(int(parameter.lower), int(parameter.upper) + 1))
+    count = fair if count is None else count
+    if count < 2:
+        raise SolverError(f"a grid has at least two values of {parameter.address}, not {count}")
+    values = (parameter.from_unit(u) for u in np.linspace(0.0, 1.0, count))
+    return list(dict.fromkeys(values))
+
+
+def _fair_count(search: Search) -> int:
+    """How many values each continuous parameter has where the user says nothing."""
+    if search.budget is None:
+        return 11
+    continuous = sum(parameter.is_continuous for parameter in search.space)
+    whole = discrete_size(search.space)
+    count = 1
+    while continuous and whole * (count + 1) ** continuous <= search.budget:
+        count += 1
+    return count
+
+
+def discrete_size(space: Sequence[Dimension]) -> int:
+    """The number of combinations of the parameters that are not continuous."""
+    return prod(
+        len(parameter.options) if isinstance(parameter, Choice) else int(parameter.upper) - int(parameter.lower) + 1
+        for parameter in space
+        if isinstance(parameter, Choice) or (isinstance(parameter, Parameter) and parameter.integer)
+    )

@@ -1,0 +1,169 @@
+"""Optuna's samplers, behind a study in memory."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.solvers.batch import BatchSolver
+from vtbdrake.optimization.solvers.ranking import usable
+from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.distributions import BaseDistribution
+
+# By name: Optuna's class, its options besides seed, and how many points a batch has where the user does not say.
+SAMPLERS: Mapping[str, tuple[str, Mapping[str, Any], int]] = {
+    "TPE": ("TPESampler", {"constant_liar": True, "multivariate": True}, 4),
+    "GP": ("GPSampler", {}, 1),
+    "NSGA-II": ("NSGAIISampler", {}, 50),
+    "NSGA-III": ("NSGAIIISampler", {}, 50),
+    "QMC": ("QMCSampler", {"scramble": True}, 16),
+}
+ONE_OBJECTIVE = frozenset({"QMC"})
+
+
+class OptunaSolver(BatchSolver):
+    """A sampler of Optuna: continuous, whole and categorical parameters, several objectives, constraints.
+
+    It has no end of its own: it asks until its budget is spent. A failed simulation is told as a failed trial, without
+    a value of any kind. Points given by hand are added to the study from which it learns.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
+        batch: how many points it asks for at a time: left away, 4 for TPE, a population for NSGA, 1 for GP, 16 for
+            QMC. It belongs to the method: another batch is another search.
+        sampler_options: more options of Optuna's sampler, by its own names (``n_startup_trials``, ``population_size``).
+
+    Raises:
+        ModuleNotFoundError: Optuna is not installed (or, for GP, torch).
+        SolverError: Optuna does not know an option.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        *,
+        name: str,
+        batch: int | None = None,
+        sampler_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        search.require(name, one_objective=name in ONE_OBJECTIVE, no_constraints=name in ONE_OBJECTIVE)
+        super().__init__(search, name=name)
+        kind, defaults, usual = SAMPLERS[name]
+        options = {**defaults, **(sampler_options or {})}
+        self._batch = batch if batch is not None else options.get("population_size", usual)
+        if self._batch < 1:
+            raise SolverError(f"a batch has at least one point, not {self._batch}")
+        self._keys = [f"{i} {parameter.address}" for i, parameter in enumerate(search.space)]
+        self._optuna = _import_optuna(name)
+        self._distributions = {
+            key: _distribution(parameter, self._optuna) for key, parameter in zip(self._keys, search.space, strict=True)
+        }
+        self._study = self._make_study(kind, options)
+        self._trials: list[optuna.Trial] = []
+        if search.start is not None:
+            self._study.enqueue_trial(self._parameters(search.start))
+
+    def _make_study(self, kind: str, options: Mapping[str, Any]) -> optuna.Study:
+        with _quiet():
+            try:
+                sampler = getattr(self._optuna.samplers, kind)(seed=self.search.seed, **options)
+            except TypeError as error:
+                raise SolverError(f"{self.name} of Optuna: {error}") from error
+            return self._optuna.create_study(
+                study_name=self.name, sampler=sampler, directions=["maximize"] * self.search.objectives
+            )
+
+    def _parameters(self, point: Point) -> dict[str, Any]:
+        return {
+            key: parameter.options.index(parameter.check(value)) if isinstance(parameter, Choice) else value
+            for key, parameter, value in zip(self._keys, self.search.space, point, strict=True)
+        }
+
+    def _point(self, parameters: Mapping[str, Any]) -> Point:
+        return tuple(
+            parameter.options[parameters[key]] if isinstance(parameter, Choice) else parameter.check(parameters[key])
+            for key, parameter in zip(self._keys, self.search.space, strict=True)
+        )
+
+    def _next(self) -> list[Point]:
+        with _quiet():
+            self._trials = [self._study.ask(self._distributions) for _ in range(self._batch)]
+        return [self._point(trial.params) for trial in self._trials]
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        with _quiet():
+            if asked:
+                for trial, evaluation in zip(self._trials, asked, strict=True):
+                    self._tell(trial, evaluation)
+            for evaluation in given:
+                if usable(evaluation):
+                    self._study.add_trial(
+                        self._optuna.create_trial(
+                            params=self._parameters(evaluation.point),
+                            distributions=self._distributions,
+                            values=list(evaluation.values),
+                            constraints={str(i): violation for i, violation in enumerate(evaluation.violations)},
+                        )
+                    )
+
+    def _tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
+        if not usable(evaluation):
+            self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
+            return
+        for i, violation in enumerate(evaluation.violations):
+            trial.set_constraint(str(i), violation)
+        self._study.tell(trial, list(evaluation.values))
+
+
+def _import_optuna(name: str) -> Any:
+    try:
+        module = importlib.import_module("optuna")
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{name} needs Optuna: pip install 'vtbdrake[optuna]'") from error
+    if name == "GP":
+        try:
+            importlib.import_module("torch")
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("GP of Optuna needs PyTorch: pip install 'vtbdrake[optuna]' torch") from error
+    return module
+
+
+def _distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
+    distributions = optuna.distributions
+    if isinstance(parameter, Choice):
+        # By index: Optuna holds 1 and True for equal.
+        return distributions.CategoricalDistribution(range(len(parameter.options)))
+    kind = distributions.IntDistribution if parameter.integer else distributions.FloatDistribution
+    return kind(parameter.lower, parameter.upper, log=parameter.log)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Holds back what Optuna says on this thread about its study in memory and its experimental parts."""
+    thread = threading.get_ident()
+    handlers = logging.getLogger("optuna").handlers
+
+    def of_another_thread(record: logging.LogRecord) -> bool:
+        return record.thread != thread
+
+    for handler in handlers:
+        handler.addFilter(of_another_thread)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="optuna")
+            warnings.filterwarnings("ignore", message=".*xperimental")
+            yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(of_another_thread)
