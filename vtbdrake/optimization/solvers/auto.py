@@ -12,7 +12,7 @@ from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.solvers.batch import BatchSolver
 from vtbdrake.optimization.solvers.cmaes_solver import CmaEs, default_population
 from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
-from vtbdrake.optimization.solvers.mathematical_program import NloptDerivativeFree
+from vtbdrake.optimization.solvers.drake_solvers import NloptDerivativeFree
 from vtbdrake.optimization.solvers.optuna_samplers import OptunaSolver
 from vtbdrake.optimization.solvers.ranking import best_of, rank_key
 from vtbdrake.optimization.solvers.scipy_solvers import DifferentialEvolution

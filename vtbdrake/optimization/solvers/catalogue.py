@@ -11,7 +11,7 @@ from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers.auto import Auto
 from vtbdrake.optimization.solvers.cmaes_solver import CmaEs
 from vtbdrake.optimization.solvers.designs import Grid, LatinHypercube, RandomSearch, Sobol
-from vtbdrake.optimization.solvers.mathematical_program import Ipopt, NloptDerivativeFree, NloptWithDerivatives, Snopt
+from vtbdrake.optimization.solvers.drake_solvers import Ipopt, NloptDerivativeFree, NloptWithDerivatives, Snopt
 from vtbdrake.optimization.solvers.nlopt_algorithms import DERIVATIVE_FREE, WITH_DERIVATIVES
 from vtbdrake.optimization.solvers.optuna_samplers import SAMPLERS, OptunaSolver
 from vtbdrake.optimization.solvers.scipy_solvers import DifferentialEvolution

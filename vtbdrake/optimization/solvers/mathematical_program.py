@@ -1,4 +1,4 @@
-"""Drake's solvers of a MathematicalProgram: SNOPT, IPOPT and the algorithms of NLopt."""
+"""What all of Drake's solvers of a MathematicalProgram share: cost, constraints, derivatives, and when to believe them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,9 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.solvers import (
-    IpoptSolver,
-    MathematicalProgram,
-    MathematicalProgramResult,
-    NloptSolver,
-    SnoptSolver,
-    SolverInterface,
-    SolverOptions,
-)
+from pydrake.solvers import MathematicalProgram, MathematicalProgramResult, SolverInterface, SolverOptions
 
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
-from vtbdrake.optimization.solvers.nlopt_algorithms import (
-    LIMIT,
-    RESULTS,
-    SEEDED_BY_CLOCK,
-    UNTIL_LIMIT,
-    WITH_CONSTRAINTS,
-)
 from vtbdrake.optimization.solvers.ranking import usable
 from vtbdrake.optimization.solvers.search import Search
 from vtbdrake.optimization.solvers.solver import SolverError
@@ -178,7 +163,7 @@ class GradientProgramSolver(ProgramSolver):
             raise SolverError(f"constraints need gradient='central': {AUTODIFF} gives the objective's only")
         if step is not None and (gradient == AUTODIFF or not 0.0 < step <= 0.25):
             raise SolverError(
-                f"the step of differences is a part of the range, in (0, 0.25], and not of {gradient}: {step}"
+                f"step is of differences only, a part of the range in (0, 0.25], not {step} of {gradient}"
             )
         super().__init__(search, name=name, tolerance=tolerance, feasibility=feasibility, solver_options=solver_options)
         self.wants_gradient = gradient == AUTODIFF
@@ -186,7 +171,7 @@ class GradientProgramSolver(ProgramSolver):
         self._step = STEPS[gradient] if step is None else step
 
     def _stencil(self, u: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """The neighbours of ``u`` along coordinate i, shape (k, n), and the weights of their differences, shape (k,)."""
+        """The neighbours of ``u`` along coordinate i, shape (k, n), and the weights of what they differ, (k,)."""
         inside, at_end = FORMULAS[self._gradient]
         room = self._step <= u[i] <= 1.0 - self._step
         offsets, weights = (np.array(numbers) for numbers in (inside if room else at_end))
@@ -217,113 +202,3 @@ class GradientProgramSolver(ProgramSolver):
                 beside = np.array([np.concatenate([[cost], violations]) for _, cost, violations in judged])
                 derivatives[:, i] = weights @ (beside - values)
         return derivatives
-
-
-class Snopt(GradientProgramSolver):
-    """SNOPT: sequential quadratic programming; Gill, Murray and Saunders (2005), SIAM Review 47."""
-
-    def _solver(self) -> SolverInterface:
-        return SnoptSolver()
-
-    def _options(self) -> dict[str, Any]:
-        return {
-            "Major optimality tolerance": self._tolerance,
-            "Major feasibility tolerance": self._feasibility,
-            # It would check our differences against its own.
-            "Verify level": -1,
-        }
-
-    def _status(self, result: MathematicalProgramResult) -> str:
-        info = result.get_solver_details().info
-        return f"{result.get_solution_result().name} (EXIT {10 * (info // 10)}, INFO {info})"
-
-
-class Ipopt(GradientProgramSolver):
-    """IPOPT: interior point; Wächter and Biegler (2006), Mathematical Programming 106."""
-
-    def _solver(self) -> SolverInterface:
-        return IpoptSolver()
-
-    def _options(self) -> dict[str, Any]:
-        return {
-            "tol": self._tolerance,
-            "acceptable_tol": self._tolerance,
-            "constr_viol_tol": self._feasibility,
-            "acceptable_constr_viol_tol": self._feasibility,
-        }
-
-    def _status(self, result: MathematicalProgramResult) -> str:
-        return f"{result.get_solution_result().name} ({result.get_solver_details().ConvertStatusToString()})"
-
-
-class _Nlopt(ProgramSolver):
-    """An algorithm of NLopt, by its name."""
-
-    def _choose(self) -> None:
-        if self.name not in WITH_CONSTRAINTS:
-            self.search.require(self.name, no_constraints=True)
-        self.local = self.name.startswith("L")
-        self.reproducible = self.name not in SEEDED_BY_CLOCK
-
-    def _solver(self) -> SolverInterface:
-        return NloptSolver()
-
-    def _options(self) -> dict[str, Any]:
-        return {
-            NloptSolver.AlgorithmName(): self.name,
-            NloptSolver.XRelativeToleranceName(): self._tolerance,
-            NloptSolver.XAbsoluteToleranceName(): self._tolerance,
-            NloptSolver.ConstraintToleranceName(): self._feasibility,
-            # 0: no limit. Drake's is 1000, and the budget is counted by us.
-            NloptSolver.MaxEvalName(): LIMIT if self.name in UNTIL_LIMIT else 0,
-        }
-
-    def _judge(self, result: MathematicalProgramResult) -> tuple[bool, str]:
-        success, message = super()._judge(result)
-        return success and self.name not in UNTIL_LIMIT, message
-
-    def _status(self, result: MathematicalProgramResult) -> str:
-        status = result.get_solver_details().status
-        return f"{result.get_solution_result().name} ({RESULTS.get(status, status)})"
-
-
-class NloptDerivativeFree(_Nlopt):
-    """An algorithm of NLopt that looks at values only; it asks for one point at a time."""
-
-    def __init__(
-        self,
-        search: Search,
-        *,
-        name: str,
-        tolerance: float = 1e-6,
-        feasibility: float = 1e-6,
-        solver_options: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(search, name=name, tolerance=tolerance, feasibility=feasibility, solver_options=solver_options)
-        self._choose()
-
-
-class NloptWithDerivatives(GradientProgramSolver, _Nlopt):
-    """An algorithm of NLopt that uses derivatives."""
-
-    def __init__(
-        self,
-        search: Search,
-        *,
-        name: str,
-        gradient: str = "central",
-        step: float | None = None,
-        tolerance: float = 1e-6,
-        feasibility: float = 1e-6,
-        solver_options: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(
-            search,
-            name=name,
-            gradient=gradient,
-            step=step,
-            tolerance=tolerance,
-            feasibility=feasibility,
-            solver_options=solver_options,
-        )
-        self._choose()

@@ -1,9 +1,9 @@
 """The algorithms of NLopt that Drake's build of it can run, by NLopt's own names.
 
 The first letter says global or local, the second says whether it uses derivatives (D) or not (N). Not offered, though
-Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which its build leaves out, and those that
-need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name. All four kinds return at
-once with x = nan.
+Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which its build leaves out, and those
+that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name. They return at once
+with x = nan.
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
 """
@@ -48,14 +48,13 @@ WITH_DERIVATIVES = (
     "LD_SLSQP",
 )
 
-# LD_MMA takes constraints too, and so does LD_AUGLAG_EQ, which works with it inside; but on a quadratic under a linear
-# constraint it reports success far from the optimum. The others refuse them.
+# LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside, and GN_ORIG_DIRECT_L; but on smooth
+# functions of two variables under a linear constraint they report success far from the optimum. The others refuse them.
 WITH_CONSTRAINTS = frozenset(
     {
         "GN_AGS",
         "GN_ISRES",
         "GN_ORIG_DIRECT",
-        "GN_ORIG_DIRECT_L",
         "LD_AUGLAG",
         "LD_CCSAQ",
         "LD_SLSQP",
@@ -80,10 +79,10 @@ SEEDED_BY_CLOCK = frozenset(
     }
 )
 
-# These end at a number of evaluations only, and report success there. They do not notice either that they are told to stop,
-# so there has to be such a number.
+# These end at a number of evaluations only, and report success there. They do not notice either that they are told to
+# stop: they go on calling, and are answered by exceptions, until that number is reached.
 UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
-LIMIT = 20_000
+LIMIT = 5_000
 
 # How NLopt names the number that it returns.
 RESULTS = {
