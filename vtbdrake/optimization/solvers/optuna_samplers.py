@@ -65,9 +65,9 @@ class OptunaSolver(BatchSolver):
         if self._batch < 1:
             raise SolverError(f"a batch has at least one point, not {self._batch}")
         self._keys = [f"{i} {parameter.address}" for i, parameter in enumerate(search.space)]
-        self._optuna = _import_optuna(name)
+        self._optuna = import_optuna(name)
         self._distributions = {
-            key: _distribution(parameter, self._optuna) for key, parameter in zip(self._keys, search.space, strict=True)
+            key: distribution(parameter, self._optuna) for key, parameter in zip(self._keys, search.space, strict=True)
         }
         self._study = self._make_study(kind, options)
         self._trials: list[optuna.Trial] = []
@@ -75,7 +75,7 @@ class OptunaSolver(BatchSolver):
             self._study.enqueue_trial(self._parameters(search.start))
 
     def _make_study(self, kind: str, options: Mapping[str, Any]) -> optuna.Study:
-        with _quiet():
+        with quiet():
             try:
                 sampler = getattr(self._optuna.samplers, kind)(seed=self.search.seed, **options)
             except TypeError as error:
@@ -97,12 +97,12 @@ class OptunaSolver(BatchSolver):
         )
 
     def _next(self) -> list[Point]:
-        with _quiet():
+        with quiet():
             self._trials = [self._study.ask(self._distributions) for _ in range(self._batch)]
         return [self._point(trial.params) for trial in self._trials]
 
     def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        with _quiet():
+        with quiet():
             if asked:
                 for trial, evaluation in zip(self._trials, asked, strict=True):
                     self._tell(trial, evaluation)
@@ -126,7 +126,12 @@ class OptunaSolver(BatchSolver):
         self._study.tell(trial, list(evaluation.values))
 
 
-def _import_optuna(name: str) -> Any:
+def import_optuna(name: str) -> Any:
+    """Optuna, for the sake of the sampler or the other purpose ``name``.
+
+    Raises:
+        ModuleNotFoundError: it is not installed (or, for GP, torch).
+    """
     try:
         module = importlib.import_module("optuna")
     except ModuleNotFoundError as error:
@@ -139,7 +144,8 @@ def _import_optuna(name: str) -> Any:
     return module
 
 
-def _distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
+def distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
+    """The range of a parameter as Optuna states it; that of a choice holds the indices of its options."""
     distributions = optuna.distributions
     if isinstance(parameter, Choice):
         # By index: Optuna holds 1 and True for equal.
@@ -149,7 +155,7 @@ def _distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Holds back what Optuna says on this thread about its study in memory and its experimental parts."""
     thread = threading.get_ident()
     handlers = logging.getLogger("optuna").handlers
