@@ -16,6 +16,7 @@ BENCHMARKS: Registry = {
     "testbed_overhead": "benchmarks.space_climber:testbed_overhead",
     "sweep_speedup": "benchmarks.space_climber:sweep_speedup",
     "rollout_rtf": "benchmarks.space_climber:rollout_rtf",
+    "casadi_system": "benchmarks.casadi_system:casadi_system",
 }
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
