@@ -6,13 +6,13 @@ import subprocess
 import sys
 import textwrap
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+from tests.rollout.scenarios import KILL, STOP, TreacherousScenario
+from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
     Quality,
@@ -60,31 +60,7 @@ def test_what_cannot_travel_is_an_error_with_the_remedy():
         run_rollouts(executor, task, [{}], progress=False)
 
 
-class Treacherous(SampledFeedback):
-    """Kills or stops its process when its gain says so, but only as long as a file is there."""
-
-    def __init__(self, fuse):
-        super().__init__(0.02)
-        self._fuse = Path(fuse)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._betray)
-
-    def _betray(self, context, state):
-        how = context.get_numeric_parameter(0).value()[0]
-        if how and self._fuse.exists():
-            if how > 0:
-                self._fuse.unlink()  # Once only: the second try works.
-            os.kill(os.getpid(), signal.SIGKILL if abs(how) == 1 else signal.SIGSTOP)
-
-
-@dataclass
-class TreacherousScenario(AcrobotScenario):
-    fuse: str = ""
-
-    def make_dps(self):
-        return Treacherous(self.fuse)
-
-
-@pytest.mark.parametrize(("how", "kind"), [(1.0, "died"), (2.0, "time limit")])
+@pytest.mark.parametrize(("how", "kind"), [(KILL, "died"), (STOP, "time limit")])
 def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp_path, caplog):
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -93,7 +69,7 @@ def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp
     with SerialExecutor() as executor:
         expected = run_rollouts(executor, task, points, progress=False)
     points[3]["dps.gain[0]"] = how
-    with ProcessExecutor(2, time_limit=10.0 if how == 1.0 else 3.0) as executor:
+    with ProcessExecutor(2, time_limit=10.0 if how == KILL else 3.0) as executor:
         results = run_rollouts(executor, task, points, progress=False)
     assert kind in caplog.text
     assert not any(result.failed for result in results)
@@ -104,7 +80,7 @@ def test_a_rollout_that_kills_every_worker_fails_alone(tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(_angle, SHOULDER))
-    points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": -1.0}, {"dps.gain[0]": 0.0}]
+    points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": -KILL}, {"dps.gain[0]": 0.0}]
     with ProcessExecutor(2) as executor:
         results = run_rollouts(executor, task, points, progress=False)
     assert [result.failed for result in results] == [False, True, False]

@@ -1,15 +1,21 @@
-"""A task as bytes, as it travels to other processes: pickled once, and known there by its digest."""
+"""A task as bytes, as it travels to other processes: pickled once here, and known there by its digest."""
 
 from __future__ import annotations
 
 import hashlib
+import pickle
+import threading
 from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cloudpickle
 
 from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.testbeds import Runners, Testbeds
 
 _KEPT = 16
 
@@ -57,3 +63,35 @@ def _pickled(task: RolloutTask) -> Blob:
             "or 'serial', or keep what cannot be pickled out of its quality function and scenario"
         ) from error
     return Blob(content, hashlib.blake2b(content, digest_size=16).hexdigest())
+
+
+class _Kept:
+    """What a process of a pool that is not ours keeps: the tasks last used, by digest, and their runners."""
+
+    def __init__(self) -> None:
+        self.runners = Runners(Testbeds())
+        self._tasks: OrderedDict[str, RolloutTask] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def task(self, blob: Blob) -> RolloutTask:
+        with self._lock:
+            if blob.digest not in self._tasks:
+                self._tasks[blob.digest] = pickle.loads(blob.content)
+                if len(self._tasks) > _KEPT:
+                    self._tasks.popitem(last=False)
+            self._tasks.move_to_end(blob.digest)
+            return self._tasks[blob.digest]
+
+
+_kept = _Kept()
+
+
+def run_blob(
+    blob: Blob,
+    point: Mapping[str, Any],
+    *,
+    cancel: threading.Event | None = None,
+    begin: Callable[[], Any] | None = None,
+) -> RolloutResult:
+    """One rollout of the task in ``blob``, in a process that keeps its testbed until the next; see `Runners.run`."""
+    return _kept.runners.run(_kept.task(blob), point, cancel=cancel, begin=begin)

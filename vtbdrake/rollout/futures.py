@@ -5,17 +5,15 @@ from __future__ import annotations
 import concurrent.futures
 import pickle
 import queue
-import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from vtbdrake.rollout.blob import Blob, Blobs
+from vtbdrake.rollout.blob import Blob, Blobs, run_blob
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import KEPT, Runners, Testbeds, failed
+from vtbdrake.rollout.testbeds import failed
 from vtbdrake.rollout.worker import answer
 
 _Future = concurrent.futures.Future[bytes]
@@ -99,31 +97,6 @@ def _result(future: _Future, point: Parameters) -> RolloutResult:
     return result
 
 
-class _Kept:
-    """What a process of a pool keeps: the tasks last used, by digest, and their runners."""
-
-    def __init__(self) -> None:
-        self.runners = Runners(Testbeds(kept=KEPT))
-        self._tasks: OrderedDict[str, RolloutTask] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def task(self, blob: Blob) -> RolloutTask:
-        with self._lock:
-            if blob.digest not in self._tasks:
-                self._tasks[blob.digest] = pickle.loads(blob.content)
-                if len(self._tasks) > KEPT:
-                    self._tasks.popitem(last=False)
-            self._tasks.move_to_end(blob.digest)
-            return self._tasks[blob.digest]
-
-
-_kept = _Kept()
-
-
 def roll(blob: Blob, index: int, point: Mapping[str, Any]) -> bytes:
     """One rollout in a worker of any pool; the answer is that of `worker.answer`."""
-    return answer(index, partial(_roll, blob, point))
-
-
-def _roll(blob: Blob, point: Mapping[str, Any]) -> RolloutResult:
-    return _kept.runners.run(_kept.task(blob), point)
+    return answer(index, partial(run_blob, blob, point))

@@ -1,0 +1,49 @@
+"""Testbeds that tell who builds them, or that turn against the process that they run in."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+
+KILL, STOP, HANG = 1.0, 2.0, 3.0
+
+
+@dataclass
+class RecordedScenario(PendulumScenario):
+    """A pendulum that writes the process that builds it into a file."""
+
+    file: str = ""
+
+    def make_dps(self):
+        with open(self.file, "a") as file:
+            file.write(f"{os.getpid()}\n")
+        return super().make_dps()
+
+
+class Treacherous(SampledFeedback):
+    """Kills, stops or hangs its process when its gain says so, but only as long as a file is there."""
+
+    def __init__(self, fuse):
+        super().__init__(0.02)
+        self._fuse = Path(fuse)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._betray)
+
+    def _betray(self, context, state):
+        how = context.get_numeric_parameter(0).value()[0]
+        if how and self._fuse.exists():
+            if how > 0:
+                self._fuse.unlink()  # Once only: the second try works.
+            while abs(how) == HANG:
+                time.sleep(1.0)
+            os.kill(os.getpid(), signal.SIGKILL if abs(how) == KILL else signal.SIGSTOP)
+
+
+@dataclass
+class TreacherousScenario(AcrobotScenario):
+    fuse: str = ""
+
+    def make_dps(self):
+        return Treacherous(self.fuse)

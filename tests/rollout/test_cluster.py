@@ -1,0 +1,170 @@
+"""Rollouts on a Dask cluster: a real scheduler, worker processes that are killed while they work, and its dashboard."""
+
+import os
+import time
+import urllib.request
+
+import dask
+import numpy as np
+import pytest
+from distributed import Client
+
+from benchmarks.dask_cluster import dask_cluster
+from tests.rollout.scenarios import HANG, KILL, RecordedScenario, TreacherousScenario
+from tests.testbeds import PendulumScenario
+from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, WorkerError, make_executor
+from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor
+
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+THETA = "sim.sys.Pendulum.theta.position"
+TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
+
+
+def _points(count):
+    return [{THETA: 0.1 * i} for i in range(count)]
+
+
+def _assert_right(executor, task, points):
+    found = list(executor.run(task, points))
+    assert sorted(index for index, _ in found) == list(range(len(points)))
+    expected = dict(SerialExecutor().run(task, points))
+    assert all(result.identical(expected[index]) for index, result in found)
+
+
+def test_each_worker_builds_its_testbed_once(cluster, tmp_path):
+    file = tmp_path / "built"
+    task = RolloutTask(RecordedScenario(file=str(file)), 0.1, Quality(abs, THETA))
+    with DaskExecutor(cluster.client) as executor:
+        for _ in range(5):
+            assert len(list(executor.run(task, _points(4)))) == 4
+    processes = [int(line) for line in file.read_text().split()]
+    assert len(set(processes)) == len(processes) <= 2
+    assert os.getpid() not in processes
+
+
+def test_the_dashboard_is_dasks_and_knows_the_workers(cluster):
+    def page(path):
+        with urllib.request.urlopen(cluster.dashboard + path, timeout=20) as response:
+            return response.read().decode()
+
+    workers = page("/info/main/workers.html")
+    assert "<title> Workers </title>" in workers
+    assert all(address in workers for address in cluster.client.scheduler_info()["workers"])
+    assert "Dask" in page("/status")
+
+
+def test_what_the_workers_were_told_is_taken_back_at_the_end(cluster):
+    def told():
+        plugins = cluster.client.run(lambda dask_worker: [name for name in dask_worker.plugins if "vtbdrake" in name])
+        return {name for names in plugins.values() for name in names}
+
+    executor = DaskExecutor(cluster.client)
+    list(executor.run(TASK, _points(1)))
+    assert len(told()) == 1
+    list(executor.run(TASK, _points(1)))
+    assert len(told()) == 1
+    executor.close()
+    assert told() == set()
+    # It can be used again, as every executor.
+    _assert_right(executor, TASK, _points(2))
+    executor.close()
+
+
+def _bad(theta):
+    raise RuntimeError("not today")
+
+
+def test_an_error_in_the_quality_reaches_the_user_and_the_cluster_goes_on(cluster):
+    with DaskExecutor(cluster.client) as executor:
+        with pytest.raises(QualityError, match="_bad at t = 0 s, .* raises RuntimeError: not today"):
+            list(executor.run(RolloutTask(PendulumScenario(), 0.3, Quality(_bad, THETA)), _points(6)))
+        _assert_right(executor, TASK, _points(3))
+
+
+def test_an_interruption_takes_back_what_has_not_begun(cluster):
+    with DaskExecutor(cluster.client) as executor:
+        rollouts = executor.run(TASK, _points(1000))
+        next(rollouts)
+        rollouts.close()
+        _assert_right(executor, TASK, _points(3))
+
+
+def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path, caplog):
+    """Kill -9, in the midst of a simulation."""
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{SHOULDER: value, "dps.gain[0]": 0.0} for value in np.linspace(0.1, 0.8, 8)]
+    points[2]["dps.gain[0]"] = KILL
+    with DaskExecutor(cluster.client) as executor:
+        results = dict(executor.run(task, points))
+    assert not fuse.exists()
+    assert sorted(results) == list(range(8))
+    assert not any(result.failed for result in results.values())
+    assert "rollout 2 is tried again, alone" in caplog.text
+
+
+@pytest.mark.parametrize(("how", "time_limit"), [(KILL, np.inf), (HANG, 0.3)])
+def test_a_rollout_that_kills_or_hangs_every_worker_fails_alone(how, time_limit, cluster, tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{"dps.gain[0]": gain} for gain in (0.0, 0.0, -how, 0.0, 0.0)]
+    with DaskExecutor(cluster.client, time_limit=time_limit) as executor:
+        results = dict(executor.run(task, points))
+    assert [results[index].failed for index in range(5)] == [False, False, True, False, False]
+    assert "its workers died, time and again" in results[2].message
+    assert results[2].parameters == points[2]
+
+
+def _slow(theta):
+    time.sleep(0.05)
+    return abs(theta)
+
+
+def test_a_rollout_beyond_its_time_limit_has_failed(cluster):
+    task = RolloutTask(PendulumScenario(), 100.0, Quality(_slow, THETA), threshold=0.5)
+    with DaskExecutor(cluster.client, time_limit=1.0) as executor:
+        results = dict(executor.run(task, [{THETA: 1.0}, {THETA: 0.1}, {THETA: 1.0}]))
+    assert [results[index].end for index in range(3)] == ["threshold", "failed", "threshold"]
+    assert results[1].message == "it took longer than its time limit of 1 s"
+
+
+def test_dask_by_name_goes_to_the_scheduler_in_the_environment(cluster, monkeypatch):
+    testbed = PendulumScenario().build()
+    monkeypatch.setenv(ADDRESS, cluster.address)
+    with make_executor("dask", testbed=testbed, rollouts=3, time_limit=60.0) as executor:
+        assert isinstance(executor, DaskExecutor)
+        _assert_right(executor, TASK, _points(3))
+    monkeypatch.delenv(ADDRESS)
+    with pytest.raises(ValueError, match=r"start one with `dask scheduler` .* or give executor=distributed.Client"):
+        make_executor("dask", testbed=testbed, rollouts=3)
+    with pytest.raises(ValueError, match="a Dask cluster has its own settings: workers=2"):
+        make_executor("dask", testbed=testbed, rollouts=3, workers=2)
+
+
+def test_a_client_stays_the_users(cluster):
+    with make_executor(cluster.client, testbed=PendulumScenario().build(), rollouts=3) as executor:
+        assert isinstance(executor, DaskExecutor)
+    assert cluster.client.status == "running"
+    own = DaskExecutor(cluster.address)
+    client = own._client
+    own.close()
+    assert client.status == "closed"
+
+
+def test_a_scheduler_that_ends_is_an_error_not_a_wait():
+    with dask_cluster(workers=1) as short, Client(short.address, timeout="1s", set_as_default=False) as client:
+        rollouts = DaskExecutor(client).run(TASK, _points(1000))
+        next(rollouts)
+        short.client.shutdown()
+        with pytest.raises(WorkerError, match="the Dask scheduler has given up rollouts, or is gone"):
+            list(rollouts)
+
+
+def test_nothing_listens_there():
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(WorkerError, match="no Dask scheduler answers at tcp://127.0.0.1:9: start one"),
+    ):
+        DaskExecutor("tcp://127.0.0.1:9")

@@ -1,0 +1,142 @@
+"""Pools that the user brings: nothing is lost with them, and they stay the user's."""
+
+import concurrent.futures
+import threading
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from tests.rollout.scenarios import KILL, RecordedScenario, TreacherousScenario
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.rollout import FuturesExecutor, Quality, QualityError, RolloutTask, WorkerError, make_executor
+
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+THETA = "sim.sys.Pendulum.theta.position"
+TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
+
+
+def _points(count):
+    return [{THETA: 0.1 * i} for i in range(count)]
+
+
+class Counting(concurrent.futures.Executor):
+    """A pool of threads that knows how many rollouts it has, and had."""
+
+    def __init__(self, workers):
+        self.num_workers = workers
+        self.submitted = 0
+        self.most = 0
+        self._open = 0
+        self._lock = threading.Lock()
+        self._inner = ThreadPoolExecutor(workers)
+
+    def submit(self, fn, /, *args, **kwargs):
+        with self._lock:
+            self.submitted += 1
+            self._open += 1
+            self.most = max(self.most, self._open)
+        future = self._inner.submit(fn, *args, **kwargs)
+        future.add_done_callback(self._done)
+        return future
+
+    def _done(self, future):
+        with self._lock:
+            self._open -= 1
+
+
+@pytest.mark.parametrize(("in_flight", "most"), [(None, 4), (3, 3)])
+def test_the_pool_is_given_a_few_rollouts_at_a_time(in_flight, most):
+    pool = Counting(2)
+    with FuturesExecutor(pool, in_flight=in_flight) as executor:
+        assert len(list(executor.run(TASK, _points(20)))) == 20
+    assert (pool.submitted, pool.most) == (20, most)
+
+
+def test_an_interruption_takes_back_what_has_not_begun():
+    pool = Counting(1)
+    rollouts = FuturesExecutor(pool, in_flight=8).run(TASK, _points(100))
+    next(rollouts)
+    rollouts.close()
+    pool._inner.shutdown(wait=True)
+    # What was in flight, and what took the place of the one that came back.
+    assert pool.submitted <= 9
+    assert pool._open == 0
+
+
+def test_each_process_builds_its_testbed_once(process_pool, tmp_path):
+    file = tmp_path / "built"
+    task = RolloutTask(RecordedScenario(file=str(file)), 0.1, Quality(abs, THETA))
+    executor = FuturesExecutor(process_pool)
+    for _ in range(10):
+        list(executor.run(task, _points(4)))
+    processes = file.read_text().split()
+    assert len(set(processes)) == len(processes) <= 2
+
+
+def test_the_pool_stays_the_users(process_pool):
+    executor = make_executor(process_pool, testbed=TASK.scenario.build(), rollouts=2)
+    with executor:
+        assert isinstance(executor, FuturesExecutor)
+    assert process_pool.submit(abs, -3).result() == 3
+
+
+def _bad(theta):
+    raise RuntimeError("not today")
+
+
+def test_an_error_in_the_quality_reaches_the_user_and_the_pool_goes_on(process_pool):
+    with FuturesExecutor(process_pool) as executor:
+        with pytest.raises(QualityError, match="_bad at t = 0 s, .* raises RuntimeError: not today"):
+            list(executor.run(RolloutTask(PendulumScenario(), 0.3, Quality(_bad, THETA)), _points(6)))
+        assert len(list(executor.run(TASK, _points(3)))) == 3
+
+
+def test_what_cannot_travel_is_an_error_with_the_remedy(process_pool):
+    lock = threading.Lock()
+    task = RolloutTask(PendulumScenario(), 0.3, Quality(lambda t: float(lock.locked()), THETA))
+    with pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
+        list(FuturesExecutor(process_pool).run(task, _points(1)))
+
+
+def test_a_broken_pool_takes_no_more_rollouts(tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
+    points = [{"dps.gain[0]": 0.0}] * 3 + [{"dps.gain[0]": KILL}] + [{"dps.gain[0]": 0.0}] * 20
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        executor = FuturesExecutor(pool)
+        with pytest.raises(WorkerError, match="ProcessPoolExecutor takes no more rollouts: .* terminated abruptly"):
+            list(executor.run(task, points))
+        with pytest.raises(WorkerError, match="takes no more rollouts"):
+            list(executor.run(task, points[:1]))
+
+
+def test_a_broken_pool_costs_the_rollouts_that_it_had(tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
+    points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": 0.0}, {"dps.gain[0]": KILL}, {"dps.gain[0]": 0.0}]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        results = dict(FuturesExecutor(pool, in_flight=4).run(task, points))
+    assert [results[i].failed for i in range(4)] == [False, False, True, True]
+    assert "the pool broke while it had this rollout (BrokenProcessPool: " in results[2].message
+    assert results[2].parameters == points[2]
+
+
+def test_a_pool_that_was_shut_down_takes_no_more():
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.raises(WorkerError, match="ThreadPoolExecutor takes no more rollouts: cannot schedule new futures"):
+        list(FuturesExecutor(pool).run(TASK, _points(1)))
+
+
+def test_something_must_be_in_flight():
+    with pytest.raises(ValueError, match="at least one rollout must be in flight, not 0"):
+        FuturesExecutor(ThreadPoolExecutor(1), in_flight=0)
+
+
+def test_make_executor_tells_what_a_pool_decides_itself():
+    testbed = AcrobotScenario().build()
+    with pytest.raises(ValueError, match="a pool that is there already has its own settings: workers=2"):
+        make_executor(ThreadPoolExecutor(1), testbed=testbed, rollouts=2, workers=2)

@@ -1,0 +1,212 @@
+"""Rollouts on a Dask cluster: a scheduler and its workers, be they processes, SLURM jobs, pods or hosts behind SSH."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import threading
+import time
+import uuid
+from collections import OrderedDict, deque
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from math import inf, isfinite
+from typing import Any
+
+from vtbdrake.rollout.blob import Blob, Blobs, run_blob
+from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
+from vtbdrake.rollout.processes import checked_time_limit
+from vtbdrake.rollout.result import RolloutResult
+from vtbdrake.rollout.runner import CancelledError
+from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.testbeds import failed
+from vtbdrake.rollout.worker import answer
+
+try:
+    from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("rollouts on a Dask cluster need: pip install 'vtbdrake[cluster]'") from error
+
+_log = logging.getLogger(__name__)
+
+ADDRESS = "DASK_SCHEDULER_ADDRESS"
+# How many tasks the workers are told about at a time.
+_TASKS = 16
+# How often the cluster is asked for its size, in seconds: it may grow while it works.
+_SIZE_PERIOD = 5.0
+
+
+class DaskExecutor(Executor):
+    """Rollouts on a Dask cluster, whose workers need the same vtbdrake and what the problem imports.
+
+    A task is told to all workers once, also to those that come later, and each builds its testbed once and keeps it.
+    Workers with one thread each suit testbeds with systems in Python. When a worker is lost, Dask runs its rollouts
+    elsewhere. A rollout with which more workers were lost than ``distributed.scheduler.allowed-failures`` is tried
+    again when no other runs, for it may have been the neighbour of the one at fault; when that fails too, it is a
+    failed result.
+
+    Args:
+        client: of the cluster, and left open; or the address of its scheduler; left out, that in the environment
+            variable ``DASK_SCHEDULER_ADDRESS``.
+        time_limit: in seconds of wall time for one rollout. A rollout is asked to stop, and is then a failed result;
+            if it does not get to its next sample in as long again, its worker process is killed, to be started again
+            by its nanny.
+        in_flight: how many rollouts the cluster is given at a time; twice its threads if left out.
+
+    Raises:
+        ValueError: no scheduler is known.
+        WorkerError: none answers.
+    """
+
+    def __init__(
+        self, client: Client | str | None = None, *, time_limit: float = inf, in_flight: int | None = None
+    ) -> None:
+        if in_flight is not None and in_flight < 1:
+            raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
+        self._time_limit = checked_time_limit(time_limit)
+        self._own = not isinstance(client, Client)
+        self._client: Client = client if isinstance(client, Client) else _connected(client)
+        if self._client.asynchronous:
+            raise ValueError("an asynchronous Dask client cannot be waited for: make it with asynchronous=False")
+        self._limit = in_flight
+        self._threads = 0
+        self._counted = -inf
+        self._blobs = Blobs()
+        self._told: OrderedDict[str, str] = OrderedDict()
+
+    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        """See `Executor.run`.
+
+        Raises:
+            WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
+        """
+        name = self._tell(self._blobs.get(task))
+        waiting = deque(range(len(points)))
+        suspects: deque[int] = deque()
+        tried: set[int] = set()
+        flying: dict[Future[bytes], int] = {}
+        landed = as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        try:
+            while waiting or flying or suspects:
+                alone = not waiting and not flying
+                room = 1 if alone else self._room() - len(flying)
+                batch = suspects if alone else waiting
+                for _ in range(min(room, len(batch))):
+                    index = batch.popleft()
+                    future = self._submit(name, index, points[index])
+                    flying[future] = index
+                    landed.add(future)
+                future, outcome = next(landed)
+                index = flying.pop(future)
+                error = _error(outcome)
+                if isinstance(error, KilledWorker) and index not in tried:
+                    tried.add(index)
+                    suspects.append(index)
+                    _log.warning("rollout %d is tried again, alone: %s", index, error)
+                elif isinstance(error, KilledWorker):
+                    message = f"its workers died, time and again, also when no other rollout ran: {error}"
+                    yield index, failed(points[index], message)
+                elif error is not None:
+                    raise error
+                else:
+                    yield index, pickle.loads(outcome)[1]
+        finally:
+            if flying and self._client.status == "running":
+                self._client.cancel(list(flying))
+
+    def _submit(self, name: str, index: int, point: Parameters) -> Future[bytes]:
+        return self._client.submit(
+            roll_on_dask, name, index, dict(point), self._time_limit, key=f"rollout-{uuid.uuid4().hex}", pure=False
+        )
+
+    def _tell(self, blob: Blob) -> str:
+        """The name under which the workers know the task; sent once."""
+        if blob.digest not in self._told:
+            name = f"vtbdrake-{blob.digest}-{uuid.uuid4().hex}"
+            try:
+                self._client.register_plugin(TaskPlugin(blob), name=name)
+            except Exception as error:
+                raise WorkerError(
+                    f"the Dask workers do not take the problem ({type(error).__name__}: {error}): they need the same "
+                    "vtbdrake as this process"
+                ) from error
+            self._told[blob.digest] = name
+            if len(self._told) > _TASKS:
+                self._client.unregister_worker_plugin(self._told.popitem(last=False)[1])
+        self._told.move_to_end(blob.digest)
+        return self._told[blob.digest]
+
+    def _room(self) -> int:
+        if self._limit is not None:
+            return self._limit
+        if time.monotonic() >= self._counted + _SIZE_PERIOD:
+            self._threads = sum(self._client.nthreads().values())
+            self._counted = time.monotonic()
+        return max(2, 2 * self._threads)
+
+    def close(self) -> None:
+        if self._client.status == "running":
+            for name in self._told.values():
+                self._client.unregister_worker_plugin(name)
+        self._told.clear()
+        if self._own:
+            self._client.close()
+
+
+def _connected(address: str | None) -> Client:
+    address = address or os.environ.get(ADDRESS)
+    if not address:
+        raise ValueError(
+            "executor='dask' needs a scheduler: start one with `dask scheduler` and workers with `dask worker ADDRESS` "
+            f"and set {ADDRESS}, or give executor=distributed.Client(...)"
+        )
+    try:
+        return Client(address, set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise WorkerError(f"no Dask scheduler answers at {address}: start one with `dask scheduler`") from error
+
+
+def _error(outcome: Any) -> BaseException | None:
+    """What went wrong, on Dask's side or in the rollout. The status of a future may change after its outcome came."""
+    if isinstance(outcome, BaseException):
+        return WorkerError(f"the Dask scheduler has given up rollouts, or is gone: {outcome}")
+    error = outcome[1] if isinstance(outcome, tuple) else pickle.loads(outcome)[1]
+    return error if isinstance(error, BaseException) else None
+
+
+class TaskPlugin(WorkerPlugin):
+    """Brings a task to every worker of a cluster, also to those that come later or are started again."""
+
+    def __init__(self, blob: Blob) -> None:
+        self.blob = blob
+
+
+def roll_on_dask(name: str, index: int, point: Mapping[str, Any], time_limit: float) -> bytes:
+    """One rollout on a worker, of the task that it knows by ``name``; the answer is that of `worker.answer`."""
+    plugin: Any = get_worker().plugins[name]
+    return answer(index, partial(_roll, plugin.blob, point, time_limit))
+
+
+def _roll(blob: Blob, point: Mapping[str, Any], time_limit: float) -> RolloutResult:
+    cancel = threading.Event()
+    timers = [threading.Timer(time_limit, cancel.set), threading.Timer(2.0 * time_limit, _die, [time_limit])]
+
+    def begin() -> None:
+        if isfinite(time_limit):
+            for timer in timers:
+                timer.start()
+
+    try:
+        return run_blob(blob, point, cancel=cancel, begin=begin)
+    except CancelledError:
+        return failed(point, f"it took longer than its time limit of {time_limit:g} s")
+    finally:
+        for timer in timers:
+            timer.cancel()
+
+
+def _die(time_limit: float) -> None:
+    _log.error("a rollout does not end within its time limit of %g s: its worker process is killed", time_limit)
+    os.kill(os.getpid(), signal.SIGKILL)
