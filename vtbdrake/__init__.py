@@ -7,8 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
-    from vtbdrake.rollout import Quality, RolloutResult
+    from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
+    from vtbdrake.rollout import Constraint, Quality, RolloutResult
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import (
         Interface,
@@ -23,16 +23,21 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Boundary",
+    "CVaR",
+    "Choice",
+    "Constraint",
     "Interface",
     "Parameter",
     "PlantFields",
     "Problem",
     "Quality",
+    "Quantile",
     "RolloutResult",
     "Scenario",
     "Signal",
     "SimulatorFields",
     "Snapshot",
+    "Study",
     "Sweep",
     "VirtualTestbed",
     "VirtualTestbedBuilder",
@@ -40,8 +45,8 @@ __all__ = [
 ]
 
 _LAYERS = {
-    "optimization": ("Boundary", "Parameter", "Problem", "Sweep"),
-    "rollout": ("Quality", "RolloutResult"),
+    "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
+    "rollout": ("Constraint", "Quality", "RolloutResult"),
     "state": ("Snapshot",),
     "testbed": (
         "Interface",

@@ -1,8 +1,30 @@
 """Section 4: problem (18), stated in five steps and solved."""
 
 from vtbdrake.optimization.boundary import Boundary
-from vtbdrake.optimization.parameter import Parameter
-from vtbdrake.optimization.problem import Motion, Problem, ProblemRollout
+from vtbdrake.optimization.motion import Motion, ProblemRollout
+from vtbdrake.optimization.outcome import Outcome, Trial
+from vtbdrake.optimization.parameter import Choice, Parameter
+from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
+from vtbdrake.optimization.study import Study
+from vtbdrake.optimization.study_file import StudyError
 from vtbdrake.optimization.sweep import Sweep
 
-__all__ = ["Boundary", "Motion", "Parameter", "Problem", "ProblemRollout", "Sweep"]
+__all__ = [
+    "Boundary",
+    "CVaR",
+    "Choice",
+    "Mean",
+    "Motion",
+    "Outcome",
+    "Parameter",
+    "Problem",
+    "ProblemRollout",
+    "Quantile",
+    "Risk",
+    "Study",
+    "StudyError",
+    "Sweep",
+    "Trial",
+    "Worst",
+]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from vtbdrake.optimization.sweep import Sweep
 
 # (value, number of the condition)
-Trial = tuple[float, int]
+Candidate = tuple[float, int]
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,11 @@ class Refinement:
 
 
 def find_boundary(
-    refinement: Refinement, conditions: int, examine: Callable[[Sequence[Trial]], Sequence[bool]]
+    refinement: Refinement, conditions: int, examine: Callable[[Sequence[Candidate]], Sequence[bool]]
 ) -> None:
-    """Examines trials, in as few rounds as possible, until the refinement asks for no more.
+    """Examines candidates, in as few rounds as possible, until the refinement asks for no more.
 
-    ``examine`` says of each trial whether it failed.
+    ``examine`` says of each whether it failed.
     """
     outcomes: list[dict[int, bool]] = [{} for _ in range(conditions)]
     wanted = [(index, condition) for index in refinement.start() for condition in range(conditions)]

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.rollout.testbeds import FIELD
 from vtbdrake.state import Variable, Variables
-
-# What begins the address of a scenario's field: `scenario.gravity`.
-FIELD = "scenario."
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,11 @@ class Parameter:
     def is_continuous(self) -> bool:
         """Whether values between two values have a meaning, as gradients need it."""
         return not self.integer
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The values at the ends of the range."""
+        return self.lower, self.upper
 
     @property
     def range_text(self) -> str:
@@ -151,6 +154,11 @@ class Choice:
         return self.address.startswith(FIELD)
 
     is_continuous = False
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """All options."""
+        return self.options
 
     @property
     def range_text(self) -> str:

@@ -2,58 +2,30 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.optimization.boundary import Boundary, Refinement, Trial, find_boundary
-from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.boundary import Boundary
+from vtbdrake.optimization.motion import Motion, ProblemRollout
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.risk import Risk, make_risk
+from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, grid
-from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutRunner, RolloutTask, make_executor
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
+from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pydrake.geometry import Meshcat
+    from vtbdrake.optimization.study import Study
 
-Condition = Mapping[str, ArrayLike]
-# (point, number of the condition)
-Row = tuple[tuple[float, ...], int]
-
-
-@dataclass(frozen=True)
-class Motion:
-    """How the simulated world moved: the plant's states [q; v] at ``times``, shape (n, nq + nv)."""
-
-    scenario: Scenario
-    times: np.ndarray
-    states: np.ndarray
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProblemRollout(RolloutResult):
-    """A rollout that knows its problem, so that it can be looked at."""
-
-    problem: Problem = field(repr=False)
-    condition: Condition = field(default_factory=dict)
-
-    def show(self, meshcat: Meshcat, *, prefix: str = "rollout") -> None:
-        """Puts the motion into ``meshcat`` as a recording under ``prefix``."""
-        from vtbdrake.visualization import show_motion
-
-        show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
-
-    def plot(self) -> Figure:
-        """The quality trajectory with t* marked (Figure 5)."""
-        from vtbdrake.visualization import plot_quality
-
-        return plot_quality([self])
+Condition = Mapping[str, Any]
 
 
 class Problem:
@@ -61,13 +33,17 @@ class Problem:
 
     Args:
         scenario: builds the testbed; its defaults are s0.
-        parameters: s^0, equation (8): the elements of s0 that are varied. All else is held constant (9).
-        quality: f and its quality variables, equations (11) and (12).
+        parameters: s^0, equation (8): the elements of s0, and the fields of the scenario (``scenario.gravity``), to be
+            varied. All else is held constant (9).
+        quality: f and its quality variables, equations (11) and (12); or a cost. Several ask for their Pareto front.
         horizon: t_m in seconds.
-        threshold: f_m; a rollout whose f exceeds it, strictly, ends there.
+        threshold: f_m; a rollout whose f exceeds it, strictly, ends there. Of a cost: below which it ends. None: never.
         sample_period: of f, in seconds; part of the problem, see `RolloutTask`.
-        conditions: further elements of s0 (address -> value) that a decision must cope with, such as start phases;
-            every point is tried under each.
+        conditions: further elements of s0 (address -> value) that a decision must cope with, such as start phases,
+            frictions or the seeds of sensors; every point is tried under each, so that all points meet the same noise
+            (common random numbers).
+        risk: how the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
+        constraints: what every rollout has to keep, under every condition.
         start: s0 from a snapshot instead of the defaults.
 
     Raises:
@@ -79,26 +55,35 @@ class Problem:
         self,
         *,
         scenario: Scenario,
-        parameters: Sequence[Parameter],
-        quality: Quality,
+        parameters: Sequence[Dimension],
+        quality: Quality | Sequence[Quality],
         horizon: float,
-        threshold: float = inf,
+        threshold: float | None = None,
         sample_period: float = 0.05,
         conditions: Sequence[Condition] = ({},),
+        risk: str | Risk = "worst",
+        constraints: Sequence[Constraint] = (),
         start: Snapshot | None = None,
     ) -> None:
         self.parameters = tuple(parameters)
         self.conditions = tuple({**condition} for condition in conditions)
+        self.objectives = (quality,) if isinstance(quality, Quality) else tuple(quality)
+        self.constraints = tuple(constraints)
+        self.risk = make_risk(risk)
+        if not self.objectives:
+            raise ValueError("a problem has at least one quality")
         self.task = RolloutTask(
             scenario=scenario,
             horizon=horizon,
-            quality=quality,
-            threshold=threshold,
+            quality=self.objectives[0],
+            measures=(*self.objectives[1:], *self.constraints),
+            threshold=_f_m(self.objectives, threshold),
             sample_period=sample_period,
             start=start,
         )
         self.scenario = self.task.scenario
         self.testbed: VirtualTestbed = self.scenario.build()
+        self._testbeds = Testbeds(self.testbed)
         self._check()
 
     def _check(self) -> None:
@@ -109,40 +94,66 @@ class Problem:
         if len(set(addresses)) < len(addresses):
             raise ValueError(f"a parameter is given twice: {', '.join(addresses)}")
         for parameter in self.parameters:
-            parameter.find(variables)
+            if parameter.is_field:
+                for value in parameter.ends:
+                    self._scenario({parameter.address: value})
+            else:
+                parameter.find(variables)
         for condition in self.conditions:
-            for address, value in condition.items():
+            self._scenario(condition)
+            for address, value in split(condition)[1].items():
                 variables[address].check(value)
-                if address in addresses:
-                    raise ValueError(f"{address} is a parameter, so that no condition can set it")
-        assert self.task.quality is not None
-        for address in self.task.quality.of:
-            self.testbed.reader(address)
+            both = [address for address in condition if address in addresses]
+            if both:
+                raise ValueError(f"{both[0]} is a parameter, so that no condition can set it")
+        for measure in (*self.objectives, *self.constraints):
+            for address in measure.of:
+                self.testbed.reader(address)
 
-    def values(self, point: ArrayLike | Mapping[str, float]) -> dict[str, float]:
-        """A point s^0, given as numbers in the order of the parameters or by address, as address -> value.
+    def _scenario(self, values: Mapping[str, Any]) -> Scenario:
+        fields, _ = split(values)
+        if fields and self.task.start is not None:
+            raise ValueError(
+                f"{', '.join(fields)} cannot change where s0 is a snapshot, which is of the scenario as it was"
+            )
+        return self.scenario.with_fields(fields) if fields else self.scenario
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the parameters; those of scenario fields are not known."""
+        variables = self.testbed.variables()
+        return tuple("" if p.is_field else variables[p.address].unit for p in self.parameters)
+
+    def point(self, point: ArrayLike | Mapping[str, Any]) -> Point:
+        """A point s^0, given as values in the order of the parameters or by address, checked.
 
         Raises:
             ValueError: it has another number of entries, or one lies outside its range.
         """
+        addresses = [parameter.address for parameter in self.parameters]
         if isinstance(point, Mapping):
-            unknown = set(point) ^ {parameter.address for parameter in self.parameters}
+            unknown = set(point) ^ set(addresses)
             if unknown:
                 raise ValueError(f"a point sets each parameter once; this one is wrong about {', '.join(unknown)}")
-            point = [point[parameter.address] for parameter in self.parameters]
-        numbers = np.atleast_1d(np.asarray(point, dtype=float))
-        if numbers.shape != (len(self.parameters),):
-            raise ValueError(f"a point has {len(self.parameters)} entries, but the one given has shape {numbers.shape}")
-        for parameter, value in zip(self.parameters, numbers, strict=True):
-            if not parameter.lower <= value <= parameter.upper:
-                raise ValueError(
-                    f"{parameter.address} = {value:g} lies outside its range [{parameter.lower:g}, {parameter.upper:g}]"
-                )
-        return {p.address: float(value) for p, value in zip(self.parameters, numbers, strict=True)}
+            point = [point[address] for address in addresses]
+        shape = np.shape(point) or (1,)
+        if shape != (len(addresses),):
+            raise ValueError(f"a point has {len(addresses)} entries, but the one given has shape {shape}")
+        entries = list(point) if isinstance(point, list | tuple) else np.atleast_1d(np.asarray(point)).tolist()
+        return tuple(parameter.check(value) for parameter, value in zip(self.parameters, entries, strict=True))
+
+    def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
+        """What `point` sets in s0, as address -> value; and what the condition sets, if one is named.
+
+        Raises:
+            ValueError: as `point`.
+        """
+        chosen = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
+        return chosen if condition is None else {**self.conditions[condition], **chosen}
 
     def rollout(
         self,
-        point: ArrayLike | Mapping[str, float],
+        point: ArrayLike | Mapping[str, Any],
         *,
         condition: int = 0,
         record: Sequence[str] = (),
@@ -155,22 +166,26 @@ class Problem:
             record: addresses and ports (``path.port``) to record at the sample times.
             run_on: simulate to t_m although the threshold was exceeded.
         """
-        chosen = self.conditions[condition]
         task = replace(self.task, record=tuple(record), run_on=run_on, keep_state=True)
-        result = RolloutRunner(task, self.testbed).run({**chosen, **self.values(point)})
-        return ProblemRollout(**vars(result), problem=self, condition=chosen)
+        parameters = self.values(point, condition=condition)
+        result = replace(self._runner(task, parameters).run(split(parameters)[1]), parameters=parameters)
+        return ProblemRollout(**vars(result), problem=self, condition=self.conditions[condition])
 
-    def state(self, point: ArrayLike | Mapping[str, float], t: float, *, condition: int = 0) -> Snapshot:
+    def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
         """s(t) = Gamma'(s^0, t), equation (10), at a sample time."""
-        parameters = {**self.conditions[condition], **self.values(point)}
-        snapshot: Snapshot = RolloutRunner(self.task, self.testbed).state(parameters, t)
+        parameters = self.values(point, condition=condition)
+        snapshot: Snapshot = self._runner(self.task, parameters).state(split(parameters)[1], t)
         return snapshot
 
     def motion(self, parameters: Mapping[str, Any]) -> Motion:
         """The motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0."""
-        task = replace(self.task, record=("plant.state",))
-        result = RolloutRunner(task, self.testbed).run(parameters)
-        return Motion(self.scenario, result.times, result.record["plant.state"])
+        runner = self._runner(replace(self.task, record=("plant.state",)), parameters)
+        result = runner.run(split(parameters)[1])
+        return Motion(runner.task.scenario, result.times, result.record["plant.state"])
+
+    def _runner(self, task: RolloutTask, parameters: Mapping[str, Any]) -> RolloutRunner:
+        scenario = self._scenario(parameters)
+        return RolloutRunner(replace(task, scenario=scenario), self._testbeds.get(scenario))
 
     def sweep(
         self,
@@ -198,22 +213,18 @@ class Problem:
             ValueError: a point lies outside the range of a parameter, or the executor is unknown.
             QualityError: f raises, is negative or NaN.
         """
+        from vtbdrake.optimization import examine
+
         if (points is None) == (values is None):
             raise ValueError("a sweep takes either the number of points of a grid, or values")
+        numeric = examine.numeric(self)
         if values is None:
             assert points is not None
-            table = grid(self.parameters, points)
+            table = grid(numeric, points)
         else:
-            table = np.asarray(values, dtype=float).reshape(-1, len(self.parameters))
-        rows = [(tuple(point), condition) for point in table for condition in range(len(self.conditions))]
+            table = np.asarray(values, dtype=float).reshape(-1, len(numeric))
         task = replace(self.task, record=tuple(record), run_on=run_on)
-        chosen = make_executor(executor, testbed=self.testbed, rollouts=len(rows), workers=workers)
-        try:
-            results = run_rollouts(chosen, task, self._trials(rows), progress=progress, description="sweep")
-        finally:
-            if chosen is not executor:
-                chosen.close()
-        return self._table(rows, results)
+        return examine.sweep(self, task, table, executor=executor, workers=workers, progress=progress)
 
     def boundary(
         self,
@@ -237,49 +248,45 @@ class Problem:
             ValueError: there is not exactly one parameter, no threshold, or the steps do not fit the range.
             KeyboardInterrupt: it was interrupted, so that nothing can be said.
         """
-        if len(self.parameters) != 1 or self.task.threshold == inf:
-            raise ValueError(
-                "a boundary is that of one parameter under a finite threshold, but the problem has "
-                f"{len(self.parameters)} parameters and a threshold of {self.task.threshold:g}"
-            )
-        parameter = self.parameters[0]
-        refinement = Refinement(parameter.lower, parameter.upper, resolution=resolution, coarse=coarse)
-        rows: list[Row] = []
-        results: list[RolloutResult] = []
-        trials = len(refinement.start()) * len(self.conditions)
-        chosen = make_executor(executor, testbed=self.testbed, rollouts=trials, workers=workers)
+        from vtbdrake.optimization import examine
 
-        def examine(wanted: Sequence[Trial]) -> list[bool]:
-            new = [((value,), condition) for value, condition in wanted]
-            found = run_rollouts(chosen, self.task, self._trials(new), progress=progress, description="boundary")
-            finished = [result for result in found if result is not None]
-            if len(finished) < len(found):
-                raise KeyboardInterrupt
-            rows.extend(new)
-            results.extend(finished)
-            return [result.failed or result.exceedances.size > 0 for result in finished]
-
-        try:
-            find_boundary(refinement, len(self.conditions), examine)
-        finally:
-            if chosen is not executor:
-                chosen.close()
-        return self._table(rows, results).boundary()
-
-    def _trials(self, rows: Sequence[Row]) -> list[dict[str, Any]]:
-        return [{**self.conditions[condition], **self.values(point)} for point, condition in rows]
-
-    def _table(self, rows: Sequence[Row], results: Sequence[RolloutResult | None]) -> Sweep:
-        finished = [(*row, result) for row, result in zip(rows, results, strict=True) if result is not None]
-        finished.sort(key=lambda row: row[:2])
-        variables = self.testbed.variables()
-        return Sweep(
-            parameters=self.parameters,
-            units=tuple(variables[parameter.address].unit for parameter in self.parameters),
-            conditions=self.conditions,
-            points=np.array([point for point, _, _ in finished], dtype=float).reshape(-1, len(self.parameters)),
-            condition=np.array([condition for _, condition, _ in finished], dtype=int),
-            rollouts=tuple(result for _, _, result in finished),
-            scenario=self.scenario.record(),
-            complete=len(finished) == len(rows),
+        return examine.boundary(
+            self, resolution=resolution, coarse=coarse, executor=executor, workers=workers, progress=progress
         )
+
+    def study(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        solver: str | None = None,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> Study:
+        """A study of the problem: begins a new one, or resumes the one in the file.
+
+        Args:
+            path: of the file; None keeps the study in memory.
+            solver: by name, see `vtbdrake.optimization.solvers`; by default ``auto``, which chooses by the problem,
+                or that of the file.
+            seed: of the solver; 0 by default, or that of the file.
+            options: of the solver.
+
+        Raises:
+            StudyError: the file is no study, is damaged, of another version, problem, solver or seed.
+        """
+        from vtbdrake.optimization.study import Study
+
+        return Study.of(self, path, solver=solver, seed=seed, options=options)
+
+
+def _f_m(objectives: Sequence[Quality], threshold: float | None) -> float:
+    """f_m of the threshold in the user's terms."""
+    if threshold is None or (threshold == inf and not objectives[0].minimize):
+        return inf
+    if len(objectives) > 1:
+        raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
+    if not objectives[0].minimize:
+        return float(threshold)
+    if not 0.0 < threshold < inf:
+        raise ValueError(f"the cost below which a rollout ends is positive and finite, not {threshold}")
+    return float(objectives[0].quality(np.array(threshold)))

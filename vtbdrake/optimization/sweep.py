@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 KIND = "vtbdrake sweep"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -73,21 +73,24 @@ class Sweep:
     def best(self) -> tuple[dict[str, float], float]:
         """(s^0*, h(s^0*)), equation (18), over the points examined; of several conditions, the worst counts.
 
+        Of a cost, its value stands in the place of h.
+
         Raises:
             ValueError: no point has finished all its conditions.
         """
-        scores: dict[tuple[float, ...], dict[int, float]] = {}
-        for point, condition, h in zip(self.points, self.condition, self.h, strict=True):
-            scores.setdefault(tuple(point.tolist()), {})[int(condition)] = float(h)
+        # By point and condition, (h, the same in the user's terms).
+        scores: dict[tuple[float, ...], dict[int, tuple[float, float]]] = {}
+        for point, condition, rollout in zip(self.points, self.condition, self.rollouts, strict=True):
+            scores.setdefault(tuple(point.tolist()), {})[int(condition)] = rollout.h, rollout.value
         finished = {
-            point: min(hs.values())
-            for point, hs in scores.items()
-            if len(hs) == len(self.conditions) and not np.isnan(list(hs.values())).any()
+            point: min(pairs.values())
+            for point, pairs in scores.items()
+            if len(pairs) == len(self.conditions) and not np.isnan(list(pairs.values())).any()
         }
         if not finished:
             raise ValueError("no point of the sweep has a quality under all conditions" + self._first_failure())
         best = max(finished, key=lambda point: finished[point])
-        return {p.address: value for p, value in zip(self.parameters, best, strict=True)}, finished[best]
+        return {p.address: value for p, value in zip(self.parameters, best, strict=True)}, finished[best][1]
 
     def boundary(self) -> Boundary:
         """The largest parameter value below which every rollout examined here has an empty G1.
@@ -145,8 +148,9 @@ class Sweep:
                     raise ValueError(f"the recording of {key} is not an array, and cannot be saved")
                 arrays[f"record/{i}/{key}"] = value
             arrays |= {f"times/{i}": rollout.times, f"quality/{i}": rollout.quality}
-            scalars = ("end", "message", "t_star", "h", "threshold", "wall_time")
-            rows.append({name: _plain(getattr(rollout, name)) for name in scalars})
+            scalars = ("end", "message", "t_star", "h", "value", "threshold", "wall_time")
+            row = {name: _plain(getattr(rollout, name)) for name in scalars}
+            rows.append({**row, "measures": [_plain(number) for number in rollout.measures]})
         header = {
             "parameters": [asdict(parameter) for parameter in self.parameters],
             "units": list(self.units),
@@ -178,6 +182,7 @@ class Sweep:
                     times=arrays[f"times/{i}"],
                     quality=arrays[f"quality/{i}"],
                     record={k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)},
+                    measures=tuple(_number(number) for number in row.pop("measures")),
                     **{name: _number(value) for name, value in row.items()},
                 )
             )

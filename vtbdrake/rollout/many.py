@@ -31,7 +31,7 @@ def run_rollouts(
         QualityError: f raises, is negative or NaN.
     """
     results: list[RolloutResult | None] = [None] * len(points)
-    with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and _watched())) as bar:
+    with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and watched())) as bar:
         rollouts = executor.run(task, points)
         try:
             for index, result in rollouts:
@@ -45,6 +45,6 @@ def run_rollouts(
     return results
 
 
-def _watched() -> bool:
+def watched() -> bool:
     """True in a terminal and in a notebook."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

@@ -1,0 +1,75 @@
+"""Small problems for the tests of studies, importable by other processes."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import System
+from pydrake.systems.primitives import LinearSystem, MatrixGain
+
+from tests.testbeds import PendulumScenario
+from vtbdrake.optimization import Parameter, Problem
+from vtbdrake.rollout import Quality
+from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+
+THETA = "sim.sys.Pendulum.theta.position"
+RATE = "sim.sys.Pendulum.theta.velocity"
+DAMPING = "sim.sys.Pendulum.theta.damping"
+
+
+def gap(theta: float) -> float:
+    """How far the pendulum is from where it is wanted, in rad."""
+    return abs(theta - 0.3)
+
+
+def pendulum_problem(**more: object) -> Problem:
+    """From which angle and with which speed does the pendulum get nearest to 0.3 rad at the end?"""
+    settings: dict = {
+        "scenario": PendulumScenario(),
+        "parameters": [Parameter(THETA, -1.5, 1.5), Parameter(RATE, -3.0, 3.0)],
+        "quality": Quality(gap, THETA, minimize=True, reading="end"),
+        "horizon": 0.3,
+        "sample_period": 0.1,
+    }
+    return Problem(**{**settings, **more})
+
+
+@dataclass
+class DoubleIntegratorScenario(Scenario):
+    """x'' = u with u = -stiffness x - damping x': the gains are fields, so that each pair takes another diagram."""
+
+    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-7))
+    stiffness: float = 0.5
+    damping: float = 1.0
+
+    def interface(self) -> Interface:
+        return Interface(sense=[Signal("state", size=2)], act=[Signal("force", size=1, unit="N", idle=0.0)])
+
+    def make_dps(self) -> System:
+        law = MatrixGain(np.array([[-self.stiffness, -self.damping]]))
+        from pydrake.systems.framework import DiagramBuilder
+
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("law", law)
+        builder.ExportInput(law.get_input_port(), "state")
+        builder.ExportOutput(law.get_output_port(), "force")
+        return builder.Build()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        mass = builder.add(
+            "sys", "mass", LinearSystem(np.eye(2, k=1), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1)))
+        )
+        builder.sim_sensor("state", mass.get_output_port())
+        builder.sim_actuator("force", mass.get_input_port())
+
+
+def run_for_ever(path: str, executor: str) -> None:
+    """What a process does that is going to be killed."""
+    print("ready", flush=True)
+    pendulum_problem().study(path, solver="cmaes", seed=3).run(rollouts=100_000, executor=executor, progress=False)
+
+
+if __name__ == "__main__":
+    run_for_ever(*sys.argv[1:])

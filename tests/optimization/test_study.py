@@ -1,0 +1,434 @@
+"""A study: what it finds, and that neither executor nor interruption changes it."""
+
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ellipj, ellipk
+
+from tests.optimization.studies import (
+    DAMPING,
+    RATE,
+    THETA,
+    DoubleIntegratorScenario,
+    gap,
+    pendulum_problem,
+)
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
+from vtbdrake.rollout import Constraint, Quality, QualityError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def table(study):
+    """What a study is: its points and what is known of them, without the times that they took."""
+    rollouts = {row: (o.h, o.value, o.measures, o.t_star, o.end, o.message) for row, o in study.rollouts.items()}
+    return [(t.parameters, t.values, t.exact, t.origin, t.batch) for t in study.trials], rollouts
+
+
+# -- what it finds
+
+
+def swing(start: float, t: float) -> float:
+    """The angle of an undamped pendulum of 0.5 m released at rest, by Jacobi's elliptic functions."""
+    k = np.sin(start / 2.0)
+    sn, _, _, _ = ellipj(ellipk(k**2) - np.sqrt(9.81 / 0.5) * t, k**2)
+    return float(2.0 * np.arcsin(k * sn))
+
+
+@pytest.mark.parametrize("solver", ["auto", "cmaes", "LN_BOBYQA", "sobol"])
+def test_the_best_start_of_a_pendulum_is_that_of_the_closed_form(solver):
+    problem = pendulum_problem(parameters=[Parameter(THETA, 0.1, 2.5)], conditions=[{DAMPING: 0.0}])
+    exact = brentq(lambda start: swing(start, 0.3) - 0.3, 0.1, 2.5)
+    study = problem.study(solver=solver).run(rollouts=128, target=1e-3, executor="serial", progress=False)
+    tolerance = 0.05 if solver == "sobol" else 5e-3
+    assert study.best.parameters[THETA] == pytest.approx(exact, abs=tolerance)
+
+
+def test_the_best_gains_of_a_double_integrator_are_those_of_the_linear_quadratic_regulator():
+    # For x'' = u and the cost of x^2 + u^2 over an infinite time, u = -x - sqrt(2) x', from every start.
+    problem = Problem(
+        scenario=DoubleIntegratorScenario(),
+        parameters=[Parameter("scenario.stiffness", 0.3, 3.0), Parameter("scenario.damping", 0.5, 3.0)],
+        quality=Quality(
+            lambda x, u: x[0] ** 2 + u[0] ** 2, ["sim.sys.mass.y0", "dps.force"], minimize=True, reading="integral"
+        ),
+        horizon=12.0,
+        sample_period=0.02,
+        conditions=[{"sim.sys.mass.continuous_state[0]": 1.0}],
+    )
+    study = problem.study(solver="LN_BOBYQA").run(rollouts=80, executor="serial", progress=False)
+    assert study.best.parameters["scenario.stiffness"] == pytest.approx(1.0, abs=0.02)
+    assert study.best.parameters["scenario.damping"] == pytest.approx(np.sqrt(2.0), abs=0.02)
+    # x(0) = 1: the cost is P11 of the Riccati equation's solution.
+    assert study.best.value == pytest.approx(np.sqrt(2.0), abs=1e-3)
+    assert study.reason == "solver" and "LN_BOBYQA" in study.message
+
+
+def test_two_qualities_have_a_front_and_no_best():
+    problem = pendulum_problem(
+        quality=[Quality(gap, THETA, minimize=True, reading="end"), Quality(abs, RATE, reading="end")]
+    )
+    study = problem.study(solver="sobol").run(rollouts=32, executor="serial", progress=False)
+    values = np.array([trial.values for trial in study.trials])
+    better = (values[None, :, 0] <= values[:, None, 0]) & (values[None, :, 1] >= values[:, None, 1])
+    better &= (values[None, :, 0] < values[:, None, 0]) | (values[None, :, 1] > values[:, None, 1])
+    assert [trial.number for trial in study.pareto()] == np.flatnonzero(~better.any(axis=1)).tolist()
+    with pytest.raises(ValueError, match=r"ask for pareto\(\)"):
+        study.best  # noqa: B018
+
+
+def test_the_best_keeps_the_constraints():
+    limit = Constraint(lambda rate: abs(rate), RATE, at_most=1.0)
+    study = (
+        pendulum_problem(constraints=[limit]).study(solver="sobol").run(rollouts=64, executor="serial", progress=False)
+    )
+    feasible = [t for t in study.trials if t.violations[0] <= 0.0]
+    assert 0 < len(feasible) < 64
+    assert study.best.value == min(t.value for t in feasible) > min(t.value for t in study.trials)
+
+
+def test_fields_choices_and_integers_can_be_varied():
+    problem = Problem(
+        scenario=PendulumScenario(),
+        parameters=[
+            Choice("scenario.simulator.integration_scheme", ["runge_kutta3", "implicit_euler"]),
+            Parameter("scenario.stiffness", 0, 4, integer=True),
+            Choice(DAMPING, [0.0, 0.3]),
+        ],
+        quality=Quality(gap, THETA, minimize=True, reading="end"),
+        horizon=0.3,
+        conditions=[{THETA: 0.8}],
+    )
+    study = problem.study(solver="grid").run(rollouts=100, executor="serial", progress=False)
+    assert len(study) == len(study.trials) == 2 * 5 * 2 and study.reason == "solver"
+    for trial in study.trials:
+        fields = {k: v for k, v in trial.parameters.items() if k.startswith("scenario.")}
+        alone = Problem(
+            scenario=PendulumScenario().with_fields({k.removeprefix("scenario."): v for k, v in fields.items()}),
+            parameters=[Parameter(DAMPING, 0.0, 1.0)],
+            quality=Quality(gap, THETA, minimize=True, reading="end"),
+            horizon=0.3,
+            conditions=[{THETA: 0.8}],
+        )
+        assert alone.rollout([trial.parameters[DAMPING]]).value == trial.value
+
+
+# -- executors and interruptions change nothing
+
+
+@pytest.mark.parametrize("solver", ["cmaes", "TPE", "sobol"])
+def test_a_study_is_the_same_in_series_and_in_parallel(solver):
+    studies = []
+    for executor in ("serial", "threads", "processes"):
+        problem = pendulum_problem(conditions=[{DAMPING: 0.0}, {DAMPING: 0.2}, {DAMPING: 0.4}])
+        studies.append(
+            problem.study(solver=solver, seed=5).run(rollouts=60, executor=executor, workers=2, progress=False)
+        )
+    assert table(studies[0])[0] == table(studies[1])[0] == table(studies[2])[0]
+    assert table(studies[0])[1] == table(studies[1])[1] == table(studies[2])[1]
+
+
+@pytest.mark.parametrize("solver", ["cmaes", "TPE", "auto", "LN_COBYLA", "SNOPT"])
+def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
+    whole = pendulum_problem().study(tmp_path / "whole.db", solver=solver, seed=2)
+    whole.run(rollouts=45, executor="serial", progress=False)
+    path = tmp_path / "parts.db"
+    first = pendulum_problem().study(path, solver=solver, seed=2)
+    # The budget that the solver is made for is that of the first run.
+    first._file.set("evaluations", 45)
+    first._meta = first._file.meta
+    first.run(rollouts=17, executor="serial", progress=False).close()
+    with pendulum_problem().study(path) as second:
+        assert second.run(rollouts=45, executor="threads", progress=False).reason == whole.reason
+        assert table(second) == table(whole)
+
+
+def test_a_study_that_is_complete_runs_nothing_more(tmp_path):
+    path = tmp_path / "a.db"
+    pendulum_problem().study(path, solver="sobol").run(rollouts=16, executor="serial", progress=False).close()
+    before = sqlite3.connect(path).execute("SELECT point, finished FROM rollouts").fetchall()
+    with pendulum_problem().study(path) as again:
+        again.run(rollouts=16, executor="serial", progress=False)
+        assert sqlite3.connect(path).execute("SELECT point, finished FROM rollouts").fetchall() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["serial", "threads"])
+def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
+    path = tmp_path / "killed.db"
+    clock = random.Random(1)
+    counts = [0]
+    for _ in range(5):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.optimization.studies", str(path), executor],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        # It is killed while it works, at a moment that chance names.
+        until = counts[-1] + clock.randrange(1, 40)
+        while _rollouts(path) < until and process.poll() is None:
+            time.sleep(clock.random() * 0.01)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        with Study.open(path) as study:
+            counts.append(len(study))
+            assert len(study.rollouts) == counts[-1] >= counts[-2]
+            assert all(o.end == "horizon" and np.isfinite(o.value) for o in study.rollouts.values())
+    assert counts[-1] > 5
+    with pendulum_problem().study(path) as study:
+        study.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
+        resumed = table(study)
+    whole = pendulum_problem().study(solver="cmaes", seed=3)
+    whole._file.set("evaluations", 100_000)
+    whole._meta = whole._file.meta
+    whole.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
+    assert resumed == table(whole)
+
+
+def _rollouts(path: Path) -> int:
+    try:
+        with Study.open(path) as study:
+            return len(study)
+    except StudyError:
+        return 0
+
+
+def test_points_given_by_another_process_are_judged_and_told(tmp_path):
+    path = tmp_path / "a.db"
+    pendulum_problem().study(path, solver="cmaes", seed=1).run(rollouts=12, executor="serial", progress=False).close()
+    code = (
+        "from vtbdrake.optimization import Study\n"
+        f"study = Study.open({str(path)!r})\n"
+        f"study.add({{{THETA!r}: 0.5, {RATE!r}: -1.0}}, [0.25, 0.0])\n"
+        "print(len(study.trials))"
+    )
+    seen = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert int(seen.stdout) == 12
+    with pendulum_problem().study(path) as study:
+        study.run(rollouts=30, executor="serial", progress=False)
+        given = [t for t in study.trials if t.origin == "user"]
+        assert [tuple(t.parameters.values()) for t in given] == [(0.5, -1.0), (0.25, 0.0)]
+        assert given[0].value == pendulum_problem().rollout([0.5, -1.0]).value
+        first = table(study)
+    with pendulum_problem().study(path) as again:
+        again.run(rollouts=30, executor="serial", progress=False)
+        assert table(again) == first
+
+
+def test_a_study_can_be_read_while_it_runs(tmp_path):
+    path = tmp_path / "a.db"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.optimization.studies", str(path), "serial"], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    try:
+        counts = [0]
+        while counts[-1] < 30 and process.poll() is None:
+            counts.append(_rollouts(path))
+        assert counts == sorted(counts) and len(set(counts)) > 2
+        with pytest.raises(StudyError, match="is being run by another process"):
+            pendulum_problem().study(path).run(rollouts=100, progress=False)
+        with Study.open(path) as study:
+            assert study.best.value < 0.5
+    finally:
+        process.kill()
+        process.wait()
+
+
+# -- budgets
+
+
+def test_a_budget_of_rollouts_is_kept_to_the_rollout():
+    conditions = [{DAMPING: d} for d in (0.0, 0.1, 0.2)]
+    study = (
+        pendulum_problem(conditions=conditions)
+        .study(solver="cmaes")
+        .run(rollouts=50, executor="threads", progress=False)
+    )
+    assert len(study) == 50 and study.reason == "budget"
+
+
+def test_a_target_ends_a_study():
+    study = pendulum_problem().study(solver="sobol").run(target=0.05, executor="serial", progress=False)
+    assert study.best.value <= 0.05 and study.reason == "target"
+    last = study.trials[-1].batch
+    assert all(t.value > 0.05 for t in study.trials if t.batch < last)
+
+
+def test_a_budget_of_time_ends_a_study():
+    study = pendulum_problem().study(solver="cmaes").run(seconds=0.3, executor="serial", progress=False)
+    assert study.reason == "time" and len(study) > 0
+
+
+def test_a_solver_that_asks_only_for_what_is_known_ends_a_study():
+    problem = pendulum_problem(parameters=[Parameter("scenario.stiffness", 0, 1, integer=True)])
+    study = problem.study(solver="random").run(rollouts=100, executor="serial", progress=False)
+    assert study.reason == "solver" and len(study) == 2
+
+
+@pytest.mark.parametrize(
+    ("budget", "message"),
+    [
+        ({}, "give rollouts=, seconds= or target="),
+        ({"rollouts": 0}, "at least one rollout, not 0"),
+        ({"seconds": -1.0}, "positive and finite, not -1.0 s"),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_refused(budget, message):
+    with pytest.raises(ValueError, match=message):
+        pendulum_problem().study().run(**budget)
+
+
+# -- bad input
+
+
+def test_files_that_are_no_study_are_told_apart_and_left_alone(tmp_path):
+    text, other, newer, truncated = (tmp_path / name for name in ("text", "other", "newer", "truncated"))
+    text.write_text("point,h\n1,2\n" * 100)
+    sqlite3.connect(other).execute("CREATE TABLE something (x)")
+    pendulum_problem().study(newer, solver="sobol").run(rollouts=16, executor="serial", progress=False).close()
+    truncated.write_bytes(newer.read_bytes()[:9000])
+    database = sqlite3.connect(newer)
+    database.execute("PRAGMA user_version = 7")
+    database.close()
+    for path, message in [
+        (text, "cannot be read .file is not a database."),
+        (other, "SQLite file of another kind"),
+        (newer, "a study of version 7, but this vtbdrake reads version 1"),
+        (truncated, "cannot be read"),
+        (tmp_path / "none", "there is no study file"),
+        (tmp_path / "no" / "folder", "there is no study file"),
+    ]:
+        before = path.read_bytes() if path.exists() else None
+        with pytest.raises(StudyError, match=message):
+            Study.open(path)
+        if path.exists():
+            with pytest.raises(StudyError, match=message):
+                pendulum_problem().study(path)
+        assert (path.read_bytes() if path.exists() else None) == before
+    with pytest.raises(StudyError, match="lies in a folder that does not exist"):
+        pendulum_problem().study(tmp_path / "no" / "folder.db")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"horizon": 0.4}, r"horizon: 0\.3 there, 0\.4 here"),
+        ({"scenario": PendulumScenario(stiffness=2.0)}, r"scenario stiffness: 0\.0 there, 2\.0 here"),
+        ({"quality": Quality(gap, THETA, minimize=True, reading="best")}, "reading"),
+        ({"parameters": [Parameter(THETA, -1.0, 1.5), Parameter(RATE, -3.0, 3.0)]}, "parameters"),
+        ({"conditions": [{DAMPING: 0.3}]}, "conditions"),
+        ({"risk": "mean"}, r"risk: 'Worst\(\)' there, 'Mean\(\)' here"),
+    ],
+)
+def test_a_study_of_another_problem_is_refused(tmp_path, change, message):
+    path = tmp_path / "a.db"
+    pendulum_problem().study(path, solver="sobol").run(rollouts=2, executor="serial", progress=False).close()
+    with pytest.raises(StudyError, match=message):
+        pendulum_problem(**change).study(path)
+    with pytest.raises(StudyError, match="was begun with solver 'sobol', not 'CMA-ES'"):
+        pendulum_problem().study(path, solver="cmaes")
+
+
+def test_a_quality_function_that_has_changed_is_refused(tmp_path):
+    path = tmp_path / "a.db"
+
+    def f(theta):
+        return theta**2
+
+    pendulum_problem(quality=Quality(f, THETA)).study(path).close()
+
+    def f(theta):
+        return theta**4
+
+    with pytest.raises(StudyError, match="the function f has other code"):
+        pendulum_problem(quality=Quality(f, THETA)).study(path)
+
+
+def test_an_unknown_solver_is_told_the_known_ones(tmp_path):
+    with pytest.raises(ValueError, match="did you mean 'CMA-ES'") as error:
+        pendulum_problem().study(tmp_path / "a.db", solver="cmeas")
+    assert all(name in str(error.value) for name in ("auto", "sobol", "TPE", "SNOPT", "LN_BOBYQA"))
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_a_choice_for_a_gradient_solver_is_refused(tmp_path):
+    problem = pendulum_problem(parameters=[Choice(DAMPING, [0.0, 0.5])])
+    with pytest.raises(ValueError, match=f"{DAMPING}"):
+        problem.study(tmp_path / "a.db", solver="snopt")
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
+def test_a_quality_function_that_raises_leaves_the_study_whole(tmp_path, executor):
+    path = tmp_path / "a.db"
+    problem = pendulum_problem(quality=Quality(_raises_beyond, THETA, reading="end"))
+    study = problem.study(path, solver="sobol")
+    with pytest.raises(QualityError, match="ValueError: too far"):
+        study.run(rollouts=64, executor=executor, progress=False)
+    finished = len(study)
+    study.close()
+    with Study.open(path) as again:
+        assert len(again) == finished < 64
+        assert all(o.value <= 1.0 for o in again.rollouts.values())
+        assert again._file.sessions()[0][2] == "QualityError"
+
+
+def _raises_beyond(theta: float) -> float:
+    if abs(theta) > 1.0:
+        raise ValueError("too far")
+    return abs(theta)
+
+
+def test_given_points_are_checked_at_once(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db")
+    with pytest.raises(ValueError, match=r"outside its range \[-1\.5, 1\.5\]"):
+        study.add([2.0, 0.0])
+    with pytest.raises(ValueError, match="a point has 2 entries, not 1"):
+        study.add(2.0)
+    with pytest.raises(ValueError, match="wrong about nonsense"):
+        study.add({THETA: 0.0, RATE: 0.0, "nonsense": 1.0})
+    assert study._file.waiting() == 0
+
+
+def test_a_study_says_what_it_is_about_and_what_happened(tmp_path):
+    study = (
+        pendulum_problem()
+        .study(tmp_path / "a.db", solver="sobol", seed=4)
+        .run(rollouts=8, executor="serial", progress=False)
+    )
+    record = study.record
+    assert record["seed"] == 4 and record["solver"] == "sobol"
+    assert record["problem"]["scenario"]["scenario"] == "tests.testbeds:PendulumScenario"
+    assert record["versions"]["drake"] and record["versions"]["python"]
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    assert record["revision"].rstrip("+") == commit.stdout.strip()
+    text = study.summary()
+    assert "8 points, 8 rollouts" in text and f"gap = {study.best.value:g}" in text
+
+
+def test_failed_simulations_are_outcomes_and_are_told():
+    # A mass that is nearly nothing fails inside Drake.
+    problem = Problem(
+        scenario=AcrobotScenario(),
+        parameters=[Choice("sim.sys.Acrobot.lower_link.mass", [0.0, 0.5, 1.0, 2.0])],
+        quality=Quality(abs, "sim.sys.Acrobot.shoulder.position", reading="end"),
+        horizon=0.5,
+        conditions=[{"sim.sys.Acrobot.upper_link.mass": mass} for mass in (0.0, 1.0)],
+    )
+    study = problem.study(solver="grid").run(rollouts=24, executor="serial", progress=False)
+    failed = {row: o for row, o in study.rollouts.items() if o.end == "failed"}
+    assert failed and len(failed) < len(study)
+    lost = {point for point, _ in failed}
+    assert [t.failed for t in study.trials] == [tuple(t.parameters.values()) in lost for t in study.trials]
+    assert next(iter(failed.values())).message in study.summary()

@@ -1,0 +1,118 @@
+"""Judges points of a problem: which rollouts they take, under which conditions, and what these say together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import ceil, inf, nan
+
+import numpy as np
+
+from vtbdrake.optimization.outcome import Outcome, Row
+from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.solvers.solver import Evaluation, Point
+from vtbdrake.rollout.result import FAILED
+
+Outcomes = Mapping[Row, Outcome]
+
+# Racing goes through the conditions in rounds of at least so many rollouts, so that several workers have work. It
+# does not depend on their number: a study is the same with any.
+_ROUND = 8
+
+
+class Judge:
+    """Judges batches of points by rollouts that are known, or are run.
+
+    Args:
+        problem: what is asked.
+        known: the outcomes known so far; ``run`` adds to them.
+        run: runs the rollouts of some rows.
+        racing: drop a point as soon as it can no longer be better than the best one known, whatever the conditions
+            that it has not seen would say. It never drops the winner: the risk does not fall when a quality rises,
+            and the best that a quality can be is `Quality.upper` (of a cost, 0).
+    """
+
+    def __init__(
+        self, problem: Problem, known: Outcomes, run: Callable[[Sequence[Row]], None], *, racing: bool = False
+    ) -> None:
+        if racing and len(problem.objectives) > 1:
+            raise ValueError(
+                "racing is about one quality, but the problem has several: no point is behind in all of them"
+            )
+        self._problem = problem
+        self._known = known
+        self._run = run
+        self._racing = racing and len(problem.conditions) > 1
+        self._conditions = range(len(problem.conditions))
+        self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
+        self._incumbent: Point | None = None
+        self._best = -inf
+
+    def judge(self, points: Sequence[Point]) -> list[Evaluation]:
+        """One evaluation per point, in their order."""
+        distinct = list(dict.fromkeys(points))
+        if self._racing:
+            self._race(distinct)
+        else:
+            self._complete([(point, condition) for point in distinct for condition in self._conditions])
+        evaluations = {point: self.evaluation(point) for point in distinct}
+        for point, evaluation in evaluations.items():
+            self._remember(point, evaluation)
+        return [evaluations[point] for point in points]
+
+    def _complete(self, rows: Sequence[Row]) -> None:
+        missing = [row for row in rows if row not in self._known]
+        if missing:
+            self._run(missing)
+
+    def _race(self, points: Sequence[Point]) -> None:
+        order = self._order()
+        alive = list(points)
+        done = 0
+        while alive and done < len(order):
+            share = ceil(_ROUND / len(alive))
+            self._complete([(point, condition) for point in alive for condition in order[done : done + share]])
+            done += share
+            alive = [point for point in alive if not self._lost(self.evaluation(point))]
+
+    def _order(self) -> list[int]:
+        """The conditions, those first in which the best point fares worst: they tell most."""
+        if self._incumbent is None:
+            return list(self._conditions)
+        h = [self._known[self._incumbent, condition].value * self._signs[0] for condition in self._conditions]
+        return sorted(self._conditions, key=lambda condition: h[condition])
+
+    def _lost(self, evaluation: Evaluation) -> bool:
+        """Whether a point, judged by a bound from above, cannot become the best."""
+        if evaluation.failed:
+            return True
+        return self._incumbent is not None and (not evaluation.feasible or evaluation.values[0] <= self._best)
+
+    def evaluation(self, point: Point) -> Evaluation:
+        """What the known outcomes of a point say; conditions that it has not seen count as the best that could be."""
+        outcomes = [self._known.get((point, condition)) for condition in self._conditions]
+        seen = [outcome for outcome in outcomes if outcome is not None]
+        exact = len(seen) == len(outcomes)
+        constraints = len(self._problem.constraints)
+        if any(outcome.end == FAILED for outcome in seen):
+            # One failed simulation leaves nothing to be said, and nothing to be gained by the others.
+            return Evaluation(point, (nan,) * self._signs.size, (nan,) * constraints, exact=exact)
+        objectives = self._problem.objectives
+        values = []
+        for k, (quality, sign) in enumerate(zip(objectives, self._signs, strict=True)):
+            bound = sign * quality.bound(self._problem.task.horizon)
+            h = [bound if o is None else sign * (o.value if k == 0 else o.measures[k - 1]) for o in outcomes]
+            values.append(self._problem.risk(np.array(h)))
+        violations = [
+            max((outcome.measures[len(objectives) - 1 + k] for outcome in seen), default=-inf)
+            for k in range(constraints)
+        ]
+        return Evaluation(point, tuple(values), tuple(violations), exact=exact)
+
+    def in_the_users_terms(self, evaluation: Evaluation) -> tuple[float, ...]:
+        """The values, a cost as a cost."""
+        # Adding 0 makes 0 of -0.
+        return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
+
+    def _remember(self, point: Point, evaluation: Evaluation) -> None:
+        if len(self._signs) == 1 and evaluation.exact and evaluation.feasible and evaluation.values[0] > self._best:
+            self._incumbent, self._best = point, evaluation.values[0]

@@ -1,0 +1,185 @@
+"""One run of a study: asks the solver, judges, records, tells, until it is enough."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from math import inf, isfinite
+
+from tqdm.auto import tqdm
+
+from vtbdrake.optimization.judge import Judge
+from vtbdrake.optimization.outcome import Outcome, Row
+from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.solvers.solver import Evaluation, Solver
+from vtbdrake.optimization.study_file import StudyFile, TrialRow
+from vtbdrake.rollout import Executor
+from vtbdrake.rollout.many import watched
+
+_log = logging.getLogger(__name__)
+
+BUDGET, TIME, TARGET, SOLVER, INTERRUPTED = "budget", "time", "target", "solver", "interrupted"
+
+# A solver of a small space may ask for ever for what is known; so many batches in a row without news are enough.
+_WITHOUT_NEWS = 50
+
+
+class _SpentError(Exception):
+    """The run is over, in the middle of a batch: (reason, message)."""
+
+
+class StudyRun:
+    """Runs a study in a file once.
+
+    Args:
+        known: what the file holds is told to the solver first, batch by batch as it was found.
+    """
+
+    def __init__(
+        self, file: StudyFile, problem: Problem, solver: Solver, executor: Executor, *, racing: bool, progress: bool
+    ) -> None:
+        self._file = file
+        self._problem = problem
+        self._solver = solver
+        self._executor = executor
+        self._known: dict[Row, Outcome] = file.outcomes()
+        self._judge = Judge(problem, self._known, self._roll_out, racing=racing)
+        self._told = file.told()
+        self._progress = progress
+        self._bar: tqdm | None = None  # type: ignore[type-arg]
+        self._limit: float = inf
+        self._deadline = inf
+        self._best = -inf
+
+    def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
+        """Runs; returns why it ended, in a word and in a sentence."""
+        self._limit = inf if rollouts is None else rollouts
+        self._deadline = inf if seconds is None else time.monotonic() + seconds
+        shown = self._progress and watched()
+        name = f"study ({self._solver.name})"
+        with tqdm(total=rollouts, initial=len(self._known), desc=name, unit="rollout", disable=not shown) as self._bar:
+            try:
+                return self._batches(target)
+            finally:
+                self._solver.close()
+
+    def _batches(self, target: float | None) -> tuple[str, str]:
+        batch, silent = self._resume(), 0
+        while True:
+            if target is not None and self._reached(target):
+                return TARGET, f"the target of {target:g} is reached"
+            if silent >= _WITHOUT_NEWS:
+                return SOLVER, f"{self._solver.name} asks only for points that are known"
+            before = len(self._known)
+            method = self._solver.method
+            asked = [self._problem.point(point) for point in self._solver.ask()]
+            # A batch that was told before gets no new points by hand: it is to be what it was.
+            given = self._file.take(batch, new=batch >= self._told)
+            if not asked and not given:
+                return SOLVER, self._solvers_end()
+            points = [*asked, *given]
+            try:
+                evaluations = self._judge.judge(points)
+            except BaseException as error:
+                self._record(
+                    batch, [self._judge.evaluation(point) for point in points], len(asked), method, ended=False
+                )
+                if isinstance(error, _SpentError):
+                    return error.args[0], error.args[1]
+                if isinstance(error, KeyboardInterrupt):
+                    _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._known))
+                    return INTERRUPTED, "it was interrupted"
+                raise
+            self._solver.tell(evaluations)
+            if batch >= self._told:
+                self._record(batch, evaluations, len(asked), method, ended=True)
+                silent = 0 if len(self._known) > before else silent + 1
+            self._show(evaluations)
+            batch += 1
+
+    def _resume(self) -> int:
+        """The batch to begin with. A solver that can be told again begins where the study did, others where it
+        stands."""
+        if self._solver.reproducible or not self._told:
+            return 0
+        points = list(dict.fromkeys(row[2] for row in self._file.trials()))
+        evaluations = self._judge.judge(points)
+        self._solver.tell(evaluations)
+        self._show(evaluations)
+        return self._told
+
+    def _solvers_end(self) -> str:
+        how = {True: "is finished", False: "has ended without success", None: "has ended"}[self._solver.success]
+        return f"{self._solver.name} {how}" + (f": {self._solver.message}" if self._solver.message else "")
+
+    def _roll_out(self, rows: Sequence[Row]) -> None:
+        now = rows[: max(0, int(min(self._limit - len(self._known), len(rows))))]
+        points = [self._problem.values(point, condition=condition) for point, condition in now]
+        self._refuse_lateness()
+        results = self._executor.run(self._problem.task, points) if points else iter(())
+        try:
+            for index, result in results:
+                outcome = Outcome.of(result)
+                self._known[now[index]] = outcome
+                self._file.add(*now[index], outcome)
+                assert self._bar is not None
+                self._bar.update()
+                self._refuse_lateness()
+        finally:
+            if points:
+                results.close()  # type: ignore[attr-defined]
+        if len(now) < len(rows):
+            raise _SpentError(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
+
+    def _refuse_lateness(self) -> None:
+        if time.monotonic() >= self._deadline:
+            raise _SpentError(TIME, "the time is over")
+
+    def _record(self, batch: int, evaluations: Sequence[Evaluation], asked: int, method: str, *, ended: bool) -> None:
+        """Records the points that are judged; a batch that has not ended is judged again in the next run."""
+        rows: list[TrialRow] = [
+            (
+                batch,
+                position,
+                evaluation.point,
+                self._judge.in_the_users_terms(evaluation),
+                evaluation.violations,
+                evaluation.exact,
+                "solver" if position < asked else "user",
+                method if position < asked else "by hand",
+            )
+            for position, evaluation in enumerate(evaluations)
+            if ended or evaluation.exact
+        ]
+        self._file.save_trials(rows, told=batch + 1 if ended else None)
+
+    def _reached(self, target: float) -> bool:
+        return self._best >= (-target if self._problem.objectives[0].minimize else target)
+
+    def _show(self, evaluations: Sequence[Evaluation]) -> None:
+        for evaluation in evaluations:
+            if (
+                len(evaluation.values) == 1
+                and evaluation.exact
+                and evaluation.feasible
+                and evaluation.values[0] > self._best
+            ):
+                self._best = evaluation.values[0]
+                assert self._bar is not None
+                self._bar.set_postfix_str(f"best {self._judge.in_the_users_terms(evaluation)[0]:.6g}", refresh=False)
+
+
+def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:
+    """
+    Raises:
+        ValueError: there is no budget at all, one is not positive, or a target is given for several qualities.
+    """
+    if rollouts is None and seconds is None and target is None:
+        raise ValueError("a study needs to know when it is enough: give rollouts=, seconds= or target=")
+    if rollouts is not None and rollouts < 1:
+        raise ValueError(f"a budget is at least one rollout, not {rollouts}")
+    if seconds is not None and not (isfinite(seconds) and seconds > 0.0):
+        raise ValueError(f"a budget of wall time is positive and finite, not {seconds} s")
+    if target is not None and len(problem.objectives) > 1:
+        raise ValueError("a target belongs to one quality, but the problem has several")
