@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.rollout.scenarios import KILL, STOP, TreacherousScenario
-from tests.testbeds import AcrobotScenario, PendulumScenario
+from tests.testbeds import AcrobotScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
     Quality,
@@ -21,7 +21,6 @@ from vtbdrake.rollout import (
     SerialExecutor,
     ThreadExecutor,
     WorkerError,
-    choose_executor,
 )
 from vtbdrake.rollout.many import run_rollouts
 
@@ -31,15 +30,6 @@ SHOULDER = "sim.sys.Acrobot.shoulder.position"
 
 def _angle(theta):
     return abs(theta)
-
-
-def test_threads_suit_drakes_systems_and_processes_suit_python():
-    assert choose_executor(PendulumScenario().build()) == "threads"
-    assert choose_executor(AcrobotScenario().build()) == "processes"
-    with pytest.raises(ValueError, match="at least one worker"):
-        ThreadExecutor(0)
-    with pytest.raises(ValueError, match="time limit must be positive"):
-        ProcessExecutor(1, time_limit=0.0)
 
 
 def _bad_at_half(t):
