@@ -24,6 +24,7 @@ from tests.optimization.studies import (
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
 from vtbdrake.rollout import Constraint, Quality, QualityError
+from vtbdrake.testbed import SimulatorFields
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -432,3 +433,36 @@ def test_failed_simulations_are_outcomes_and_are_told():
     lost = {point for point, _ in failed}
     assert [t.failed for t in study.trials] == [tuple(t.parameters.values()) in lost for t in study.trials]
     assert next(iter(failed.values())).message in study.summary()
+
+
+@pytest.mark.parametrize("solver", ["SNOPT", "LD_SLSQP"])
+def test_a_gradient_by_autodiff_leads_to_the_same_optimum_with_fewer_rollouts(solver):
+    fixed = SimulatorFields("runge_kutta3", 0.005, 1e-3, use_error_control=False)
+    conditions = [{DAMPING: 0.0}, {DAMPING: 0.4}]
+
+    def miss(theta, rate):
+        return (theta - 0.3) ** 2 + 0.1 * (rate - 1.0) ** 2
+
+    problem = pendulum_problem(
+        scenario=PendulumScenario(simulator=fixed),
+        quality=Quality(miss, [THETA, RATE], minimize=True, reading="end"),
+        conditions=conditions,
+        risk="mean",
+    )
+    studies = [
+        problem.study(solver=solver, options={"gradient": gradient}).run(
+            rollouts=400, executor="serial", racing=False, progress=False
+        )
+        for gradient in ("autodiff", "central")
+    ]
+    points = [list(study.best.parameters.values()) for study in studies]
+    assert points[0] == pytest.approx(points[1], abs=1e-3)
+    assert len(studies[0]) < len(studies[1])
+
+
+def test_a_gradient_that_cannot_be_had_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="controls its error"):
+        pendulum_problem().study(solver="SNOPT", options={"gradient": "autodiff"}).run(rollouts=10, progress=False)
+    field = pendulum_problem(parameters=[Parameter("scenario.stiffness", 0.0, 1.0)])
+    with pytest.raises(ValueError, match="there is no derivative by scenario.stiffness"):
+        field.study(solver="SNOPT", options={"gradient": "autodiff"}).run(rollouts=10, progress=False)

@@ -26,6 +26,7 @@ _TABLES = (
     "PRIMARY KEY (point, condition))",
     "CREATE TABLE trials (batch INTEGER, position INTEGER, point TEXT, trial_values TEXT, violations TEXT, "
     "exact INTEGER, origin TEXT, method TEXT, PRIMARY KEY (batch, position))",
+    "CREATE TABLE gradients (point TEXT PRIMARY KEY, gradient TEXT)",
     # Points given by hand; batch is that which they were judged with.
     "CREATE TABLE given (number INTEGER PRIMARY KEY, point TEXT, batch INTEGER)",
     "CREATE TABLE sessions (number INTEGER PRIMARY KEY, started TEXT DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ')), "
@@ -242,6 +243,15 @@ class StudyFile:
                 "SELECT * FROM trials ORDER BY batch, position"
             )
         ]
+
+    def add_gradient(self, point: Point, gradient: Sequence[float]) -> None:
+        """Records the gradient at a point."""
+        self._write("INSERT OR IGNORE INTO gradients VALUES (?, ?)", (encode(point), json.dumps(list(gradient))))
+
+    def gradients(self) -> dict[Point, tuple[float, ...]]:
+        """All gradients."""
+        rows = self._read("SELECT point, gradient FROM gradients")
+        return {decode(point): tuple(json.loads(gradient)) for point, gradient in rows}
 
     def give(self, points: Sequence[Point]) -> None:
         """Puts points into the queue, to be judged with the next batch."""

@@ -9,6 +9,7 @@ from math import inf, isfinite
 
 from tqdm.auto import tqdm
 
+from vtbdrake.optimization.gradient import Gradients
 from vtbdrake.optimization.judge import Judge
 from vtbdrake.optimization.outcome import Outcome, Row
 from vtbdrake.optimization.problem import Problem
@@ -45,6 +46,8 @@ class StudyRun:
         self._executor = executor
         self._known: dict[Row, Outcome] = file.outcomes()
         self._judge = Judge(problem, self._known, self._roll_out, racing=racing)
+        self._gradients = Gradients(problem) if solver.wants_gradient else None
+        self._slopes = file.gradients()
         self._told = file.told()
         self._progress = progress
         self._bar: tqdm | None = None  # type: ignore[type-arg]
@@ -91,7 +94,7 @@ class StudyRun:
                     _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._known))
                     return INTERRUPTED, "it was interrupted"
                 raise
-            self._solver.tell(evaluations)
+            self._solver.tell([self._with_gradient(evaluation) for evaluation in evaluations])
             if batch >= self._told:
                 self._record(batch, evaluations, len(asked), method, ended=True)
                 silent = 0 if len(self._known) > before else silent + 1
@@ -131,6 +134,15 @@ class StudyRun:
                 results.close()  # type: ignore[attr-defined]
         if len(now) < len(rows):
             raise _SpentError(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
+
+    def _with_gradient(self, evaluation: Evaluation) -> Evaluation:
+        if self._gradients is None:
+            return evaluation
+        known = len(self._slopes)
+        filled = self._gradients.fill(evaluation, self._slopes)
+        if len(self._slopes) > known and filled.gradient is not None:
+            self._file.add_gradient(evaluation.point, filled.gradient)
+        return filled
 
     def _refuse_lateness(self) -> None:
         if time.monotonic() >= self._deadline:

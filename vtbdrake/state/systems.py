@@ -17,10 +17,10 @@ POSE_UNIT = "m, rad"
 
 
 def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
-    """All leaf systems below ``diagram`` with their dotted paths, in the Diagram's order."""
+    """All leaf systems below ``diagram``, of any scalar, with their dotted paths, in the Diagram's order."""
     for system in diagram.GetSystems():
         below = f"{path}.{system.get_name()}" if path else system.get_name()
-        if isinstance(system, Diagram):
+        if hasattr(system, "GetSystems"):
             yield from leaves(system, path=below)
         else:
             yield below, system

@@ -1,0 +1,188 @@
+"""Derivatives of a rollout: the state by AutoDiff through the simulation, the quality by the directions in which it
+moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.geometry import SceneGraph
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator_
+from pydrake.systems.framework import Context
+
+from vtbdrake.rollout.quality import Quality
+from vtbdrake.rollout.readings import READINGS
+from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.state.snapshot import numeric_groups
+from vtbdrake.state.systems import leaves, read_group, write_group
+from vtbdrake.testbed import VirtualTestbed
+
+# Of a parameter's own size, when what it does to the groups of a context is measured. Nearly all are linear in it.
+_STEP = 1e-6
+# Of the state, along the direction in which a parameter moves it, when what that does to f is measured.
+_NUDGE = 1e-6
+
+
+class DerivativeError(ValueError):
+    """A testbed or a problem through which no derivative can be taken."""
+
+
+class DerivativeRunner:
+    """The number that a rollout's quality is read as, and its derivatives by the parameters.
+
+    The simulation runs once with AutoDiffXd, at fixed steps: with error control the steps would depend on the
+    parameters, and the derivatives would be garbage. At the sample times the state and its derivatives ds/dp are
+    known; f is evaluated at s +- e ds/dp, so that f may be any function in Python.
+
+    Args:
+        task: the rollout. Its threshold is not looked at.
+        testbed: built from the task's scenario, of systems that convert to AutoDiffXd.
+
+    Raises:
+        DerivativeError: a system does not convert, or the integrator controls its error.
+    """
+
+    def __init__(self, task: RolloutTask, testbed: VirtualTestbed) -> None:
+        if task.quality is None:
+            raise DerivativeError("a rollout without a quality has no derivative")
+        self.task = task
+        self.testbed = testbed
+        self._quality: Quality = task.quality
+        fields = testbed.simulator_fields
+        discrete = testbed.plant is not None and testbed.plant.time_step() > 0.0
+        if fields.use_error_control and not discrete:
+            raise DerivativeError(
+                f"derivatives need fixed steps, but {fields.integration_scheme} controls its error: set "
+                "simulator.use_error_control to false and choose max_step_size, or use gradient='central'"
+            )
+        try:
+            self._diagram = testbed.diagram.ToAutoDiffXd()
+        except RuntimeError as error:
+            raise DerivativeError(
+                f"the testbed does not convert to AutoDiffXd: {error}. Use gradient='central'"
+            ) from error
+        converted = dict(leaves(self._diagram))
+        self._pairs = [
+            (path, system, converted[path])
+            for path, system in leaves(testbed.diagram)
+            if not isinstance(system, SceneGraph)
+        ]
+        self._readers = [testbed.reader(address) for address in self._quality.of]
+
+    def run(self, parameters: Mapping[str, Any], by: Sequence[str]) -> tuple[float, np.ndarray]:
+        """(the number, its derivatives of shape (n,)) at ``parameters`` (address -> value), by those named in ``by``.
+
+        Raises:
+            DerivativeError: a parameter is not part of the numeric groups of the context.
+            RuntimeError: the simulation fails.
+        """
+        context = self._start(parameters)
+        directions = {address: self._direction(parameters, address) for address in by}
+        simulator = Simulator_[AutoDiffXd](self._diagram, self._seeded(context, list(directions.values())))
+        ApplySimulatorConfig(self.testbed.simulator_fields.config(), simulator)
+        simulator.get_mutable_context().SetTime(AutoDiffXd(context.get_time()))
+        t0 = context.get_time()
+        samples, slopes, times = [], [], self.task.sample_times()
+        for t in times:
+            if t > 0.0:
+                simulator.AdvanceTo(AutoDiffXd(t0 + float(t)))
+            value, slope = self._sample(simulator.get_context(), context, t0 + float(t), len(by))
+            samples.append(value)
+            slopes.append(slope)
+        return self._read(times, np.array(samples), np.array(slopes))
+
+    def _start(self, parameters: Mapping[str, Any]) -> Context:
+        context = self.testbed.default_context()
+        if self.task.start is not None:
+            self.testbed.restore(context, self.task.start)
+            self.testbed.switch(context, "sim")
+        self.testbed.write(context, parameters)
+        return context
+
+    def _direction(self, parameters: Mapping[str, Any], address: str) -> dict[tuple[str, str, int], np.ndarray]:
+        """How the numeric groups move with a parameter: a central difference of what writing it does to them."""
+        variable = self.testbed.variables()[address]
+        if variable.carried_by:
+            raise DerivativeError(
+                f"{address} does not lie in the numeric groups of the context, through which derivatives are taken: "
+                "use gradient='central'"
+            )
+        value = float(parameters[address])
+        step = _STEP * max(1.0, abs(value))
+        lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
+        ends = max(value - step, lower), min(value + step, upper)
+        below, above = (self._groups(self._start({**parameters, address: end})) for end in ends)
+        return {key: (above[key] - below[key]) / (ends[1] - ends[0]) for key in below}
+
+    def _groups(self, context: Context) -> dict[tuple[str, str, int], np.ndarray]:
+        return {
+            (path, group, index): read_group(system.GetMyContextFromRoot(context), group, index)
+            for path, system, _ in self._pairs
+            for group, index in numeric_groups(system.GetMyContextFromRoot(context))
+        }
+
+    def _seeded(self, context: Context, directions: Sequence[Mapping[tuple[str, str, int], np.ndarray]]) -> Any:
+        seeded = self._diagram.CreateDefaultContext()
+        seeded.SetTimeStateAndParametersFrom(context)
+        systems = {path: system for path, _, system in self._pairs}
+        for (path, group, index), value in self._groups(context).items():
+            gradient = np.stack([direction[path, group, index] for direction in directions], axis=1)
+            # NaN marks what has no value, such as the command that is none: it has no derivative either.
+            gradient[np.isnan(gradient)] = 0.0
+            if gradient.any():
+                leaf = systems[path].GetMyMutableContextFromRoot(seeded)
+                write_group(leaf, group, index, InitializeAutoDiff(value, gradient).ravel())
+        return seeded
+
+    def _sample(self, seeded: Any, context: Context, t: float, count: int) -> tuple[float, np.ndarray]:
+        context.SetTime(t)
+        values, gradients = {}, {}
+        for path, system, converted in self._pairs:
+            leaf = system.GetMyMutableContextFromRoot(context)
+            for group, index in numeric_groups(leaf):
+                entries = _entries(converted.GetMyContextFromRoot(seeded), group, index)
+                key = (path, group, index)
+                values[key] = ExtractValue(entries).ravel()
+                gradient = ExtractGradient(entries)
+                gradients[key] = gradient if gradient.size else np.zeros((values[key].size, count))
+        self._write(context, values)
+        sample = self._f(context, t)
+        slope = np.empty(count)
+        for k in range(count):
+            ends = []
+            scale = max((float(np.abs(g[:, k]).max(initial=0.0)) for g in gradients.values()), default=0.0)
+            nudge = _NUDGE / max(1.0, scale)
+            for sign in (1.0, -1.0):
+                self._write(context, {key: v + sign * nudge * gradients[key][:, k] for key, v in values.items()})
+                ends.append(self._f(context, t, checked=False))
+            slope[k] = (ends[0] - ends[1]) / (2.0 * nudge)
+        return sample, slope
+
+    def _write(self, context: Context, values: Mapping[tuple[str, str, int], np.ndarray]) -> None:
+        for path, system, _ in self._pairs:
+            leaf = system.GetMyMutableContextFromRoot(context)
+            for group, index in numeric_groups(leaf):
+                write_group(leaf, group, index, values[path, group, index])
+
+    def _f(self, context: Context, t: float, *, checked: bool = True) -> float:
+        arguments = [read(context) for read in self._readers]
+        # Nudged below its least, f may be negative.
+        return self._quality(arguments, time=t) if checked else float(self._quality.f(*arguments))
+
+    def _read(self, times: np.ndarray, samples: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
+        t, value = READINGS[self._quality.reading](times, samples, not self._quality.minimize)
+        if self._quality.reading == "integral":
+            return value, np.trapezoid(slopes, times, axis=0)
+        # At the best time its own derivative is zero, or it is an end: only that of f counts (envelope theorem).
+        return value, slopes[int(np.flatnonzero(times == t)[0])]
+
+
+def _entries(leaf: Any, group: str, index: int) -> np.ndarray:
+    """A numeric group of a context of AutoDiffXd."""
+    if group == "continuous":
+        return np.array(leaf.get_continuous_state_vector().CopyToVector())
+    if group == "discrete":
+        return np.array(leaf.get_discrete_state(index).CopyToVector())
+    return np.array(leaf.get_numeric_parameter(index).CopyToVector())
