@@ -23,6 +23,7 @@ from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
 
 if TYPE_CHECKING:
+    from vtbdrake.optimization.casadi_function import ProblemFunction
     from vtbdrake.optimization.study import Study
 
 Condition = Mapping[str, Any]
@@ -253,6 +254,12 @@ class Problem:
         return examine.boundary(
             self, resolution=resolution, coarse=coarse, executor=executor, workers=workers, progress=progress
         )
+
+    def casadi_function(self, **options: Any) -> ProblemFunction:
+        """h(s^0) as a ``casadi.Function`` with derivatives, for ``Opti`` and ``nlpsol``; see `ProblemFunction`."""
+        from vtbdrake.optimization.casadi_function import ProblemFunction
+
+        return ProblemFunction(self, **options)
 
     def study(
         self,

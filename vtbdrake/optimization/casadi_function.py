@@ -1,0 +1,187 @@
+"""Problem (18) as a CasADi function: h(s^0) with derivatives, beside symbolic costs and constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor as FuturesExecutor
+from typing import TYPE_CHECKING, Any
+
+import casadi
+import numpy as np
+
+from vtbdrake.optimization.gradient import Gradients
+from vtbdrake.optimization.judge import Judge
+from vtbdrake.optimization.outcome import Outcome, Row
+from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.rollout import Executor, make_executor
+
+if TYPE_CHECKING:
+    from vtbdrake.optimization.problem import Problem
+
+CENTRAL, AUTODIFF = "central", "autodiff"
+
+# By how much of its range a parameter may lie outside: interior point methods relax bounds a little.
+_SLACK = 1e-6
+
+
+class ProblemFunction(casadi.Callback):
+    """h(s^0) in the user's terms (a cost as a cost), over all conditions, as ``casadi.Function``: (n,) -> scalar.
+
+    Use it as any function, in ``Opti`` or ``nlpsol``, together with symbolic expressions; solvers need
+    ``hessian_approximation="limited-memory"``, as there is no second derivative. Keep it alive while they work.
+
+    A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers swallow what a
+    function
+    raises: call `check` after them, which raises it as itself.
+
+    Attributes:
+        error: what was raised last while it was evaluated, or None.
+        rollouts: how many there were.
+
+    Args:
+        gradient: ``central`` differences, whose points are rolled out side by side, or ``autodiff`` (see `Gradients`).
+        step: of the differences, as a part of each parameter's range.
+        executor, workers: see `Problem.sweep`.
+
+    Raises:
+        ValueError: a parameter is not continuous, there are several qualities, or the gradient is unknown or cannot
+            be had.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        name: str = "h",
+        gradient: str = CENTRAL,
+        step: float = 1e-4,
+        executor: str | Executor | FuturesExecutor = "auto",
+        workers: int | None = None,
+    ) -> None:
+        super().__init__()
+        if gradient not in (CENTRAL, AUTODIFF):
+            raise ValueError(f"a gradient is taken by one of {CENTRAL}, {AUTODIFF}, not by {gradient!r}")
+        if not 0.0 < step <= 0.1:
+            raise ValueError(f"the step is a part of each range, in (0, 0.1], not {step}")
+        if len(problem.objectives) > 1:
+            raise ValueError("a CasADi function has one value, but the problem has several qualities")
+        for parameter in problem.parameters:
+            if not parameter.is_continuous:
+                raise ValueError(f"{parameter.address} is not continuous: there is no derivative by it")
+        self._problem = problem
+        self._gradients = Gradients(problem) if gradient == AUTODIFF else None
+        self._step = step
+        rollouts = 2 * len(problem.parameters) * len(problem.conditions)
+        self._executor = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, workers=workers)
+        self._owned = self._executor is not executor
+        self._known: dict[Row, Outcome] = {}
+        self._judge = Judge(problem, self._known, self._roll_out)
+        self._jacobian: _Jacobian | None = None
+        self.error: BaseException | None = None
+        self.construct(name, {})
+
+    @property
+    def rollouts(self) -> int:
+        return len(self._known)
+
+    def close(self) -> None:
+        """Gives back the executor."""
+        if self._owned:
+            self._executor.close()
+
+    def check(self) -> None:
+        """Raises what was raised while it was evaluated, if anything was."""
+        if self.error is not None:
+            raise self.error
+
+    def value(self, x: np.ndarray) -> float:
+        """The value at ``x``, shape (n,)."""
+        (evaluation,) = self._judge.judge([self._point(x)])
+        return self._judge.in_the_users_terms(evaluation)[0]
+
+    def slope(self, x: np.ndarray) -> np.ndarray:
+        """The gradient at ``x``, shape (n,)."""
+        point = self._point(x)
+        if self._gradients is not None:
+            sign = -1.0 if self._problem.objectives[0].minimize else 1.0
+            return sign * np.array(self._gradients.at(point))
+        pairs = [self._neighbours(point, i) for i in range(len(point))]
+        evaluations = self._judge.judge([neighbour for pair in pairs for neighbour in pair])
+        values = np.array([self._judge.in_the_users_terms(e)[0] for e in evaluations]).reshape(-1, 2)
+        widths = np.array([above[i] - below[i] for i, (below, above) in enumerate(pairs)])
+        return (values[:, 1] - values[:, 0]) / widths
+
+    def _neighbours(self, point: Point, index: int) -> tuple[Point, Point]:
+        parameter = self._problem.parameters[index]
+        lower, upper = parameter.ends
+        reach = self._step * (upper - lower)
+        ends = max(point[index] - reach, lower), min(point[index] + reach, upper)
+        return tuple((*point[:index], end, *point[index + 1 :]) for end in ends)  # type: ignore[return-value]
+
+    def _point(self, x: np.ndarray) -> Point:
+        entries = []
+        for parameter, value in zip(self._problem.parameters, np.ravel(x).tolist(), strict=True):
+            lower, upper = parameter.ends
+            slack = _SLACK * (upper - lower)
+            entries.append(min(max(value, lower), upper) if lower - slack <= value <= upper + slack else value)
+        return self._problem.point(entries)
+
+    def _roll_out(self, rows: Sequence[Row]) -> None:
+        points = [self._problem.values(point, condition=condition) for point, condition in rows]
+        for index, result in self._executor.run(self._problem.task, points):
+            self._known[rows[index]] = Outcome.of(result)
+
+    # -- what CasADi calls
+
+    def get_n_in(self) -> int:
+        return 1
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> casadi.Sparsity:
+        return casadi.Sparsity.dense(len(self._problem.parameters), 1)
+
+    def eval(self, arg: Sequence[Any]) -> list[Any]:
+        try:
+            return [self.value(np.array(arg[0]))]
+        except BaseException as error:
+            self.error = error
+            raise
+
+    def has_jacobian(self) -> bool:
+        return True
+
+    def get_jacobian(
+        self, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+    ) -> casadi.Function:
+        self._jacobian = _Jacobian(self, name, opts)
+        return self._jacobian
+
+
+class _Jacobian(casadi.Callback):
+    """(x, h) -> dh/dx, as a row."""
+
+    def __init__(self, function: ProblemFunction, name: str, opts: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._function = function
+        self.construct(name, opts)
+
+    def get_n_in(self) -> int:
+        return 2
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> casadi.Sparsity:
+        return self._function.sparsity_in(0) if i == 0 else self._function.sparsity_out(0)
+
+    def get_sparsity_out(self, i: int) -> casadi.Sparsity:
+        return casadi.Sparsity.dense(1, self._function.size1_in(0))
+
+    def eval(self, arg: Sequence[Any]) -> list[Any]:
+        try:
+            return [self._function.slope(np.array(arg[0])).reshape(1, -1)]
+        except BaseException as error:
+            self._function.error = error
+            raise
