@@ -1,0 +1,1 @@
+"""Section 6: the testbed as the controller of the real machine."""

@@ -1,0 +1,88 @@
+"""What lies behind the real ports of a testbed: a bridge, which lives outside the Diagram."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any
+
+from vtbdrake.testbed import Interface
+
+
+class BridgeError(RuntimeError):
+    """A bridge that cannot be opened, or is used before it is."""
+
+
+@dataclass
+class Reception:
+    """What is known of one sensor signal; the bridge keeps it up to date in place.
+
+    Attributes:
+        value: the newest accepted one: an array of the signal's size, or an abstract value; None before the first.
+        arrived: when it arrived, on the clock of `time.monotonic`, in seconds; -inf before the first.
+        sent: the sender's own time of it, in seconds, if the message tells; NaN if not.
+        count: how many were accepted.
+        rejected: how many were not, by the reason: ``fingerprint``, ``truncated``, ``trailing``, ``size``, ``not
+            finite``, ``limits``, ``out of order``, ...
+    """
+
+    value: Any = None
+    arrived: float = -inf
+    sent: float = float("nan")
+    count: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+
+    def age(self, now: float) -> float:
+        """Seconds since it arrived; infinite before the first."""
+        return now - self.arrived
+
+    def reject(self, reason: str) -> None:
+        """Counts a message that was not accepted."""
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+
+
+class Bridge(ABC):
+    """Carries what crosses the boundary between a testbed and the real machine.
+
+    One thread uses it. No call of it waits longer than it is told to, and none raises because of what came in or because
+    the machine is gone: that is counted, and told by `connected`.
+
+    Attributes:
+        interface: the DPS's signals.
+        sensed: reception of each sensor signal, by name.
+        commanded: reception of each command u that comes from outside, by name.
+    """
+
+    interface: Interface
+    sensed: dict[str, Reception]
+    commanded: dict[str, Reception]
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connects.
+
+        Raises:
+            BridgeError: it cannot; there is no private substitute.
+        """
+
+    @abstractmethod
+    def poll(self, timeout: float = 0.0) -> int:
+        """Takes in what has arrived, waiting up to ``timeout`` seconds for the first; returns how many messages it
+        was."""
+
+    @abstractmethod
+    def publish(self, commands: Mapping[str, Any]) -> None:
+        """Sends actuator signals, by name. A signal that is not named is not sent: there is no message for "no
+        command"."""
+
+    @property
+    @abstractmethod
+    def connected(self) -> bool:
+        """Whether messages can come and go at present. A bridge that lost its connection tries to get it back in
+        `poll`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Gives the connection back; it may be opened again."""
