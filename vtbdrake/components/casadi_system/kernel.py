@@ -46,20 +46,21 @@ class Kernel:
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
         """y of AutoDiffXd, by the chain rule dy = (dy/dz) dz, where dy/dz is CasADi's."""
         z = np.concatenate(blocks)
-        value, gradient = (ExtractValue(z), ExtractGradient(z)) if z.size else (np.zeros((0, 1)), np.zeros((0, 0)))
-        y = self.value([value.ravel()])
-        return InitializeAutoDiff(y, self._dy_dz(value.ravel()) @ gradient).ravel()
+        if not z.size:
+            y = self.value(blocks)
+            return InitializeAutoDiff(y, gradient=np.zeros((y.size, 0))).ravel()
+        value = ExtractValue(z).ravel()
+        return InitializeAutoDiff(self.value([value]), gradient=self._dy_dz(value) @ ExtractGradient(z)).ravel()
 
     def _dy_dz(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         with _GENERATING:
             if self._jacobian is None:
                 parts = [casadi.jacobian(self._y, argument) for argument in self._arguments]
-                jacobian = casadi.densify(casadi.horzcat(*parts)) if parts else casadi.DM(self._y.numel(), 0)
-                self._jacobian = self._buffers(f"{self._name}_jacobian", jacobian)
+                self._jacobian = self._buffers(f"{self._name}_jacobian", casadi.densify(casadi.horzcat(*parts)))
         buffers = self._jacobian
         buffers.z[:] = z
         buffers.evaluate()
-        return buffers.y.reshape(z.size, -1).T if z.size else np.zeros((self._y.numel(), 0))
+        return buffers.y.reshape(z.size, -1).T
 
     def _buffers(self, name: str, expression: Expression) -> _Buffers:
         function = casadi.Function(name, self._arguments, [expression])
