@@ -28,6 +28,7 @@ class Signal:
         unit: SI unit of all entries; ``"1"`` if it has none.
         lower, upper: limits of its entries, scalars or arrays of shape (size,).
         rate: the largest change per second of an entry.
+        acceleration: the largest change per second of that change.
         max_age: in seconds; an older sample is stale.
         idle: actuator signals: what the simulated actuator gets while the real one is driven.
         default: commands: the value until another one is given; zeros if left out.
@@ -40,6 +41,7 @@ class Signal:
     lower: ArrayLike = -inf
     upper: ArrayLike = inf
     rate: ArrayLike = inf
+    acceleration: ArrayLike = inf
     max_age: float = inf
     idle: Any = None
     default: ArrayLike | None = None
@@ -58,7 +60,7 @@ class Signal:
         assert self.size is not None
         if self.size < 1:
             raise SignalError(f"signal {self.name} must have at least one entry, not {self.size}")
-        for name in ("lower", "upper", "rate", "idle", "default"):
+        for name in ("lower", "upper", "rate", "acceleration", "idle", "default"):
             value = getattr(self, name)
             if value is None:
                 continue
@@ -69,8 +71,9 @@ class Signal:
                 raise SignalError(f"signal {self.name}: its {name} has a NaN")
         if (np.asarray(self.lower) > np.asarray(self.upper)).any():
             raise SignalError(f"signal {self.name}: its lower limit {self.lower} lies above its upper {self.upper}")
-        if (np.asarray(self.rate) <= 0).any():
-            raise SignalError(f"signal {self.name}: its rate limit must be positive, not {self.rate}")
+        for name in ("rate", "acceleration"):
+            if (np.asarray(getattr(self, name)) <= 0).any():
+                raise SignalError(f"signal {self.name}: its {name} limit must be positive, not {getattr(self, name)}")
 
     @property
     def is_vector(self) -> bool:
