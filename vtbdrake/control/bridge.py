@@ -46,8 +46,8 @@ class Reception:
 class Bridge(ABC):
     """Carries what crosses the boundary between a testbed and the real machine.
 
-    One thread uses it. No call of it waits longer than it is told to, and none raises because of what came in or because
-    the machine is gone: that is counted, and told by `connected`.
+    One thread uses it. No call of it waits longer than it is told to, and none raises because of what came in or
+    because the machine is gone: that is counted, and told by `connected`.
 
     Attributes:
         interface: the DPS's signals.
@@ -69,8 +69,7 @@ class Bridge(ABC):
 
     @abstractmethod
     def poll(self, timeout: float = 0.0) -> int:
-        """Takes in what has arrived, waiting up to ``timeout`` seconds for the first; returns how many messages it
-        was."""
+        """Takes in what has arrived, waiting up to ``timeout`` seconds for the first; says how many messages came."""
 
     @abstractmethod
     def publish(self, commands: Mapping[str, Any]) -> None:
@@ -80,8 +79,7 @@ class Bridge(ABC):
     @property
     @abstractmethod
     def connected(self) -> bool:
-        """Whether messages can come and go at present. A bridge that lost its connection tries to get it back in
-        `poll`."""
+        """Whether messages can come and go at present. A bridge that lost its connection seeks a new one in `poll`."""
 
     @abstractmethod
     def close(self) -> None:
