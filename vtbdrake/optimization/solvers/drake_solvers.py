@@ -10,6 +10,7 @@ from pydrake.solvers import IpoptSolver, MathematicalProgramResult, NloptSolver,
 from vtbdrake.optimization.solvers.mathematical_program import GradientProgramSolver, ProgramSolver
 from vtbdrake.optimization.solvers.nlopt_algorithms import (
     LIMIT,
+    NO_EXCEPTIONS,
     RESULTS,
     SEEDED_BY_CLOCK,
     UNTIL_LIMIT,
@@ -62,6 +63,7 @@ class _Nlopt(ProgramSolver):
         if self.name not in WITH_CONSTRAINTS:
             self.search.require(self.name, no_constraints=True)
         self.local = self.name.startswith("L")
+        self._survives_exceptions = self.name not in NO_EXCEPTIONS
         self.reproducible = self.name not in SEEDED_BY_CLOCK
 
     def _solver(self) -> SolverInterface:
@@ -74,7 +76,7 @@ class _Nlopt(ProgramSolver):
             NloptSolver.XAbsoluteToleranceName(): self._tolerance,
             NloptSolver.ConstraintToleranceName(): self._feasibility,
             # 0: no limit. Drake's is 1000, and the budget is counted by us.
-            NloptSolver.MaxEvalName(): LIMIT if self.name in UNTIL_LIMIT else 0,
+            NloptSolver.MaxEvalName(): LIMIT if self.name in NO_EXCEPTIONS else 0,
         }
 
     def _judge(self, result: MathematicalProgramResult) -> tuple[bool, str]:

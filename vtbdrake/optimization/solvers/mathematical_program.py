@@ -1,4 +1,4 @@
-"""What all of Drake's solvers of a MathematicalProgram share: cost, constraints, derivatives, and when to believe them."""
+"""What Drake's solvers of a MathematicalProgram share: cost, constraints, derivatives, and when to believe them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import MathematicalProgram, MathematicalProgramResult, SolverInterface, SolverOptions
 
-from vtbdrake.optimization.solvers.blocking import BlockingSolver
+from vtbdrake.optimization.solvers.blocking import BlockingSolver, Stopped
 from vtbdrake.optimization.solvers.ranking import usable
 from vtbdrake.optimization.solvers.search import Search
 from vtbdrake.optimization.solvers.solver import SolverError
@@ -46,6 +46,8 @@ class ProgramSolver(BlockingSolver):
 
     # Whether it looks downhill from its start, and is lost if the simulation fails there.
     local = True
+    # Whether an exception in its callback ends it.
+    _survives_exceptions = True
 
     def __init__(
         self,
@@ -108,12 +110,18 @@ class ProgramSolver(BlockingSolver):
 
     def _functions(self, x: np.ndarray) -> np.ndarray:
         """(c, g) at ``x``, shape (1 + constraints,), of numbers or of AutoDiffXd, as ``x`` is."""
+        count = 1 + self.search.constraints
         # NLopt calls with AutoDiffXd even where it takes no derivatives, and swallows what is returned otherwise.
         if x.dtype != object:
             _, cost, violations = self._at(np.array(x, dtype=float))
             return np.concatenate([[cost], violations])
         u = np.array(ExtractValue(x), dtype=float).ravel()
-        self._prepare(u)
+        try:
+            self._prepare(u)
+        except Stopped:
+            if self._survives_exceptions:
+                raise
+            return InitializeAutoDiff(np.zeros(count), np.zeros((count, self.search.size))).ravel()
         _, cost, violations = self._at(u)
         values = np.concatenate([[cost], violations])
         derivatives = self._derivatives(u)
@@ -163,7 +171,7 @@ class GradientProgramSolver(ProgramSolver):
             raise SolverError(f"constraints need gradient='central': {AUTODIFF} gives the objective's only")
         if step is not None and (gradient == AUTODIFF or not 0.0 < step <= 0.25):
             raise SolverError(
-                f"step is of differences only, a part of the range in (0, 0.25], not {step} of {gradient}"
+                f"step is of differences, a part of the range in (0, 0.25], not {step} of {gradient}"
             )
         super().__init__(search, name=name, tolerance=tolerance, feasibility=feasibility, solver_options=solver_options)
         self.wants_gradient = gradient == AUTODIFF

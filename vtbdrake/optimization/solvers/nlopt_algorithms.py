@@ -2,8 +2,8 @@
 
 The first letter says global or local, the second says whether it uses derivatives (D) or not (N). Not offered, though
 Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which its build leaves out, and those
-that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name. They return at once
-with x = nan.
+that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name. They return at
+once with x = nan.
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
 """
@@ -79,9 +79,12 @@ SEEDED_BY_CLOCK = frozenset(
     }
 )
 
-# These end at a number of evaluations only, and report success there. They do not notice either that they are told to
-# stop: they go on calling, and are answered by exceptions, until that number is reached.
+# These end at a number of evaluations only, and report success there.
 UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
+
+# These do not survive an exception in their callback: they go on for ever, or crash the process. When they are closed,
+# they are given the same value everywhere instead, and run to their end or to this number of calls.
+NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "LN_NEWUOA", "LN_NEWUOA_BOUND"})
 LIMIT = 5_000
 
 # How NLopt names the number that it returns.
