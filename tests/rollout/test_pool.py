@@ -1,11 +1,13 @@
 """An executor outlives its tasks, the errors in them, and its workers."""
 
+import gc
 import threading
 import time
 
 import numpy as np
 import pytest
 
+from tests.rollout.scenarios import RecordedScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import ProcessExecutor, Quality, QualityError, RolloutTask, SerialExecutor, ThreadExecutor
 
@@ -115,3 +117,72 @@ def test_an_error_in_one_thread_is_raised_when_the_others_have_stopped():
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rollout-")]
     # The other thread was in its first sample, and has neither gone on nor begun another rollout.
     assert len(calls) <= 3
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(1)])
+def test_a_testbed_is_built_once_for_all_calls(make, tmp_path):
+    file = tmp_path / "built"
+    task = RolloutTask(RecordedScenario(file=str(file)), 0.1, Quality(_angle, THETA))
+    with make() as executor:
+        for count in (1, 4, 1, 2):
+            _assert_right(executor, task, [{THETA: 0.1 * i} for i in range(count)])
+        # The other times, one after another, to be compared with.
+        assert len(file.read_text().split()) == 1 + 4
+
+
+def test_threads_are_kept_between_calls():
+    seen = set()
+
+    def f(theta):
+        seen.add(threading.get_ident())
+        return abs(theta)
+
+    task = RolloutTask(PendulumScenario(), 0.1, Quality(f, THETA))
+    with ThreadExecutor(2) as executor:
+        for _ in range(5):
+            list(executor.run(task, [{THETA: 0.1}] * 8))
+    assert len(seen) <= 2
+    assert threading.get_ident() not in seen
+
+
+def test_an_executor_that_is_forgotten_leaves_no_threads():
+    task = RolloutTask(PendulumScenario(), 0.1, Quality(_angle, THETA))
+    executor = ThreadExecutor(2)
+    list(executor.run(task, [{THETA: 0.1}] * 4))
+    threads = [thread for thread in threading.enumerate() if thread.name.startswith("rollout-")]
+    assert len(threads) == 2
+    del executor
+    gc.collect()
+    for thread in threads:
+        thread.join(timeout=10.0)
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def test_two_runs_of_one_executor_do_not_mix():
+    tasks = [RolloutTask(PendulumScenario(stiffness=k), 0.2, Quality(_angle, THETA)) for k in (0.0, 5.0)]
+    points = [{THETA: 0.1 * i} for i in range(6)]
+    expected = [dict(SerialExecutor().run(task, points)) for task in tasks]
+    with ThreadExecutor(2) as executor:
+        pairs = zip(*(executor.run(task, points) for task in tasks), strict=True)
+        for found in pairs:
+            for (index, result), right in zip(found, expected, strict=True):
+                assert result.identical(right[index])
+
+
+class PickledScenario(PendulumScenario):
+    """Counts how often it is pickled."""
+
+    count = 0
+
+    def __reduce_ex__(self, protocol):
+        PickledScenario.count += 1
+        return super().__reduce_ex__(protocol)
+
+
+def test_a_task_is_pickled_once_for_all_calls():
+    task = RolloutTask(PickledScenario(), 0.1, Quality(_angle, THETA))
+    PickledScenario.count = 0
+    with ProcessExecutor(1) as executor:
+        for _ in range(3):
+            list(executor.run(task, [{THETA: 0.1}] * 2))
+    assert PickledScenario.count == 1
