@@ -29,6 +29,7 @@ def rollout(quality: np.ndarray, threshold: float = np.inf, failed: bool = False
         quality=quality,
         t_star=np.nan if failed else TIMES[best],
         h=np.nan if failed else quality[best],
+        value=np.nan if failed else quality[best],
         threshold=threshold,
     )
 

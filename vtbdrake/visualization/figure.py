@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -27,3 +28,10 @@ class Picture(Figure):
 def label(name: str, unit: str) -> str:
     """An axis label: ``sim.sys.payload.mass [kg]``; without brackets if there is no unit."""
     return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def finish(axes: Axes) -> None:
+    """What all diagrams share: a pale grid, and no frame above and to the right."""
+    axes.grid(True, color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)

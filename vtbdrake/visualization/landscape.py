@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap
 
 from vtbdrake.visualization.figure import label
 from vtbdrake.visualization.trajectories import FAILED
@@ -41,13 +42,9 @@ def draw_landscape(axes: Axes, sweep: Sweep) -> None:
     if len(points) == x.size * y.size and min(x.size, y.size) > 1:
         # np.unique has sorted the points by x, then y.
         image = h.reshape(x.size, y.size).T
-        drawn: ScalarMappable = axes.pcolormesh(
-            x, y, np.ma.masked_invalid(image), shading="nearest", cmap="viridis", gid="h"
-        )
-        low, high = (np.nanmin(h), np.nanmax(h)) if known.any() else (0.0, 0.0)
-        if high > low and min(x.size, y.size) > 2:
-            axes.contour(x, y, image, levels=np.linspace(low, high, 9)[1:-1], colors="white", linewidths=0.6, alpha=0.6)
-        if low < threshold < high:
+        log = sweep.parameters[0].log, sweep.parameters[1].log
+        drawn: ScalarMappable = draw_mesh(axes, x, y, image, log=log, lines=min(x.size, y.size) > 2)
+        if known.any() and np.nanmin(h) < threshold < np.nanmax(h):
             axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
             axes.plot([], [], color=_THRESHOLD, linewidth=2, label=f"f_m = {threshold:g}")
     else:
@@ -65,20 +62,62 @@ def draw_landscape(axes: Axes, sweep: Sweep) -> None:
         axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
 
 
+def draw_mesh(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    image: np.ndarray,
+    *,
+    log: tuple[bool, bool] = (False, False),
+    lines: bool = True,
+    cmap: str | Colormap = "viridis",
+) -> ScalarMappable:
+    """Values on a full grid as cells around its points, with lines of equal value.
+
+    Args:
+        x, y: where the points lie, ascending, shapes (n,) and (m,).
+        image: the values, shape (m, n); NaN leaves a hole.
+        log: whether the cells lie around their points on a logarithmic scale, in x and y.
+        lines: draw the lines.
+    """
+    cells = axes.pcolormesh(
+        _edges(x, log=log[0]), _edges(y, log=log[1]), np.ma.masked_invalid(image), cmap=cmap, gid="h"
+    )
+    known = image[np.isfinite(image)]
+    if lines and known.size and known.max() > known.min():
+        levels = np.linspace(known.min(), known.max(), 9)[1:-1]
+        axes.contour(x, y, image, levels=levels, colors="white", linewidths=0.6, alpha=0.6)
+    return cells
+
+
+def _edges(centers: np.ndarray, *, log: bool) -> np.ndarray:
+    """The edges of cells, halfway between their centers, shape (n + 1,) for n >= 2."""
+    c = np.log(centers) if log else centers
+    middle = (c[:-1] + c[1:]) / 2.0
+    edges = np.concatenate([[2.0 * c[0] - middle[0]], middle, [2.0 * c[-1] - middle[-1]]])
+    return np.exp(edges) if log else edges
+
+
+def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: float = 18) -> None:
+    """A star at the best point."""
+    axes.plot(
+        x,
+        y,
+        "*",
+        color="#d6604d",
+        markersize=size,
+        markeredgecolor="white",
+        clip_on=False,
+        zorder=4,
+        label=text,
+        gid="best",
+    )
+
+
 def _draw_best(axes: Axes, sweep: Sweep) -> None:
     _, h = worst(sweep)
     if not np.isfinite(h).any():
         return
     point, best = sweep.best()
     text = ", ".join(f"{value:.4g}" for value in point.values())
-    axes.plot(
-        *point.values(),
-        "*",
-        color="#d6604d",
-        markersize=18,
-        markeredgecolor="white",
-        clip_on=False,
-        zorder=4,
-        label=f"s⁰* = [{text}], h = {best:.4g}",
-        gid="best",
-    )
+    mark_best(axes, *point.values(), text=f"s⁰* = [{text}], h = {best:.4g}")

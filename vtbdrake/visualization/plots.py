@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.typing import ColorType
 
-from vtbdrake.visualization.figure import Picture, label
+from vtbdrake.visualization.figure import Picture, finish, label
 from vtbdrake.visualization.landscape import draw_landscape
 from vtbdrake.visualization.trajectories import (
     FAILED,
@@ -88,7 +88,7 @@ def plot_quality(rollouts: Sequence[RolloutResult]) -> Figure:
         draw_bars(axes, rollouts, rows, colors=colors, styles=[0] * len(rollouts))
         axes.set_yticks(rows, names)
         figure.set_figheight(max(3.0, 1.5 + 0.25 * len(rollouts)))
-        _finish(axes)
+        finish(axes)
     else:
         _draw_qualities(axes, rollouts, colors, names)
     return figure
@@ -114,7 +114,7 @@ def _draw_qualities(
         failed=any(rollout.failed for rollout in rollouts),
     )
     axes.set(xlabel="time t [s]", ylabel="quality f'(s⁰, t)", title="Quality trajectories")
-    _finish(axes)
+    finish(axes)
     axes.legend(
         handles=handles, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False
     )
@@ -159,7 +159,7 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
     axes.set(
         xlabel=label(parameter.address, sweep.units[0]), ylabel="h(s⁰) = f'(s⁰, t*)", title=title or "Quality at t*"
     )
-    _finish(axes)
+    finish(axes)
     if len(handles) > 1:
         axes.legend(handles=handles, fontsize="small", title="condition" if many else None, loc="best")
 
@@ -187,7 +187,7 @@ def _draw_trajectories(axes: Axes, sweep: Sweep) -> None:
         draw_trajectory(axes, rollout, color=_VALUES(norm(point[0])), style=int(condition), width=width)
     draw_threshold(axes, _threshold(sweep))
     axes.set(xlabel="time t [s]", ylabel="quality f'(s⁰, t)", title="Quality trajectories")
-    _finish(axes)
+    finish(axes)
     axes.legend(
         handles=keys(threshold=_threshold(sweep), failed=bool(sweep.failed.any())), fontsize="small", loc="best"
     )
@@ -206,7 +206,7 @@ def _draw_bars(axes: Axes, sweep: Sweep) -> None:
     colors = [_CONDITIONS(number % 10) if count > 1 else _SINGLE for number in sweep.condition]
     draw_bars(axes, sweep.rollouts, heights, colors=colors, styles=sweep.condition.tolist())
     axes.set_ylabel(label(sweep.parameters[0].address, sweep.units[0]))
-    _finish(axes)
+    finish(axes)
 
 
 def _norm(sweep: Sweep) -> Normalize:
@@ -215,9 +215,3 @@ def _norm(sweep: Sweep) -> Normalize:
 
 def _threshold(sweep: Sweep) -> float:
     return sweep.rollouts[0].threshold
-
-
-def _finish(axes: Axes) -> None:
-    axes.grid(True, color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,64 @@
+"""Studies whose points are stated, not simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from math import nan
+from typing import Any
+
+from vtbdrake.optimization import Study
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.study_file import StudyFile
+
+
+def point(
+    at: Sequence[Any],
+    *values: float,
+    violations: Sequence[float] = (),
+    exact: bool = True,
+    method: str = "TPE",
+) -> Mapping[str, Any]:
+    """A judged point; without values, one that failed."""
+    return {"at": tuple(at), "values": values, "violations": tuple(violations), "exact": exact, "method": method}
+
+
+def recorded(
+    parameters: Sequence[Dimension],
+    points: Sequence[Mapping[str, Any]],
+    *,
+    qualities: Mapping[str, str],
+    units: Sequence[str] | None = None,
+    conditions: int = 1,
+    risk: str = "Worst()",
+) -> Study:
+    """A study in memory with these points, each in a batch of its own, and no rollouts.
+
+    Args:
+        qualities: name -> ``maximize`` or ``minimize``.
+    """
+    problem = {
+        "parameters": [asdict(parameter) for parameter in parameters],
+        "qualities": [{"name": name, "minimize": direction == "minimize"} for name, direction in qualities.items()],
+        "constraints": [],
+        "conditions": [{}] * conditions,
+        "risk": risk,
+    }
+    units = [""] * len(parameters) if units is None else list(units)
+    meta = {"problem": problem, "solver": "TPE", "seed": 0, "options": {}, "units": units}
+    file = StudyFile(None, meta=meta)
+    rows = [
+        (
+            batch,
+            0,
+            made["at"],
+            made["values"] or (nan,) * len(qualities),
+            made["violations"],
+            made["exact"],
+            "solver",
+            made["method"],
+        )
+        for batch, made in enumerate(points)
+    ]
+    file.save_trials(rows, told=len(rows))
+    return Study(file)

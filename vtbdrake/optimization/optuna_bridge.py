@@ -1,0 +1,248 @@
+"""A study in Optuna's storage, for its dashboard, its plots and its importances; and points from there."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vtbdrake.optimization.optuna_trials import insert_trials
+from vtbdrake.optimization.outcome import Outcome, Row, Trial
+from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
+from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study_file import StudyError
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.distributions import BaseDistribution
+    from optuna.storages import BaseStorage
+    from optuna.trial import FrozenTrial
+
+    from vtbdrake.optimization.study import Study
+
+# What makes a study the one that it is: of the same ones it may be exported again.
+_IDENTITY = ("problem", "solver", "seed", "options")
+
+_FEWEST = 10
+
+
+def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.Study:
+    """Writes a study into Optuna's storage. See `Study.to_optuna`.
+
+    Raises:
+        ModuleNotFoundError: Optuna is not installed.
+        StudyError: the storage cannot be opened, or is the file of this study; or ``name`` is another study there.
+    """
+    optuna = import_optuna("an export to Optuna")
+    trials, outcomes = study.trials, study.rollouts
+    with quiet():
+        opened = _open(optuna, storage, but=study.path)
+        exported = _exported(optuna, opened, study, name)
+        distributions = {parameter.address: _distribution(optuna, parameter) for parameter in study.parameters}
+        there = Counter(_key(t.user_attrs["batch"], t.params) for t in _ours(exported))
+        new = []
+        for trial in trials:
+            params = {p.address: _to_optuna(p, trial.parameters[p.address]) for p in study.parameters}
+            key = _key(trial.batch, params)
+            if there[key]:
+                there[key] -= 1
+            else:
+                rollouts = [outcomes[row] for row in _rows(trial, study) if row in outcomes]
+                new.append(_frozen(optuna, trial, params, distributions, rollouts, objectives=len(study.names)))
+        insert_trials(exported, opened, new)
+    return exported
+
+
+def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> list[Point]:
+    """The points of a study in Optuna's storage that ``study`` has not judged. See `Study.import_optuna`.
+
+    Raises:
+        ModuleNotFoundError: Optuna is not installed.
+        StudyError: the storage cannot be opened, has no study ``name``, or that varies other parameters.
+        ValueError: a point lies outside its range.
+    """
+    optuna = import_optuna("an import from Optuna")
+    with quiet():
+        opened = _open(optuna, storage, but=study.path)
+        try:
+            found = optuna.load_study(study_name=name, storage=opened)
+        except KeyError as error:
+            names = ", ".join(optuna.get_all_study_names(opened)) or "none"
+            raise StudyError(f"Optuna's storage has no study {name!r}; it has {names}") from error
+        trials = found.get_trials(deepcopy=False)
+    known = {tuple(trial.parameters.values()) for trial in study.trials}
+    points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
+    return [point for point in dict.fromkeys(points) if point not in known]
+
+
+def importances(study: Study) -> tuple[dict[str, float], ...]:
+    """How much each parameter decides about whether a point is among the best tenth: for each quality, by address.
+
+    The shares sum to 1, the largest comes first. They come from the points that have a value, by Optuna's PED-ANOVA:
+    Watanabe, S., Bansal, A. and Hutter, F. (2023): PED-ANOVA. Efficiently quantifying hyperparameter importance in
+    arbitrary subspaces. IJCAI.
+
+    Raises:
+        ModuleNotFoundError: Optuna is not installed.
+        ValueError: fewer than ten points have a value, or they all have the same.
+    """
+    optuna = import_optuna("the importances")
+    values = [trial.values for trial in study.trials if trial.exact and not trial.failed]
+    if len(values) < _FEWEST:
+        raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
+    found = []
+    with quiet():
+        exported = to_optuna(study, optuna.storages.InMemoryStorage(), name="importances")
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+        for k, (name, direction) in enumerate(zip(study.names, study.directions, strict=True)):
+            if len({value[k] for value in values}) == 1:
+                raise ValueError(f"{name} is {values[0][k]:g} at all points, so that no parameter is of importance")
+            # Of a target of ours it takes the small values for the good ones.
+            sign = 1.0 if direction == "minimize" else -1.0
+            found.append(
+                optuna.importance.get_param_importances(
+                    exported, evaluator=evaluator, target=lambda trial, k=k, sign=sign: sign * trial.values[k]
+                )
+            )
+    return tuple(found)
+
+
+def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseStorage:
+    if not isinstance(storage, str):
+        return storage
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        database = make_url(storage).database
+        # Optuna would put its tables beside ours.
+        if but is not None and database and Path(database).resolve() == but.resolve():
+            raise StudyError(f"{but} is the study itself: give Optuna a file of its own")
+        opened: BaseStorage = optuna.storages.RDBStorage(storage)
+    except SQLAlchemyError as error:
+        reason = str(error).partition("\n")[0]
+        raise StudyError(
+            f"Optuna cannot open the storage {storage!r} ({reason}): give it an URL such as 'sqlite:///study.db' in a "
+            "folder that exists, or a storage of Optuna's"
+        ) from error
+    return opened
+
+
+def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> optuna.Study:
+    """The study in the storage, made if it is not there."""
+    record = json.loads(json.dumps(study.record))
+    if name in optuna.get_all_study_names(storage):
+        found = optuna.load_study(study_name=name, storage=storage)
+        if any(found.user_attrs.get(key) != record[key] for key in _IDENTITY):
+            raise StudyError(
+                f"Optuna's storage has another study {name!r} already: export this one by another name, or delete "
+                "the other"
+            )
+    else:
+        found = optuna.create_study(storage=storage, study_name=name, directions=study.directions)
+        found.set_metric_names(list(study.names))
+    for key, value in record.items():
+        if found.user_attrs.get(key) != value:
+            found.set_user_attr(key, value)
+    return found
+
+
+def _ours(exported: optuna.Study) -> Iterator[FrozenTrial]:
+    return (trial for trial in exported.get_trials(deepcopy=False) if "batch" in trial.user_attrs)
+
+
+def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
+    # As text: 1 and True are equal as numbers.
+    return batch, json.dumps(params, sort_keys=True)
+
+
+def _rows(trial: Trial, study: Study) -> Iterable[Row]:
+    point = tuple(trial.parameters.values())
+    return ((point, condition) for condition in range(len(study.record["problem"]["conditions"])))
+
+
+def _frozen(
+    optuna: Any,
+    trial: Trial,
+    params: Mapping[str, Any],
+    distributions: Mapping[str, BaseDistribution],
+    rollouts: Sequence[Outcome],
+    *,
+    objectives: int,
+) -> FrozenTrial:
+    states = optuna.trial.TrialState
+    failed = any(math.isnan(value) for value in trial.values)
+    state = states.FAIL if failed else states.COMPLETE if trial.exact else states.PRUNED
+    attributes: dict[str, Any] = {
+        "batch": trial.batch,
+        "origin": trial.origin,
+        "method": trial.method,
+        # By condition, in the order in which the problem has them; those that racing did not come to are not there.
+        "values": [_plain((outcome.value, *outcome.measures[: objectives - 1])) for outcome in rollouts],
+        "t_star": _plain(outcome.t_star for outcome in rollouts),
+        "end": [outcome.end for outcome in rollouts],
+        "wall_time": _plain(outcome.wall_time for outcome in rollouts),
+    }
+    if state is states.PRUNED:
+        attributes["bound"] = _plain(trial.values)
+    messages = [outcome.message for outcome in rollouts if outcome.message]
+    if messages:
+        attributes["messages"] = messages
+    frozen: FrozenTrial = optuna.create_trial(
+        state=state,
+        values=list(trial.values) if state is states.COMPLETE else None,
+        params=dict(params),
+        distributions=dict(distributions),
+        user_attrs=attributes,
+        # As a list, which the dashboard reads; Optuna reads it as it does the newer form, one attribute each.
+        system_attrs={} if failed or not trial.violations else {"constraints": list(trial.violations)},
+    )
+    return frozen
+
+
+def _plain(numbers: Iterable[float]) -> list[float | None]:
+    """JSON of the web knows no NaN and no infinity."""
+    return [number if math.isfinite(number) else None for number in numbers]
+
+
+def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
+    if not isinstance(parameter, Choice):
+        return distribution(parameter, optuna)
+    options = [_to_optuna(parameter, option) for option in parameter.options]
+    found: BaseDistribution = optuna.distributions.CategoricalDistribution(options)
+    return found
+
+
+def _ambiguous(choice: Choice) -> bool:
+    """Whether Optuna would take two options for one: 1 and True are equal to it."""
+    return len(set(choice.options)) < len(choice.options)
+
+
+def _to_optuna(parameter: Dimension, value: Any) -> Any:
+    return repr(value) if isinstance(parameter, Choice) and _ambiguous(parameter) else value
+
+
+def _from_optuna(parameter: Dimension, value: Any) -> Any:
+    if isinstance(parameter, Choice) and _ambiguous(parameter):
+        return {repr(option): option for option in parameter.options}.get(value, value)
+    return value
+
+
+def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
+    """The point of a trial; None of one whose parameters are not all drawn yet."""
+    params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
+    addresses = [parameter.address for parameter in study.parameters]
+    foreign = [key for key in params if key not in addresses]
+    missing = [address for address in addresses if address not in params]
+    if foreign or (missing and trial.state.is_finished()):
+        raise StudyError(
+            f"trial {trial.number} of Optuna's study {name!r} sets {', '.join(params) or 'nothing'}, but this study "
+            f"varies {', '.join(addresses)}: the names must be the same"
+        )
+    if missing:
+        return None
+    return tuple(p.check(_from_optuna(p, params[p.address])) for p in study.parameters)
