@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -22,18 +22,25 @@ class StateCopier:
     Args:
         source, target: the Diagrams; they may be the same one.
         source_variables, target_variables: theirs.
+        only: says of the path of a system of the target whether it is copied; left out, all are.
 
     Raises:
         ValueError: the two are not built alike.
     """
 
     def __init__(
-        self, source: Diagram, source_variables: Variables, target: Diagram, target_variables: Variables
+        self,
+        source: Diagram,
+        source_variables: Variables,
+        target: Diagram,
+        target_variables: Variables,
+        *,
+        only: Callable[[str], bool] = lambda path: True,
     ) -> None:
         from_paths, to_paths = dict(leaves(source)), dict(leaves(target))
         self._pairs = []
         for path, system in to_paths.items():
-            if isinstance(system, SceneGraph | RgbdSensor) or _is_empty(system):
+            if isinstance(system, SceneGraph | RgbdSensor) or _is_empty(system) or not only(path):
                 continue
             if path not in from_paths:
                 raise ValueError(f"the testbed to copy from has no system {path}")

@@ -4,11 +4,13 @@ from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.scenario import Scenario, ScenarioError, load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
+from vtbdrake.testbed.strip import DpsAlone
 from vtbdrake.testbed.switch import Command
 from vtbdrake.testbed.testbed import VirtualTestbed
 
 __all__ = [
     "Command",
+    "DpsAlone",
     "Interface",
     "PlantFields",
     "Scenario",

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator
-from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
+from vtbdrake.state import Snapshot, SnapshotError, Variable, collect
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.copying import StateCopier
-from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variable import X
-from vtbdrake.state.variables import suggestion
+from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
@@ -39,7 +35,7 @@ def check_mode(mode: str) -> None:
         raise ValueError(f"a testbed's mode is one of {', '.join(MODES)}, not {mode!r}")
 
 
-class VirtualTestbed:
+class VirtualTestbed(AddressedDiagram):
     """A DPS in one Diagram with the simulated world around it, behind switches.
 
     Attributes:
@@ -47,14 +43,8 @@ class VirtualTestbed:
             for every actuator signal that commands, else 0). While an actuator signal's switch is on sim, its real
             port carries no command: NaN, or an empty `Command` for an abstract signal. No system in it touches
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
-        interface: the DPS's signals.
-        dps: the data processing system, a direct subsystem of the diagram.
         plant, scene_graph: of the simulated world, if it has them.
-        simulator_fields: how the testbed is to be integrated.
-        scenario: what built it, or None.
         visualized: True if a Meshcat draws it.
-
-    It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
     """
 
     def __init__(
@@ -74,86 +64,31 @@ class VirtualTestbed:
         plant_roles: Mapping[str, str],
         visualized: bool,
     ) -> None:
-        self.diagram = diagram
-        self.interface = interface
-        self.dps = dps
+        super().__init__(
+            diagram=diagram,
+            interface=interface,
+            dps=dps,
+            simulator=simulator,
+            scenario=scenario,
+            variables=collect(
+                diagram,
+                plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
+                skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
+                extra=[
+                    Variable("time", X, (), "s", lambda context: context.get_time()),
+                    *(selector.variable() for selector in [*sense.values(), *act.values()]),
+                    *extra_variables,
+                ],
+            ),
+        )
         self.plant = plant
         self.scene_graph = scene_graph
-        self.simulator_fields = simulator
-        self.scenario = scenario
         self.visualized = visualized
         self._sense = dict(sense)
         self._act = dict(act)
         self._beliefs = beliefs
-        self._variables = collect(
-            diagram,
-            plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
-            skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
-            extra=[
-                Variable("time", X, (), "s", lambda context: context.get_time()),
-                *(selector.variable() for selector in [*self._sense.values(), *self._act.values()]),
-                *extra_variables,
-            ],
-        )
         for belief in beliefs:
             belief.check(self._variables)
-
-    # -- contexts and simulators
-
-    def default_context(self) -> Context:
-        """A new context: s0 from defaults."""
-        return self.diagram.CreateDefaultContext()
-
-    def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
-        """A new Drake Simulator of the testbed with its own integrator settings.
-
-        Args:
-            restored: ``context`` continues another one; initialization events, which would overwrite its state, have
-                happened before.
-        """
-        simulator = Simulator(self.diagram, context if context is not None else self.default_context())
-        time = simulator.get_context().get_time()
-        ApplySimulatorConfig(self.simulator_fields.config(), simulator)
-        simulator.get_mutable_context().SetTime(time)
-        if restored:
-            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
-        return simulator
-
-    # -- addresses
-
-    def variables(self) -> Variables:
-        """Every element of s = [x, a], by address."""
-        return self._variables
-
-    def read(self, context: Context, address: str) -> Any:
-        """The value of a variable, or of an output port (``path.port``), in ``context``."""
-        return self.reader(address)(context)
-
-    def write(self, context: Context, values: Mapping[str, Any]) -> None:
-        """Sets variables by address."""
-        self._variables.write(context, values)
-
-    def reader(self, address: str) -> Callable[[Context], Any]:
-        """Reads a variable, or an output port by ``path.port``, from any context.
-
-        Raises:
-            AddressError: there is neither.
-        """
-        if address in self._variables:
-            return self._variables[address].get
-        if address in self._ports:
-            return _port_reader(*self._ports[address])
-        hint = suggestion(address, [*self._variables, *self._ports])
-        raise AddressError(f"there is no variable and no output port {address!r}{hint}")
-
-    @cached_property
-    def _ports(self) -> dict[str, tuple[System, OutputPort]]:
-        ports = {}
-        for path, system in [("", self.diagram), *_all_systems(self.diagram)]:
-            for i in range(system.num_output_ports()):
-                port = system.get_output_port(i)
-                ports[f"{path}.{port.get_name()}".lstrip(".")] = (system, port)
-        return ports
 
     # -- switches
 
@@ -259,29 +194,3 @@ class VirtualTestbed:
                 for belief in self._beliefs
             },
         )
-
-    def copier_from(self, source: VirtualTestbed) -> StateCopier:
-        """Copies contexts of ``source`` (this testbed, or another of the same scenario) to contexts of this one."""
-        return StateCopier(source.diagram, source.variables(), self.diagram, self._variables)
-
-    @cached_property
-    def python_systems(self) -> tuple[str, ...]:
-        """Paths of the systems that are written in Python and have work to do while time runs."""
-        # The board of the switches has no work to do.
-        return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
-
-
-def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:
-    found = []
-    for system in diagram.GetSystems():
-        below = f"{path}.{system.get_name()}".lstrip(".")
-        found.append((below, system))
-        if isinstance(system, Diagram):
-            found += _all_systems(system, below)
-    return found
-
-
-def _port_reader(system: System, port: OutputPort) -> Callable[[Context], Any]:
-    if port.get_data_type() == PortDataType.kVectorValued:
-        return lambda context: np.array(port.Eval(system.GetMyContextFromRoot(context)))
-    return lambda context: port.EvalAbstract(system.GetMyContextFromRoot(context)).Clone().get_value()

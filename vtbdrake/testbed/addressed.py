@@ -1,0 +1,136 @@
+"""A Diagram with addresses: what a testbed and the DPS alone have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
+
+from vtbdrake.state import AddressError, Variables
+from vtbdrake.state.copying import StateCopier
+from vtbdrake.state.systems import is_python, leaves
+from vtbdrake.state.variables import suggestion
+from vtbdrake.testbed.config import SimulatorFields
+from vtbdrake.testbed.signal import Interface
+from vtbdrake.testbed.switch import BOARD
+
+if TYPE_CHECKING:
+    from vtbdrake.testbed.scenario import Scenario
+
+
+class AddressedDiagram:
+    """A Diagram, what lies in its Context by address, and how it is simulated.
+
+    Attributes:
+        diagram: its input ports ``real.sense.<signal>`` and its output ports ``real.act.<signal>`` lead to a machine.
+        interface: the DPS's signals.
+        dps: the data processing system, a direct subsystem of the diagram.
+        simulator_fields: how it is to be integrated.
+        scenario: what built it, or None.
+
+    It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
+    """
+
+    def __init__(
+        self,
+        *,
+        diagram: Diagram,
+        interface: Interface,
+        dps: System,
+        simulator: SimulatorFields,
+        scenario: Scenario | None,
+        variables: Variables,
+    ) -> None:
+        self.diagram = diagram
+        self.interface = interface
+        self.dps = dps
+        self.simulator_fields = simulator
+        self.scenario = scenario
+        self._variables = variables
+
+    # -- contexts and simulators
+
+    def default_context(self) -> Context:
+        """A new context: s0 from defaults."""
+        return self.diagram.CreateDefaultContext()
+
+    def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
+        """A new Drake Simulator of the testbed with its own integrator settings.
+
+        Args:
+            restored: ``context`` continues another one; initialization events, which would overwrite its state, have
+                happened before.
+        """
+        simulator = Simulator(self.diagram, context if context is not None else self.default_context())
+        time = simulator.get_context().get_time()
+        ApplySimulatorConfig(self.simulator_fields.config(), simulator)
+        simulator.get_mutable_context().SetTime(time)
+        if restored:
+            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        return simulator
+
+    # -- addresses
+
+    def variables(self) -> Variables:
+        """Every element of s = [x, a], by address."""
+        return self._variables
+
+    def read(self, context: Context, address: str) -> Any:
+        """The value of a variable, or of an output port (``path.port``), in ``context``."""
+        return self.reader(address)(context)
+
+    def write(self, context: Context, values: Mapping[str, Any]) -> None:
+        """Sets variables by address."""
+        self._variables.write(context, values)
+
+    def reader(self, address: str) -> Callable[[Context], Any]:
+        """Reads a variable, or an output port by ``path.port``, from any context.
+
+        Raises:
+            AddressError: there is neither.
+        """
+        if address in self._variables:
+            return self._variables[address].get
+        if address in self._ports:
+            return _port_reader(*self._ports[address])
+        hint = suggestion(address, [*self._variables, *self._ports])
+        raise AddressError(f"there is no variable and no output port {address!r}{hint}")
+
+    @cached_property
+    def _ports(self) -> dict[str, tuple[System, OutputPort]]:
+        ports = {}
+        for path, system in [("", self.diagram), *_all_systems(self.diagram)]:
+            for i in range(system.num_output_ports()):
+                port = system.get_output_port(i)
+                ports[f"{path}.{port.get_name()}".lstrip(".")] = (system, port)
+        return ports
+
+    def copier_from(self, source: AddressedDiagram) -> StateCopier:
+        """Copies contexts of ``source`` (this one, or another of the same scenario) to contexts of this one."""
+        return StateCopier(source.diagram, source.variables(), self.diagram, self._variables)
+
+    @cached_property
+    def python_systems(self) -> tuple[str, ...]:
+        """Paths of the systems that are written in Python and have work to do while time runs."""
+        # The board of the switches has no work to do.
+        return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
+
+
+def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:
+    found = []
+    for system in diagram.GetSystems():
+        below = f"{path}.{system.get_name()}".lstrip(".")
+        found.append((below, system))
+        if isinstance(system, Diagram):
+            found += _all_systems(system, below)
+    return found
+
+
+def _port_reader(system: System, port: OutputPort) -> Callable[[Context], Any]:
+    if port.get_data_type() == PortDataType.kVectorValued:
+        return lambda context: np.array(port.Eval(system.GetMyContextFromRoot(context)))
+    return lambda context: port.EvalAbstract(system.GetMyContextFromRoot(context)).Clone().get_value()

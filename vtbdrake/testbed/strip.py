@@ -1,0 +1,86 @@
+"""The DPS alone, as it runs on the robot: the same System, without the simulated world around it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import ConstantVectorSource
+
+from vtbdrake.state import Variable, collect
+from vtbdrake.state.copying import StateCopier
+from vtbdrake.state.variable import X
+from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.config import SimulatorFields
+from vtbdrake.testbed.signal import Interface
+from vtbdrake.testbed.switch import BOARD, REAL, Switches
+
+if TYPE_CHECKING:
+    from vtbdrake.testbed.scenario import Scenario
+    from vtbdrake.testbed.testbed import VirtualTestbed
+
+
+class DpsAlone(AddressedDiagram):
+    """The DPS of a scenario without its simulated world, and with the same boundary to the machine as the testbed.
+
+    What the DPS needs to know of the world (a map, a model of the robot) is part of the DPS, and stays. Every actuator
+    signal commands: ``real.act.active`` is 1 throughout.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        scenario.validate()
+        interface = scenario.interface()
+        parts = VirtualTestbedBuilder(interface)
+        dps = parts.set_dps(scenario.make_dps())
+        builder = parts.builder
+        u = {s.name: s.vector(0.0 if s.default is None else s.default) for s in interface.commands}
+        board = Switches(builder, Interface((), ()), REAL, REAL, dps, u)
+        for name, port in board.commands.items():
+            builder.Connect(port, dps.GetInputPort(name))
+        for signal in interface.sense:
+            builder.ExportInput(dps.GetInputPort(signal.name), f"real.sense.{signal.name}")
+        for signal in interface.act:
+            builder.ExportOutput(dps.GetOutputPort(signal.name), f"real.act.{signal.name}")
+        if interface.act:
+            active = builder.AddNamedSystem("T_act.active", ConstantVectorSource(np.ones(len(interface.act))))
+            builder.ExportOutput(active.get_output_port(), "real.act.active")
+        diagram = builder.Build()
+        diagram.set_name("dps_alone")
+        clock = Variable("time", X, (), "s", lambda context: context.get_time())
+        super().__init__(
+            diagram=diagram,
+            interface=interface,
+            dps=dps,
+            simulator=_without_plant(scenario.simulator),
+            scenario=scenario,
+            variables=collect(
+                diagram,
+                skip=lambda path: path in (BOARD, "T_act.active"),
+                extra=[clock, *board.command_variables(interface.commands)],
+            ),
+        )
+        self._copiers: dict[int, StateCopier] = {}
+
+    def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:
+        """A context in which the DPS goes on from where it is in a context of its testbed, at the same time."""
+        own = self.default_context()
+        if id(testbed) not in self._copiers:
+            self._copiers[id(testbed)] = StateCopier(
+                testbed.diagram,
+                testbed.variables(),
+                self.diagram,
+                self.variables(),
+                only=lambda path: path == "dps" or path.startswith("dps."),
+            )
+        self._copiers[id(testbed)].copy(context, own)
+        commands = [f"u.{signal.name}" for signal in self.interface.commands]
+        self.write(own, {a: testbed.read(context, a) for a in commands if a in testbed.variables()})
+        return own
+
+
+def _without_plant(fields: SimulatorFields) -> SimulatorFields:
+    # CENIC integrates a MultibodyPlant, and there is none.
+    return replace(fields, integration_scheme="runge_kutta3") if fields.integration_scheme == "cenic" else fields
