@@ -9,7 +9,7 @@ from vtbdrake.testbed import DpsAlone
 
 
 def closed_loop_then_alone(scenario, *, until, more, period):
-    """Outputs of the DPS in its testbed, and of the DPS alone fed with the same sensor values, after ``until`` periods."""
+    """Outputs of the DPS in its testbed, and alone with the same sensor values, from ``until`` periods on."""
     testbed, alone = scenario.build(), DpsAlone(scenario)
     simulator = testbed.simulator()
     simulator.AdvanceTo(until * period)
@@ -26,7 +26,7 @@ def closed_loop_then_alone(scenario, *, until, more, period):
         for signal in scenario.interface().act:
             pairs.append(
                 (
-                    testbed.read(simulator.get_context(), f"dps.{signal.name}"),
+                    np.ravel(testbed.read(simulator.get_context(), f"dps.{signal.name}")),
                     alone.read(mine.get_context(), f"real.act.{signal.name}"),
                 )
             )
