@@ -11,7 +11,7 @@ import numpy as np
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.solvers.batch import BatchSolver
 from vtbdrake.optimization.solvers.cmaes_solver import CmaEs, default_population
-from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
+from vtbdrake.optimization.solvers.designs import Design, Grid, Listed, Sobol, discrete_size
 from vtbdrake.optimization.solvers.drake_solvers import NloptDerivativeFree
 from vtbdrake.optimization.solvers.optuna_samplers import OptunaSolver
 from vtbdrake.optimization.solvers.ranking import best_of, rank_key
@@ -126,7 +126,7 @@ class Auto(BatchSolver):
         if fruitless == PATIENCE:
             self._end(True, f"{PATIENCE} starts in a row found nothing better")
         else:
-            self._end(False, f"the budget of {search.budget} evaluations was spent before it converged")
+            self._spent()
 
     def _begin_global(self, start: int) -> None:
         """The start-th global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
@@ -219,6 +219,13 @@ class Auto(BatchSolver):
             return after is not None
         (kind, cost), (kind_before, cost_before) = rank_key(after), rank_key(before)
         return kind < kind_before or (kind == kind_before and cost < cost_before - PROGRESS * self._spread)
+
+    def _spent(self) -> None:
+        # A design that is as long as the budget is complete.
+        if isinstance(self._solver, Design) and not self._solver.ask():
+            self._end(True, self._solver.message)
+        else:
+            super()._spent()
 
     def close(self) -> None:
         self._solver.close()

@@ -39,11 +39,15 @@ class BatchSolver(Solver):
         self._message = message
         self.close()
 
+    def _spent(self) -> None:
+        """The budget is spent, and it did not end before."""
+        self._end(False, f"the budget of {self.search.budget} evaluations is spent")
+
     def ask(self) -> list[Point]:
         if self._asked:
             raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
         if self._success is None and self._left == 0:
-            self._end(False, f"the budget of {self.search.budget} evaluations was spent before it converged")
+            self._spent()
         if self._success is not None:
             return []
         points = self._next()

@@ -170,9 +170,7 @@ class GradientProgramSolver(ProgramSolver):
         if gradient == AUTODIFF and search.constraints:
             raise SolverError(f"constraints need gradient='central': {AUTODIFF} gives the objective's only")
         if step is not None and (gradient == AUTODIFF or not 0.0 < step <= 0.25):
-            raise SolverError(
-                f"step is of differences, a part of the range in (0, 0.25], not {step} of {gradient}"
-            )
+            raise SolverError(f"step is of differences, a part of the range in (0, 0.25], not {step} of {gradient}")
         super().__init__(search, name=name, tolerance=tolerance, feasibility=feasibility, solver_options=solver_options)
         self.wants_gradient = gradient == AUTODIFF
         self._gradient = gradient

@@ -85,7 +85,7 @@ UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
 # These do not survive an exception in their callback: they go on for ever, or crash the process. When they are closed,
 # they are given the same value everywhere instead, and run to their end or to this number of calls.
 NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "LN_NEWUOA", "LN_NEWUOA_BOUND"})
-LIMIT = 5_000
+LIMIT = 2_000
 
 # How NLopt names the number that it returns.
 RESULTS = {

@@ -1,0 +1,226 @@
+"""Names, options and problems that a solver takes or refuses; designs; the choices of auto."""
+
+import itertools
+import logging
+import re
+import sys
+
+import numpy as np
+import pytest
+from pydrake.solvers import MathematicalProgram, NloptSolver, SolverOptions
+
+from tests.optimization.solvers.driver import ACKLEY, ROSENBROCK, SPHERE, drive, evaluation
+from vtbdrake.optimization.parameter import Choice, Parameter
+from vtbdrake.optimization.solvers import SolverError, known_solvers, make_solver
+from vtbdrake.optimization.solvers.nlopt_algorithms import DERIVATIVE_FREE, WITH_DERIVATIVES
+
+COUNT = Parameter("count", 1, 6, integer=True)
+KIND = Choice("kind", ["up", "down"])
+X = Parameter("x", 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("written", "canonical"),
+    [
+        ("cmaes", "CMA-ES"),
+        ("CMA_ES", "CMA-ES"),
+        ("tpe", "TPE"),
+        ("nsga2", None),
+        ("nsga-ii", "NSGA-II"),
+        ("ln_bobyqa", "LN_BOBYQA"),
+        ("Snopt", "SNOPT"),
+        ("Latin Hypercube", "latin-hypercube"),
+    ],
+)
+def test_names_are_found_however_written(written, canonical):
+    if canonical is None:
+        with pytest.raises(SolverError, match="did you mean 'NSGA-II'"):
+            make_solver(written, [X])
+    else:
+        assert make_solver(written, [X]).name == canonical
+
+
+def test_an_unknown_solver_is_told_all_that_are_known():
+    with pytest.raises(SolverError, match="no solver 'LN_BOBIQA'; did you mean 'LN_BOBYQA'") as caught:
+        make_solver("LN_BOBIQA", [X])
+    assert all(name in str(caught.value) for name in known_solvers())
+
+
+def test_an_unknown_option_is_never_ignored():
+    with pytest.raises(SolverError, match="CMA-ES has no option 'popsize'; it has .*'population'"):
+        make_solver("CMA-ES", [X], popsize=4)
+    with pytest.raises(SolverError, match="LN_COBYLA has no option 'step'"):
+        make_solver("LN_COBYLA", [X], step=1e-3)
+    with pytest.raises(SolverError, match="TPE of Optuna: .*n_starts"):
+        make_solver("TPE", [X], sampler_options={"n_starts": 3})
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("SNOPT", {"space": [X, COUNT]}, "SNOPT varies continuous parameters, but count is an integer; CMA-ES"),
+        ("LN_BOBYQA", {"space": [KIND]}, "LN_BOBYQA varies numbers, but kind is one of .*; TPE or grid"),
+        ("CMA-ES", {"space": [X, KIND]}, "CMA-ES varies numbers, but kind"),
+        ("IPOPT", {"objectives": 2}, "IPOPT takes one objective, not 2; NSGA-II"),
+        ("LN_BOBYQA", {"constraints": 1}, "LN_BOBYQA knows no constraints, and there are 1; CMA-ES"),
+        ("LD_MMA", {"constraints": 1}, "LD_MMA knows no constraints"),
+        ("QMC", {"constraints": 2}, "QMC knows no constraints"),
+        ("sobol", {"start": (0.5,)}, "sobol does not start at a point"),
+        ("SNOPT", {"start": (0.5, 0.5)}, "one value per parameter, 1, not 2"),
+        ("SNOPT", {"start": (7.0,)}, "x = 7 lies outside its range"),
+        ("SNOPT", {"gradient": "autodiff", "constraints": 1}, "constraints need gradient='central'"),
+        ("SNOPT", {"gradient": "backward"}, "gradient is one of"),
+        ("SNOPT", {"step": 0.6}, "a part of the range"),
+        ("CMA-ES", {"population": 2}, "at least 3"),
+        ("CMA-ES", {"seed": -1}, "a seed is a whole number"),
+        ("CMA-ES", {"budget": 0}, "at least one evaluation"),
+        ("random", {"space": []}, "no parameter to vary"),
+        ("grid", {"budget": 10, "points": 11}, "the grid has 11 points, and the budget is 10"),
+        ("grid", {"points": {"y": 3}}, r"\['y'\], which is no parameter"),
+        ("sobol", {"budget": 10, "points": 11}, "the design has 11 points, and the budget is 10"),
+    ],
+)
+def test_what_a_solver_cannot_do_is_refused_by_name(name, arguments, message):
+    with pytest.raises(SolverError, match=message):
+        make_solver(name, arguments.pop("space", [X]), **arguments)
+
+
+def test_a_missing_optuna_names_the_extra(monkeypatch):
+    # None in sys.modules is how Python itself marks a module that cannot be imported.
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ModuleNotFoundError, match=re.escape("pip install 'vtbdrake[optuna]'")):
+        make_solver("auto", [KIND, X])
+
+
+def test_every_algorithm_that_drake_lists_is_offered_or_known_to_be_of_no_use():
+    options = SolverOptions()
+    options.SetOption(NloptSolver.id(), NloptSolver.AlgorithmName(), "?")
+    program = MathematicalProgram()
+    variables = program.NewContinuousVariables(1)
+    program.AddCost(lambda x: x[0] ** 2, vars=variables)
+    with pytest.raises(RuntimeError) as caught:
+        NloptSolver().Solve(program, [0.5], options)
+    listed = set(re.findall(r"\b[A-Z][A-Z0-9_]+", str(caught.value).split("valid choices are:")[1]))
+    useless = {"AUGLAG", "AUGLAG_EQ", "G_MLSL", "G_MLSL_LDS"}
+    useless |= {name for name in listed if re.search("LD_(LBFGS|VAR|TNEWTON)", name)}
+    assert set(DERIVATIVE_FREE) | set(WITH_DERIVATIVES) == listed - useless
+
+
+def test_optuna_is_silenced_for_itself_only():
+    import optuna
+
+    said = []
+    handler = logging.Handler()
+    handler.emit = said.append
+    optuna.logging.get_verbosity()
+    logging.getLogger("optuna").addHandler(handler)
+    try:
+        drive(make_solver("TPE", [X, KIND]), lambda p: p[0], limit=20)
+        assert said == []
+        optuna.create_study()
+        assert len(said) == 1
+    finally:
+        logging.getLogger("optuna").removeHandler(handler)
+
+
+# -------------------------------------------------------------------------------------------- designs
+
+
+def _points(solver):
+    return [told.point for told in drive(solver, lambda p: 0.0)]
+
+
+def test_a_grid_takes_all_values_of_integers_and_choices():
+    points = _points(make_solver("grid", [X, COUNT, KIND], points=3))
+    assert points == list(itertools.product((0.0, 0.5, 1.0), range(1, 7), ("up", "down")))
+
+
+def test_a_grid_is_as_fine_as_its_budget_allows():
+    solver = make_solver("grid", [X, Parameter("y", 1.0, 100.0, log=True), KIND], budget=60)
+    points = _points(solver)
+    assert len(points) == 5 * 5 * 2
+    np.testing.assert_allclose(sorted({p[1] for p in points}), 10.0 ** np.array([0.0, 0.5, 1.0, 1.5, 2.0]))
+    assert solver.success is True
+
+
+def test_sobol_points_are_balanced_and_the_same_however_many():
+    points = np.array(_points(make_solver("sobol", [X, Parameter("y", -1.0, 3.0)], seed=7)))
+    assert len(points) == 128
+    # Each of 128 equal slices of each range holds one point: a digital net in base 2.
+    slices = np.floor((points - [0.0, -1.0]) / [1.0, 4.0] * 128).astype(int)
+    assert all(sorted(column) == list(range(128)) for column in slices.T)
+    few = _points(make_solver("sobol", [X, Parameter("y", -1.0, 3.0)], seed=7, points=70))
+    np.testing.assert_array_equal(few, points[:70])
+
+
+def test_a_latin_hypercube_has_one_point_in_each_slice():
+    points = np.array(_points(make_solver("latin-hypercube", [X, Parameter("y", -1.0, 3.0)], budget=50)))
+    slices = np.floor((points - [0.0, -1.0]) / [1.0, 4.0] * 50).astype(int)
+    assert all(sorted(column) == list(range(50)) for column in slices.T)
+
+
+# -------------------------------------------------------------------------------------------- auto
+
+
+@pytest.mark.parametrize(
+    ("space", "arguments", "method"),
+    [
+        ([X, KIND], {}, "TPE"),
+        ([X], {"objectives": 2}, "NSGA-II"),
+        ([COUNT, KIND], {}, "grid"),
+        ([COUNT, KIND], {"budget": 12}, "grid"),
+        ([COUNT, KIND], {"budget": 11}, "TPE"),
+        ([X, COUNT], {"budget": 10_000}, "sobol"),
+    ],
+)
+def test_auto_chooses_by_the_problem(space, arguments, method):
+    solver = make_solver("auto", space, **arguments)
+    assert solver.ask()
+    assert solver.method == method
+
+
+def test_auto_spends_a_tiny_budget_on_the_design_alone():
+    solver = make_solver("auto", SPHERE.space, budget=40)
+    assert len(drive(solver, SPHERE.cost)) == 40
+    assert solver.changes == ((0, "sobol"),)
+    assert solver.success is True
+
+
+def test_auto_starts_anew_with_larger_populations_and_another_method():
+    solver = make_solver("auto", ACKLEY.space, budget=4000)
+    methods = []
+    while points := solver.ask():
+        if solver.method not in methods:
+            methods.append(solver.method)
+        solver.tell([evaluation(p, ACKLEY.cost) for p in points])
+    assert [method for _, method in solver.changes] == methods
+    assert methods[:4] == [
+        "sobol",
+        "CMA-ES, start 1, population 7",
+        "CMA-ES, start 2, population 14",
+        "differential-evolution, start 3",
+    ]
+    assert methods[-1] == "LN_BOBYQA, polish"
+
+
+def test_auto_leaves_a_search_that_stalls():
+    # A plateau with noise below the criterion: CMA-ES alone would go on.
+    spread = 1.0
+    solver = make_solver("auto", ROSENBROCK.space)
+
+    def cost(p):
+        return spread * (p[0] > 0.2) + 1e-9 * np.sin(1e6 * p[0] + 3e6 * p[1])
+
+    drive(solver, cost)
+    (_, _), (begin, first), (end, _) = solver.changes[:3]
+    assert first.startswith("CMA-ES, start 1")
+    # 20 generations of 6 and 30 n, from the first value of the plateau.
+    assert 20 * 6 + 30 * 2 <= end - begin <= 20 * 6 + 30 * 2 + 5 * 6
+    assert solver.success is True
+    assert solver.message == "5 starts in a row found nothing better"
+
+
+def test_auto_judges_the_given_start_first():
+    solver = make_solver("auto", SPHERE.space, start=(3.0, 3.5))
+    assert solver.ask() == [(3.0, 3.5)]
+    solver.close()

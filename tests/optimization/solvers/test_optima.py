@@ -1,0 +1,161 @@
+"""Solvers find optima that are known."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.optimization.solvers.driver import (
+    ACKLEY,
+    BRANIN,
+    CONSTRAINED,
+    ROSENBROCK,
+    SPHERE,
+    Function,
+    drive,
+    half_plane,
+    solve,
+)
+from vtbdrake.optimization.parameter import Choice, Parameter
+from vtbdrake.optimization.solvers import make_solver
+from vtbdrake.optimization.solvers.nlopt_algorithms import (
+    DERIVATIVE_FREE,
+    SEEDED_BY_CLOCK,
+    UNTIL_LIMIT,
+    WITH_CONSTRAINTS,
+    WITH_DERIVATIVES,
+)
+
+LOCAL = ["SNOPT", "IPOPT", "LD_SLSQP", "LN_BOBYQA", "LN_NELDERMEAD"]
+
+
+@pytest.mark.parametrize("name", ["CMA-ES", "differential-evolution", "auto", *LOCAL])
+@pytest.mark.parametrize("function", [SPHERE, ROSENBROCK], ids=["sphere", "rosenbrock"])
+def test_it_converges_to_the_minimum_of_a_valley(name, function):
+    options = {"tolerance": 1e-6} if name == "differential-evolution" else {}
+    solver, best = solve(name, function, **options)
+    assert solver.success is True
+    np.testing.assert_allclose(best.point, function.best, atol=2e-3)
+    assert -best.values[0] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in (*DERIVATIVE_FREE, *WITH_DERIVATIVES) if name not in UNTIL_LIMIT])
+def test_every_algorithm_of_nlopt_comes_near_the_minimum(name):
+    solver, best = solve(name, SPHERE, limit=1500)
+    np.testing.assert_allclose(best.point, SPHERE.best, atol=0.5 if name in SEEDED_BY_CLOCK else 0.05)
+
+
+@pytest.mark.parametrize("name", ["auto", "differential-evolution"])
+def test_global_solvers_find_the_deepest_of_many_minima(name):
+    solver, best = solve(name, ACKLEY, seed=3)
+    assert solver.success is True
+    np.testing.assert_allclose(best.point, ACKLEY.best, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["auto", "CMA-ES", "GN_DIRECT_L", "TPE"])
+def test_global_solvers_find_the_value_of_branin(name):
+    _, best = solve(name, BRANIN, budget=240)
+    assert -best.values[0] == pytest.approx(BRANIN.lowest, abs=0.1 if name == "TPE" else 2e-3)
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *WITH_CONSTRAINTS])
+def test_under_a_constraint_it_finds_the_kkt_point_and_keeps_the_constraint(name):
+    options = {"tolerance": 1e-5} if name == "differential-evolution" else {}
+    solver, best = solve(name, CONSTRAINED, violations=half_plane, limit=4000, **options)
+    coarse = name in ("GN_ISRES", "GN_AGS", "GN_ORIG_DIRECT")
+    np.testing.assert_allclose(best.point, CONSTRAINED.best, atol=0.3 if coarse else 2e-3)
+    assert best.violations[0] <= 0.0
+    if solver.success:
+        np.testing.assert_allclose(best.point, CONSTRAINED.best, atol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "LD_SLSQP", "LN_COBYLA"])
+def test_an_optimum_at_the_bounds_is_found(name):
+    function = Function(lambda p: (p[0] - 9.0) ** 2 + np.exp(p[1]), SPHERE.space, (4.0, -3.0))
+    solver, best = solve(name, function)
+    np.testing.assert_allclose(best.point, (4.0, -3.0), atol=1e-5)
+    assert solver.success is True
+
+
+@pytest.mark.parametrize("name", ["CMA-ES", "auto", "TPE"])
+def test_a_mixed_problem_agrees_with_brute_force(name):
+    space = (Parameter("n", -7, 12, integer=True), Parameter("x", -2.0, 2.0), Parameter("k", 1, 40, integer=True))
+
+    def cost(p):
+        n, x, k = p
+        return 0.3 * (n - 4.4) ** 2 + (x - 0.1 * n) ** 2 + 0.05 * (k - 3 * n) ** 2
+
+    # For given integers, x = 0.1 n.
+    brute = min(itertools.product(range(-7, 13), range(1, 41)), key=lambda p: cost((p[0], 0.1 * p[0], p[1])))
+    solver = make_solver(name, space, budget=150 if name == "TPE" else 400)
+    best = max(drive(solver, cost), key=lambda e: e.values[0])
+    assert all(type(value) is kind for value, kind in zip(best.point, (int, float, int), strict=True))
+    if name == "TPE":
+        assert abs(best.point[0] - brute[0]) <= 2
+    else:
+        assert (best.point[0], best.point[2]) == brute
+        assert best.point[1] == pytest.approx(0.1 * brute[0], abs=1e-3)
+
+
+def test_a_categorical_parameter_is_chosen_rightly():
+    space = (Choice("kind", ["up", "down", "left"]), Parameter("x", 0.0, 1.0), Choice("flag", [True, 1, 2.5]))
+
+    def cost(p):
+        kind, x, flag = p
+        return {"up": 2.0, "down": 0.0, "left": 1.0}[kind] + (x - 0.25) ** 2 + (0.0 if flag is True else 0.7)
+
+    solver = make_solver("auto", space, budget=120)
+    assert solver.method == "TPE"
+    best = max(drive(solver, cost), key=lambda e: e.values[0])
+    assert best.point[0] == "down" and best.point[2] is True
+    assert best.point[1] == pytest.approx(0.25, abs=0.1)
+
+
+def test_one_parameter_is_enough_for_every_method_of_auto():
+    function = Function(lambda p: abs(p[0] - 0.3), (Parameter("x", -1.0, 2.0),), (0.3,))
+    solver, best = solve("auto", function)
+    assert solver.success is True
+    assert best.point[0] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_a_logarithmic_range_is_searched_by_decades():
+    space = (Parameter("gain", 1e-4, 1e4, log=True), Parameter("x", -1.0, 1.0))
+    function = Function(lambda p: (np.log10(p[0]) + 2.0) ** 2 + p[1] ** 2, space, (1e-2, 0.0))
+    for name in ("CMA-ES", "SNOPT"):
+        _, best = solve(name, function)
+        assert best.point[0] == pytest.approx(1e-2, rel=1e-3)
+
+
+# ------------------------------------------------------------------------------------- several objectives
+
+
+def _two_costs(p):
+    """Fonseca and Fleming with two parameters: the front is x = y in [-1/sqrt 2, 1/sqrt 2]."""
+    x = np.array(p)
+    shift = 1.0 / np.sqrt(2.0)
+    return 1.0 - np.exp(-np.sum((x - shift) ** 2)), 1.0 - np.exp(-np.sum((x + shift) ** 2))
+
+
+def _hypervolume(log):
+    """Of two costs, under the reference (1, 1), by a sweep along the first."""
+    volume, ceiling = 0.0, 1.0
+    for first, second in sorted((-e.values[0], -e.values[1]) for e in log):
+        if second < ceiling:
+            volume += (1.0 - first) * (ceiling - second)
+            ceiling = second
+    return volume
+
+
+@pytest.mark.parametrize("name", ["NSGA-II", "auto"])
+def test_a_pareto_front_is_covered_better_than_by_chance(name):
+    space = SPHERE.space
+    t = np.linspace(-1.0, 1.0, 2001) / np.sqrt(2.0)
+    first, second = np.transpose([_two_costs((x, x)) for x in t])
+    ideal = np.trapezoid(1.0 - second[::-1], first[::-1])
+    volumes = {}
+    for solver in (name, "random"):
+        made = make_solver(solver, space, objectives=2, budget=1000, seed=1)
+        volumes[solver] = _hypervolume(drive(made, _two_costs))
+    # The hypervolume of the front cannot be exceeded (1e-3: of the trapezoids).
+    assert 0.9 * ideal < volumes[name] < ideal + 1e-3
+    assert ideal - volumes[name] < 0.6 * (ideal - volumes["random"])

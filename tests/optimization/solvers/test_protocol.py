@@ -1,0 +1,268 @@
+"""What every solver of the catalogue keeps: repetition, replay, budgets, failed simulations, an end without remains."""
+
+import importlib.util
+import itertools
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from tests.optimization.solvers.driver import ROSENBROCK, SPHERE, drive, evaluation, solve
+from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.solvers import Evaluation, Solver, SolverError, known_solvers, make_solver
+from vtbdrake.optimization.solvers.blocking import BlockingSolver
+from vtbdrake.optimization.solvers.search import Search
+
+INSTALLED = [name for name in known_solvers() if name != "GP" or importlib.util.find_spec("torch")]
+REPRODUCIBLE = [name for name in INSTALLED if make_solver(name, SPHERE.space).reproducible]
+BLOCKING = [name for name in INSTALLED if isinstance(make_solver(name, SPHERE.space), BlockingSolver)]
+SEEDED = ["sobol", "latin-hypercube", "random", "CMA-ES", "differential-evolution", "TPE", "NSGA-II", "QMC", "auto"]
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left():
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) == before
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_it_asks_for_points_of_the_space_within_its_budget(name):
+    solver = make_solver(name, ROSENBROCK.space, budget=90)
+    log = drive(solver, ROSENBROCK.cost)
+    assert 1 <= len(log) <= 90
+    for told in log:
+        assert [parameter.check(value) for parameter, value in zip(ROSENBROCK.space, told.point, strict=True)] == [
+            *told.point
+        ]
+    assert solver.success is not None and solver.message
+    assert solver.ask() == []
+
+
+@pytest.mark.parametrize("name", REPRODUCIBLE)
+def test_the_same_seed_asks_for_the_same_points(name):
+    first, second = (drive(make_solver(name, ROSENBROCK.space, seed=5), ROSENBROCK.cost, limit=80) for _ in range(2))
+    assert first == second
+
+
+@pytest.mark.parametrize("name", SEEDED)
+def test_another_seed_asks_for_other_points(name):
+    first, second = (drive(make_solver(name, ROSENBROCK.space, seed=seed), ROSENBROCK.cost, limit=1) for seed in (1, 2))
+    assert not {told.point for told in first} & {told.point for told in second}
+
+
+@pytest.mark.parametrize("name", REPRODUCIBLE)
+def test_told_again_it_goes_on_where_another_stopped(name):
+    whole = drive(make_solver(name, ROSENBROCK.space, seed=9), ROSENBROCK.cost, limit=100)
+    again = make_solver(name, ROSENBROCK.space, seed=9)
+    known = {told.point: told for told in whole[:60]}
+    log = []
+    while (points := again.ask()) and len(log) + len(points) <= len(whole):
+        told = [known[p] if p in known else evaluation(p, ROSENBROCK.cost) for p in points]
+        log += told
+        again.tell(told)
+    again.close()
+    assert len(log) > 0.6 * len(whole)
+    assert log == whole[: len(log)]
+
+
+def test_the_algorithms_that_are_not_reproducible_are_those_of_the_clock():
+    clock = set(INSTALLED) - set(REPRODUCIBLE)
+    assert clock == {
+        name for name in INSTALLED if "RAND" in name or name in {"GD_MLSL", "GN_MLSL", "GN_CRS2_LM", "GN_ESCH"}
+    } | {"GN_ISRES", "LN_PRAXIS"}
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_failed_simulations_are_survived(name):
+    solver = make_solver(name, SPHERE.space, seed=2, budget=120)
+    log = drive(solver, SPHERE.cost, fails=lambda p: p[0] < 0.1 or p[1] > 1.2)
+    assert any(told.failed for told in log) or len(log) < 120
+    assert max(told.values[0] for told in log if not told.failed) > -6.0
+
+
+@pytest.mark.parametrize("name", ["CMA-ES", "auto", "differential-evolution", "LN_NELDERMEAD", "SNOPT", "GN_DIRECT_L"])
+def test_it_finds_the_optimum_beside_a_region_where_simulations_fail(name):
+    solver = make_solver(name, SPHERE.space, budget=1200)
+    log = drive(solver, SPHERE.cost, fails=lambda p: p[1] > 1.2 or p[0] < -1.0)
+    best = max((told for told in log if not told.failed), key=lambda told: told.values[0])
+    np.testing.assert_allclose(best.point, SPHERE.best, atol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP", "LN_BOBYQA", "LN_COBYLA", "CMA-ES"])
+def test_where_every_simulation_fails_nothing_reports_success(name):
+    solver = make_solver(name, SPHERE.space, budget=2000)
+    log = drive(solver, SPHERE.cost, fails=lambda p: True)
+    assert all(told.failed for told in log)
+    assert solver.success is False
+
+
+def test_a_failed_start_is_named():
+    solver = make_solver("SNOPT", SPHERE.space, start=(-2.0, 1.0))
+    drive(solver, SPHERE.cost, fails=lambda p: p[0] < 0.0)
+    assert solver.success is False
+    assert "failed at the start (-2.0, 1.0)" in solver.message
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_points_given_by_hand_are_taken_and_change_nothing_that_was_asked(name):
+    solver = make_solver(name, SPHERE.space, budget=200)
+    by_hand = evaluation((1.0, -0.5), SPHERE.cost)
+    solver.tell([by_hand])
+    for _ in range(3):
+        points = solver.ask()
+        solver.tell([*(evaluation(p, SPHERE.cost) for p in points), by_hand, Evaluation((0.0, 0.0), (np.nan,))])
+    solver.close()
+
+
+def test_tpe_learns_from_points_given_by_hand():
+    space = SPHERE.space
+    spread = [told.point for told in drive(make_solver("sobol", space, points=60), SPHERE.cost)]
+    near = [(1.0 + 0.02 * i, -0.5 - 0.02 * i) for i in range(-5, 6)]
+
+    def typical_cost(given):
+        solver = make_solver("TPE", space, seed=4)
+        solver.tell([evaluation(point, SPHERE.cost) for point in given])
+        return np.median([SPHERE.cost(told.point) for told in drive(solver, SPHERE.cost, limit=20)])
+
+    assert typical_cost([*spread, *near]) < 0.3 * typical_cost([])
+
+
+def test_auto_begins_its_search_at_a_good_point_given_by_hand():
+    solver = make_solver("auto", ROSENBROCK.space)
+    solver.tell([evaluation((1.0, 1.0), ROSENBROCK.cost)])
+    points = solver.ask()
+    solver.tell([evaluation(p, ROSENBROCK.cost) for p in points])
+    generation = solver.ask()
+    assert solver.method.startswith("CMA-ES, start 1")
+    # The normal distribution has its mean there, and a width of 0.3 of the range.
+    near = np.mean(generation, axis=0) - 1.0
+    assert np.all(np.abs(near) < 0.3 * 4.5 * 2.0 / np.sqrt(len(generation)))
+    solver.close()
+
+
+@pytest.mark.parametrize("name", SEEDED)
+def test_it_refuses_to_be_told_of_other_points_than_it_asked_for(name):
+    solver = make_solver(name, SPHERE.space, budget=200)
+    points = solver.ask()
+    with pytest.raises(SolverError, match="not told yet"):
+        solver.ask()
+    with pytest.raises(SolverError, match="to be told of those first"):
+        solver.tell([evaluation((0.123, 0.456), SPHERE.cost)] * len(points))
+    with pytest.raises(SolverError, match="1 values, not 2"):
+        solver.tell([Evaluation(p, (0.0, 0.0)) for p in points])
+    solver.close()
+
+
+@pytest.mark.parametrize("name", BLOCKING)
+@pytest.mark.parametrize("batches", [0, 3])
+def test_closed_in_mid_run_it_leaves_no_thread(name, batches):
+    solver = make_solver(name, ROSENBROCK.space)
+    for _ in range(batches):
+        solver.tell([evaluation(p, ROSENBROCK.cost) for p in solver.ask()])
+    solver.ask()
+    solver.close()
+    # Once more does no harm.
+    solver.close()
+    assert not any("solver" in thread.name for thread in threading.enumerate())
+
+
+def test_a_program_that_forgets_to_close_ends_nevertheless():
+    program = (
+        "from vtbdrake.optimization.parameter import Parameter\n"
+        "from vtbdrake.optimization.solvers import make_solver\n"
+        "solvers = [make_solver(n, [Parameter('x', 0, 1)]) for n in ('SNOPT', 'IPOPT', 'LN_COBYLA')]\n"
+        "print([len(solver.ask()) for solver in solvers])\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout.strip()) == (0, "[3, 3, 1]"), ended.stderr
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP"])
+def test_several_of_a_kind_run_side_by_side(name):
+    alone = drive(make_solver(name, ROSENBROCK.space), ROSENBROCK.cost)
+    solvers = [make_solver(name, ROSENBROCK.space) for _ in range(3)]
+    logs = [[] for _ in solvers]
+    waiting = set(range(3))
+    while waiting:
+        for i in sorted(waiting):
+            points = solvers[i].ask()
+            told = [evaluation(p, ROSENBROCK.cost) for p in points]
+            logs[i] += told
+            if points:
+                solvers[i].tell(told)
+            else:
+                waiting.discard(i)
+    assert logs == [alone] * 3
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP"])
+def test_an_exception_in_the_solvers_thread_reaches_ask_as_itself(name):
+    solver = make_solver(name, SPHERE.space, gradient="autodiff")
+    assert solver.wants_gradient
+    # No gradient is told, which only the solver's callback finds out.
+    solver.tell([evaluation(p, SPHERE.cost) for p in solver.ask()])
+    with pytest.raises(SolverError, match="was told of no gradient"):
+        solver.ask()
+    assert solver.success is False
+
+
+def test_an_exception_of_any_kind_reaches_ask_as_itself():
+    class Broken(BlockingSolver):
+        def _solve(self):
+            self._at(np.array([0.5, 0.5]))
+            raise ZeroDivisionError("in the method")
+
+    solver = Broken(Search(SPHERE.space), name="broken")
+    solver.tell([evaluation(p, SPHERE.cost) for p in solver.ask()])
+    with pytest.raises(ZeroDivisionError, match="in the method"):
+        solver.ask()
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP"])
+def test_gradients_that_are_told_are_used_in_the_units_of_the_parameters(name):
+    space = (Parameter("gain", 1e-2, 1e3, log=True), Parameter("x", -3.0, 4.0))
+    solver = make_solver(name, space, gradient="autodiff")
+    asked = 0
+    while points := solver.ask():
+        (point,) = points
+        gain, x = point
+        asked += 1
+        value = -((np.log(gain) - 1.0) ** 2) - (x - 0.5) ** 2
+        gradient = (-2.0 * (np.log(gain) - 1.0) / gain, -2.0 * (x - 0.5))
+        solver.tell([Evaluation(point, (value,), gradient=gradient)])
+    assert solver.success is True
+    np.testing.assert_allclose(point, (np.e, 0.5), rtol=1e-4)
+    assert asked < 40
+
+
+@pytest.mark.parametrize(("gradient", "neighbours"), [("central", 4), ("forward", 2)])
+def test_a_point_and_its_neighbours_are_one_batch_within_the_range(gradient, neighbours):
+    for start in itertools.product((-3.0, 0.5, 4.0), (-3.0, 4.0)):
+        solver = make_solver("SNOPT", SPHERE.space, start=start, gradient=gradient)
+        points = solver.ask()
+        assert len(set(points)) == 1 + neighbours
+        assert points[0] == start
+        assert np.min(points) >= -3.0 and np.max(points) <= 4.0
+        solver.close()
+
+
+def test_a_budget_that_ends_a_local_solver_is_no_success():
+    for name in ("SNOPT", "IPOPT", "LN_BOBYQA", "GN_DIRECT_L", "GD_STOGO", "CMA-ES"):
+        solver, best = solve(name, ROSENBROCK, budget=37)
+        assert solver.success is False
+        assert solver.message == "the budget of 37 evaluations is spent"
+
+
+def test_infeasible_points_rank_by_their_violation():
+    # Only 1 in 500 of the box is feasible: found by following the violations, without any value to help.
+    solver = make_solver("CMA-ES", SPHERE.space, constraints=1, seed=1)
+    log = drive(solver, lambda p: 0.0, violations=lambda p: ((p[0] - 3.5) ** 2 + (p[1] + 2.5) ** 2 - 0.03,))
+    assert any(told.feasible for told in log)
+
+
+def test_a_solver_is_abstract():
+    with pytest.raises(TypeError, match="abstract"):
+        Solver()
