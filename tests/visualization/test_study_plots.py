@@ -11,7 +11,7 @@ from matplotlib.cbook import STEP_LOOKUP_MAP
 from matplotlib.figure import Figure
 
 from tests.optimization.studies import RATE, THETA, pendulum_problem
-from tests.visualization.recorded import point, recorded
+from tests.optimization.recorded import point, recorded
 from vtbdrake.optimization import Choice, Parameter, Study
 from vtbdrake.visualization.study_plots import (
     plot_history,

@@ -6,6 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,7 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
         StudyError: the storage cannot be opened, or is the file of this study; or ``name`` is another study there.
     """
     optuna = import_optuna("an export to Optuna")
-    trials, outcomes = study.trials, study.rollouts
+    trials, outcomes, finished = study.trials, study.rollouts, study.finished
     with quiet():
         opened = _open(optuna, storage, but=study.path)
         exported = _exported(optuna, opened, study, name)
@@ -51,8 +52,11 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
             if there[key]:
                 there[key] -= 1
             else:
-                rollouts = [outcomes[row] for row in _rows(trial, study) if row in outcomes]
-                new.append(_frozen(optuna, trial, params, distributions, rollouts, objectives=len(study.names)))
+                rows = [row for row in _rows(trial, study) if row in outcomes]
+                rollouts = [outcomes[row] for row in rows]
+                frozen = _frozen(optuna, trial, params, distributions, rollouts, objectives=len(study.names))
+                _date(frozen, [(outcomes[row].wall_time, finished[row]) for row in rows if row in finished])
+                new.append(frozen)
         insert_trials(exported, opened, new)
     return exported
 
@@ -202,6 +206,15 @@ def _frozen(
         system_attrs={} if failed or not trial.violations else {"constraints": list(trial.violations)},
     )
     return frozen
+
+
+def _date(frozen: FrozenTrial, rollouts: Sequence[tuple[float, datetime]]) -> None:
+    """Says when the rollouts, each (seconds that it took, when it was finished), were begun and finished."""
+    # Optuna's times are local, and say nothing of the zone.
+    local = [(seconds, at.astimezone().replace(tzinfo=None)) for seconds, at in rollouts if math.isfinite(seconds)]
+    if local:
+        frozen.datetime_start = min(at - timedelta(seconds=seconds) for seconds, at in local)
+        frozen.datetime_complete = max(at for _, at in local)
 
 
 def _plain(numbers: Iterable[float]) -> list[float | None]:

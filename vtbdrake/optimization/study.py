@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
+from datetime import datetime
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -288,6 +289,11 @@ class Study:
         """All finished rollouts by (point, number of the condition), as they are in the file now."""
         return self._file.outcomes()
 
+    @property
+    def finished(self) -> dict[Row, datetime]:
+        """When each rollout was finished, in UTC."""
+        return self._file.finished()
+
     def __len__(self) -> int:
         """How many rollouts there are."""
         return self._file.count()
@@ -384,7 +390,7 @@ class Study:
         return study_plots.plot_slices(self)
 
     def plot_importances(self) -> Figure:
-        """How much of the quality's variation each parameter explains; needs the extra ``optuna``."""
+        """How much each parameter decides about whether a point is among the best; needs the extra ``optuna``."""
         from vtbdrake.visualization import study_plots
 
         return study_plots.plot_importances(self)

@@ -9,6 +9,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,11 @@ class StudyFile:
             )
             for point, condition, h, value, measures, t, end, message, wall in self._read(query + " ORDER BY rowid")
         }
+
+    def finished(self) -> dict[tuple[Point, int], datetime]:
+        """When each rollout was finished, in UTC."""
+        rows = self._read("SELECT point, condition, finished FROM rollouts")
+        return {(decode(point), condition): datetime.fromisoformat(at) for point, condition, at in rows}
 
     def count(self) -> int:
         """How many rollouts there are."""
