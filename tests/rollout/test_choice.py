@@ -1,5 +1,6 @@
 """Which executor one gets for what one asks."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -76,3 +77,13 @@ def test_an_executor_or_a_pool_that_is_there_is_taken(pendulum):
 def test_what_cannot_be_is_refused(executor, options, message, pendulum):
     with pytest.raises(ValueError, match=message):
         make_executor(executor, testbed=pendulum, rollouts=5, **options)
+
+
+def test_dask_without_its_package_names_the_extra(pendulum, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.delitem(sys.modules, "vtbdrake.rollout.cluster", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'vtbdrake\[cluster\]'"):
+        make_executor("dask", testbed=pendulum, rollouts=5)
+    # Unknown things are refused all the same.
+    with pytest.raises(ValueError, match="not 3"):
+        make_executor(3, testbed=pendulum, rollouts=5)

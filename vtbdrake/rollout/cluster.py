@@ -45,7 +45,7 @@ class DaskExecutor(Executor):
     Workers with one thread each suit testbeds with systems in Python. When a worker is lost, Dask runs its rollouts
     elsewhere. A rollout with which more workers were lost than ``distributed.scheduler.allowed-failures`` is tried
     again when no other runs, for it may have been the neighbour of the one at fault; when that fails too, it is a
-    failed result.
+    failed result. With no worker left, it waits for new ones, as one does for a queue of jobs.
 
     Args:
         client: of the cluster, and left open; or the address of its scheduler; left out, that in the environment

@@ -28,8 +28,8 @@ class FuturesExecutor(Executor):
 
     Args:
         pool: where the rollouts run.
-        in_flight: how many rollouts it is given at a time; twice its workers if left out, so that none waits and an
-            interruption need not take back many.
+        in_flight: how many rollouts it is given at a time; twice its workers if left out, so that none waits. An
+            interruption takes back what has not begun; what runs goes on to its end.
     """
 
     def __init__(self, pool: concurrent.futures.Executor, *, in_flight: int | None = None) -> None:
