@@ -57,7 +57,7 @@ class Ipopt(GradientProgramSolver):
 
 
 class _Nlopt(ProgramSolver):
-    """An algorithm of NLopt, by its name."""
+    """An algorithm of NLopt, by its name. Those of `NO_EXCEPTIONS` make at most `LIMIT` calls without a budget."""
 
     def _choose(self) -> None:
         if self.name not in WITH_CONSTRAINTS:
@@ -76,7 +76,7 @@ class _Nlopt(ProgramSolver):
             NloptSolver.XAbsoluteToleranceName(): self._tolerance,
             NloptSolver.ConstraintToleranceName(): self._feasibility,
             # 0: no limit. Drake's is 1000, and the budget is counted by us.
-            NloptSolver.MaxEvalName(): LIMIT if self.name in NO_EXCEPTIONS else 0,
+            NloptSolver.MaxEvalName(): (self.search.budget or LIMIT) if self.name in NO_EXCEPTIONS else 0,
         }
 
     def _judge(self, result: MathematicalProgramResult) -> tuple[bool, str]:

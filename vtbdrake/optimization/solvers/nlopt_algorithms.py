@@ -48,13 +48,13 @@ WITH_DERIVATIVES = (
     "LD_SLSQP",
 )
 
-# LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside, and GN_ORIG_DIRECT_L; but on smooth
-# functions of two variables under a linear constraint they report success far from the optimum. The others refuse them.
+# LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside, GN_ORIG_DIRECT and GN_ORIG_DIRECT_L;
+# but on smooth functions of two variables under a linear constraint they report success far from the optimum. The others
+# refuse them.
 WITH_CONSTRAINTS = frozenset(
     {
         "GN_AGS",
         "GN_ISRES",
-        "GN_ORIG_DIRECT",
         "LD_AUGLAG",
         "LD_CCSAQ",
         "LD_SLSQP",
@@ -83,9 +83,12 @@ SEEDED_BY_CLOCK = frozenset(
 UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
 
 # These do not survive an exception in their callback: they go on for ever, or crash the process. When they are closed,
-# they are given the same value everywhere instead, and run to their end or to this number of calls.
-NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "LN_NEWUOA", "LN_NEWUOA_BOUND"})
-LIMIT = 2_000
+# they are given the same value everywhere instead, and run to their end or to the limit of their calls: the budget, or
+# this number without one.
+NO_EXCEPTIONS = frozenset(
+    {"GD_STOGO", "GD_STOGO_RAND", "GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L", "LN_NEWUOA", "LN_NEWUOA_BOUND"}
+)
+LIMIT = 5_000
 
 # How NLopt names the number that it returns.
 RESULTS = {
