@@ -49,7 +49,7 @@ WITH_DERIVATIVES = (
 )
 
 # LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside, GN_ORIG_DIRECT and GN_ORIG_DIRECT_L;
-# but on smooth functions of two variables under a linear constraint they report success far from the optimum. The others
+# but on smooth functions of two variables under a linear constraint they report success far from the optimum. Others
 # refuse them.
 WITH_CONSTRAINTS = frozenset(
     {
