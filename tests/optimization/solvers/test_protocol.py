@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from tests.optimization.solvers.driver import ROSENBROCK, SPHERE, drive, evaluation, solve
+from tests.optimization.solvers.driver import CONSTRAINED, ROSENBROCK, SPHERE, drive, evaluation, half_plane, solve
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.solvers import Evaluation, Solver, SolverError, known_solvers, make_solver
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
@@ -266,3 +266,19 @@ def test_infeasible_points_rank_by_their_violation():
 def test_a_solver_is_abstract():
     with pytest.raises(TypeError, match="abstract"):
         Solver()
+
+
+def test_the_slope_of_a_range_agrees_with_differences():
+    search = Search((Parameter("gain", 1e-2, 1e3, log=True), Parameter("x", -3.0, 4.0)))
+    u, step = np.array([0.3, 0.8]), 1e-6
+    differences = (np.array(search.point(u + step)) - np.array(search.point(u - step))) / (2.0 * step)
+    np.testing.assert_allclose(search.slope(search.point(u)), differences, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP", "LN_COBYLA"])
+def test_the_point_to_which_it_converges_keeps_the_constraint(name):
+    solver = make_solver(name, CONSTRAINED.space, constraints=1, start=(-1.0, -1.0))
+    log = drive(solver, CONSTRAINED.cost, violations=half_plane)
+    nearest = min(log, key=lambda told: np.hypot(*(np.array(told.point) - CONSTRAINED.best + 1e-6)))
+    assert solver.success is True
+    assert nearest.feasible
