@@ -50,7 +50,8 @@ def test_the_dashboard_is_dasks_and_knows_the_workers(cluster):
     workers = page("/info/main/workers.html")
     assert "<title> Workers </title>" in workers
     assert all(address in workers for address in cluster.client.scheduler_info()["workers"])
-    assert "Dask" in page("/status")
+    status = page("/status")
+    assert "Dask" in status and "Bokeh" in status, "the charts are there"
 
 
 def test_what_the_workers_were_told_is_taken_back_at_the_end(cluster):
