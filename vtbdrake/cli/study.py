@@ -34,7 +34,7 @@ from vtbdrake.testbed import Scenario
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-EXECUTORS = ("auto", "serial", "threads", "processes")
+EXECUTORS = ("auto", "serial", "threads", "processes", "dask")
 
 _PROBLEM = (
     scenario_argument,

@@ -204,7 +204,8 @@ class Problem:
         Args:
             points: of an equally spaced grid over one or two parameters, for all of them or one by one.
             values: the points themselves instead, shape (n,) for one parameter or (n, p).
-            executor: ``auto``, ``serial``, ``threads``, ``processes`` or an Executor.
+            executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask``, an Executor, any
+                ``concurrent.futures`` executor, or a client of Dask; see `make_executor`.
             workers: threads or processes; the number of cores if left out.
             record: addresses and ports to record at the sample times.
             run_on: simulate to t_m although the threshold was exceeded, so that all of G1 is known.
