@@ -1,4 +1,4 @@
-"""Joint encoders."""
+"""Joint encoders and tachometers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 
 
@@ -28,13 +29,16 @@ class JointEncoders(SampledSensor):
     ``joints``. Before the first sample it shows the plant's default positions.
     """
 
-    def __init__(self, plant: MultibodyPlant, joints: Sequence[Joint], *, period: float, stream: int = 1) -> None:
-        for joint in joints:
-            if joint.num_positions() != 1:
-                raise ValueError(
-                    f"Joint '{joint.name()}' has {joint.num_positions()} positions; "
-                    "JointEncoders measures joints with exactly one."
-                )
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joints: Sequence[Joint],
+        *,
+        period: float,
+        stream: int = 1,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        check_single(joints, self)
         self._indices = np.array([joint.position_start() for joint in joints], dtype=int)
         super().__init__(
             "joint_encoders",
@@ -43,9 +47,65 @@ class JointEncoders(SampledSensor):
             unit="rad",
             noise={"noise": (len(joints), "rad")},
             stream=stream,
+            errors=errors,
         )
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         x: NDArray[np.float64] = self._state_port.Eval(context)
         return x[self._indices]
+
+
+class JointTachometers(SampledSensor):
+    """Measures the velocities of joints that have one degree of freedom.
+
+    .. pydrake_system::
+
+        name: JointTachometers
+        input_ports:
+        - state
+        output_ports:
+        - joint_velocity
+
+    ``state`` is the plant's [q; v]; ``joint_velocity`` holds one velocity (rad/s or m/s) per joint, in the order of
+    ``joints``. Before the first sample it shows zeros.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joints: Sequence[Joint],
+        *,
+        period: float,
+        stream: int = 3,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        check_single(joints, self)
+        self._indices = np.array([plant.num_positions() + joint.velocity_start() for joint in joints], dtype=int)
+        super().__init__(
+            "joint_velocity",
+            default=np.zeros(len(joints)),
+            period=period,
+            unit="rad/s",
+            noise={"noise": (len(joints), "rad/s")},
+            stream=stream,
+            errors=errors,
+        )
+        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        x: NDArray[np.float64] = self._state_port.Eval(context)
+        return x[self._indices]
+
+
+def check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
+    """
+    Raises:
+        ValueError: a joint has not exactly one degree of freedom.
+    """
+    for joint in joints:
+        if joint.num_positions() != 1:
+            raise ValueError(
+                f"Joint '{joint.name()}' has {joint.num_positions()} positions; "
+                f"{type(sensor).__name__} measures joints with exactly one."
+            )

@@ -12,6 +12,7 @@ from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import parameter
 
@@ -34,10 +35,19 @@ class ContactSensor(SampledSensor):
     """
 
     def __init__(
-        self, plant: MultibodyPlant, bodies: Sequence[RigidBody], *, period: float, threshold: float = 1.0
+        self,
+        plant: MultibodyPlant,
+        bodies: Sequence[RigidBody],
+        *,
+        period: float,
+        threshold: float = 1.0,
+        stream: int = 2,
+        errors: ErrorModel | None = None,
     ) -> None:
         """``threshold`` is a force (N), and a parameter of the Context."""
-        super().__init__("foot_contact", default=np.zeros(len(bodies)), period=period, unit="1")
+        super().__init__(
+            "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", stream=stream, errors=errors
+        )
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Where in the list of forces a body or geometry adds to; the last place is for all that are not asked for.
         self._size = len(bodies) + 1

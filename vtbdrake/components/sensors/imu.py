@@ -13,6 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
 
@@ -46,7 +47,15 @@ class Imu(SampledSensor):
     where the sensor sits; moving ``frame`` does not move it.
     """
 
-    def __init__(self, plant: MultibodyPlant, frame: Frame, *, period: float, stream: int = 0) -> None:
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        frame: Frame,
+        *,
+        period: float,
+        stream: int = 0,
+        errors: ErrorModel | None = None,
+    ) -> None:
         body = frame.body()
         default_context = plant.CreateDefaultContext()
         self._g_W: Vector3 = tuple(plant.gravity_field().gravity_vector().tolist())
@@ -61,6 +70,7 @@ class Imu(SampledSensor):
             unit="rad/s, m/s^2",
             noise={"gyro_noise": (3, "rad/s"), "accelerometer_noise": (3, "m/s^2")},
             stream=stream,
+            errors=errors,
         )
         # [number of samples (0 or 1 is all that matters), v_WF, q_WF (wxyz)] at the last sample.
         self._memory = int(self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])))

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
 
+from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
 from vtbdrake.components.sensors.noise import normal_noise
 from vtbdrake.state import Element, discrete_state, parameter
 
@@ -18,7 +19,8 @@ class SampledSensor(LeafSystem):
     """A sensor that measures at t = 0, T, 2 T, ... and holds its measurement y in between.
 
     ``y = measurement + std * n(seed, stream, tick)`` with n independent and of N(0, 1). Until the first sample, y is
-    ``default``. A reader that is sampled at the same instants sees y one period late.
+    ``default``. A reader that is sampled at the same instants sees y one period late. An `ErrorModel` adds bias, drift,
+    quantization, latency and drop-out.
 
     The input ports have the names of the plant's output ports that they belong to, see `connect_to_plant`.
     """
@@ -32,8 +34,9 @@ class SampledSensor(LeafSystem):
         unit: str,
         noise: Mapping[str, tuple[int, str]] | None = None,
         stream: int = 0,
+        errors: ErrorModel | None = None,
     ) -> None:
-        """``noise`` names the standard deviations (all 0 by default): for how many entries of y, and their unit."""
+        """``noise`` names the standard deviations (0 without ``errors``): for how many entries of y, and their unit."""
         super().__init__()
         noise = noise or {}
         if not period > 0:
@@ -43,10 +46,18 @@ class SampledSensor(LeafSystem):
         y0 = np.asarray(default, dtype=float)
         self._output = self.DeclareDiscreteState(y0)
         self.DeclareStateOutputPort(signal, self._output)
+        if errors is not None:
+            errors.check(type(self).__name__)
+            if errors.noise and not noise:
+                raise ValueError(
+                    f"{type(self).__name__} has no noise, but noise={errors.noise:g} is given: leave it out."
+                )
         self._counts = np.array([count for count, _ in noise.values()], dtype=int)
         self.variables: tuple[Element, ...] = (discrete_state(signal, self._output, shape=y0.shape, unit=unit),)
-        if noise:
-            self._noise = int(self.DeclareNumericParameter(BasicVector(np.zeros(1 + len(noise)))))
+        self._stage: ErrorStage | None = None
+        if noise or errors is not None:
+            seed, std = (errors.seed, errors.noise) if errors is not None else (0, 0.0)
+            self._noise = int(self.DeclareNumericParameter(BasicVector([float(seed), *[std] * len(noise)])))
             self.variables += (
                 parameter("seed", self._noise, start=0, bounds=(0.0, 2.0**53)),
                 *(
@@ -54,6 +65,9 @@ class SampledSensor(LeafSystem):
                     for k, (name, (_, noise_unit)) in enumerate(noise.items())
                 ),
             )
+        if errors is not None:
+            self._stage = ErrorStage(self, errors, default=y0, output=int(self._output), period=self._period, unit=unit)
+            self.variables += self._stage.variables
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
 
     @property
@@ -67,12 +81,14 @@ class SampledSensor(LeafSystem):
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)
-        if self._counts.size:
+        if self._counts.size or self._stage is not None:
             seed, *stds = context.get_numeric_parameter(self._noise).value().tolist()
+            tick = round(context.get_time() / self._period)
             if any(stds):
-                tick = round(context.get_time() / self._period)
                 noise = normal_noise(y.size, seed=int(seed), stream=self._stream, tick=tick)
                 y = y + np.repeat(stds, self._counts) * noise
+            if self._stage is not None:
+                y = self._stage.apply(context, state, y, seed=int(seed), stream=self._stream, tick=tick)
         state.set_value(self._output, y)
 
 

@@ -1,0 +1,114 @@
+"""Sensors of what joints transmit: force/torque sensors, and torque sensors in the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint, RevoluteJoint
+from pydrake.systems.framework import Context, DiscreteValues
+
+from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.components.sensors.sampled import SampledSensor
+
+
+class ForceTorqueSensor(SampledSensor):
+    """Measures the wrench that a joint transmits.
+
+    .. pydrake_system::
+
+        name: ForceTorqueSensor
+        input_ports:
+        - reaction_forces
+        output_ports:
+        - wrench
+
+    ``wrench`` is [torque (3, N m); force (3, N)], in the order of Drake's SpatialForce: what the joint's child exerts
+    on its parent, about the origin of the frame Jc in which the joint is attached to the child, expressed in Jc. A
+    child at rest so shows its weight m g and whatever pushes it. Before the first sample it shows zeros.
+
+    Drake's reaction force F_CJc_Jc acts on the child; this is its opposite. Whatever the joint carries is in it:
+    gravity and inertia of all bodies beyond.
+
+    In a discrete plant whose output ports are sampled, reaction forces are those of the last step, and empty between a
+    restore and the next step; copies continue exactly where the plant has ``use_sampled_output_ports=False``. Then, and
+    in a continuous plant, they follow from state and actuation of the same instant.
+    """
+
+    def __init__(
+        self, plant: MultibodyPlant, joint: Joint, *, period: float, stream: int = 4, errors: ErrorModel | None = None
+    ) -> None:
+        (self._place,) = places(plant, [joint])
+        super().__init__(
+            "wrench",
+            default=np.zeros(6),
+            period=period,
+            unit="N m, N",
+            noise={"torque_noise": (3, "N m"), "force_noise": (3, "N")},
+            stream=stream,
+            errors=errors,
+        )
+        self._port = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        F_CJc_Jc: SpatialForce = self._port.Eval(context)[self._place]
+        return -F_CJc_Jc.get_coeffs()
+
+
+class JointTorqueSensors(SampledSensor):
+    """Measures the torques about the axes of revolute joints, on their output side.
+
+    .. pydrake_system::
+
+        name: JointTorqueSensors
+        input_ports:
+        - reaction_forces
+        output_ports:
+        - joint_torque
+
+    ``joint_torque`` (N m) holds for each of ``joints`` what its drive exerts on the child about the joint's axis: the
+    drive's torque, less what accelerates its rotor. Before the first sample it shows zeros. About restored
+    contexts, see `ForceTorqueSensor`.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joints: Sequence[RevoluteJoint],
+        *,
+        period: float,
+        stream: int = 5,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        for joint in joints:
+            if not isinstance(joint, RevoluteJoint):
+                raise ValueError(
+                    f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute joints."
+                )
+        self._places = places(plant, joints)
+        # In Jc and in the frame of the parent, an axis has the same components.
+        self._axes = [joint.revolute_axis() for joint in joints]
+        super().__init__(
+            "joint_torque",
+            default=np.zeros(len(joints)),
+            period=period,
+            unit="N m",
+            noise={"noise": (len(joints), "N m")},
+            stream=stream,
+            errors=errors,
+        )
+        self._port = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        F_CJc_Jc = self._port.Eval(context)
+        return np.array([axis @ F_CJc_Jc[k].rotational() for k, axis in zip(self._places, self._axes, strict=True)])
+
+
+def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:
+    """Where the joints' forces lie in the plant's reaction forces, which are in the order of all its joints."""
+    order = {int(index): k for k, index in enumerate(plant.GetJointIndices())}
+    return [order[int(joint.index())] for joint in joints]
