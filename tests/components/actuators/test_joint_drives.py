@@ -1,0 +1,162 @@
+"""Drives against closed forms: lag, saturation, delay, friction, and the rotor behind its gear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from vtbdrake.components.actuators import JointDrives
+
+PERIOD = 0.001
+
+
+def two_joints() -> tuple[DiagramBuilder, MultibodyPlant]:
+    """Two wheels on vertical axes, one on the other."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=PERIOD, use_sampled_output_ports=False), builder)
+    parent = plant.world_frame()
+    for name in ("a", "b"):
+        wheel = plant.AddRigidBody(name, SpatialInertia.SolidCylinderWithMass(2.0, 0.5, 0.1, [0, 0, 1]))
+        joint = plant.AddJoint(RevoluteJoint(name, parent, wheel.body_frame(), [0, 0, 1], damping=0))
+        plant.AddJointActuator(name, joint)
+        parent = wheel.body_frame()
+    plant.Finalize()
+    return builder, plant
+
+
+def torques(
+    steps: int, *, u: Callable[[int], list[float]] = lambda k: [8.0, -4.0], v: tuple[float, float] = (0.0, 0.0), **drive
+) -> np.ndarray:
+    """What comes out for k = 0, 1, ... while the joints turn at v."""
+    _, plant = two_joints()
+    drives = JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], period=PERIOD, **drive)
+    simulator = Simulator(drives)
+    context = simulator.get_mutable_context()
+    drives.GetInputPort("state").FixValue(context, [0.0, 0.0, *v])
+    shown = []
+    for k in range(steps):
+        drives.GetInputPort("command").FixValue(context, u(k))
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        shown.append(drives.get_output_port().Eval(context).copy())
+    return np.array(shown)
+
+
+def test_ideal_drive_gives_what_is_commanded() -> None:
+    np.testing.assert_array_equal(torques(3), [[8.0, -4.0]] * 3)
+
+
+def test_current_loop_is_a_first_order_lag() -> None:
+    tau = 0.004
+    t = (np.arange(30) + 1) * PERIOD  # m_k is the value at the end of the period in which r_k is held
+    expected = np.outer(1 - np.exp(-t / tau), [8.0, -4.0])
+    np.testing.assert_allclose(torques(30, time_constant=tau), expected, atol=1e-12)
+
+
+def test_torque_saturates_joint_by_joint() -> None:
+    np.testing.assert_array_equal(torques(3, limit=[5.0, 10.0]), [[5.0, -4.0]] * 3)
+    np.testing.assert_array_equal(torques(1, u=lambda k: [-80.0, 80.0], limit=5.0), [[-5.0, 5.0]])
+
+
+def test_torque_changes_no_faster_than_its_rate() -> None:
+    expected = [[min(8.0, 1.5 * k), max(-4.0, -1.5 * k)] for k in range(1, 9)]
+    np.testing.assert_allclose(torques(8, rate=1500.0), expected, atol=1e-12)
+
+
+def test_rate_is_that_of_the_saturated_torque() -> None:
+    """After an overlong command the torque turns back at once, without winding up."""
+    y = torques(6, u=lambda k: [100.0 if k < 3 else 0.0, 0.0], limit=2.0, rate=1000.0)
+    np.testing.assert_allclose(y[:, 0], [1.0, 2.0, 2.0, 1.0, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4])
+def test_delay_counts_periods(delay: int) -> None:
+    y = torques(12, u=lambda k: [k + 1.0, -k - 1.0], delay=delay, max_delay=4)
+    np.testing.assert_array_equal(y[:delay], np.zeros((delay, 2)))
+    np.testing.assert_array_equal(y[delay:, 0], np.arange(1.0, 13.0 - delay))
+
+
+def test_friction_opposes_the_motion() -> None:
+    v = np.array([0.3, -0.004])
+    y = torques(2, v=tuple(v), viscous=[2.0, 3.0], coulomb=[1.0, 0.5], coulomb_velocity=0.01)
+    expected = np.array([8.0, -4.0]) - [2.0 * v[0], 3.0 * v[1]] - np.array([1.0, 0.5]) * np.tanh(v / 0.01)
+    np.testing.assert_allclose(y, [expected] * 2, atol=1e-12)
+
+
+def test_friction_does_not_pass_the_current_loop() -> None:
+    np.testing.assert_allclose(
+        torques(1, u=lambda k: [0.0, 0.0], v=(1.0, 0.0), viscous=2.0, time_constant=1.0)[0, 0], -2.0
+    )
+
+
+def test_spin_down_under_coulomb_friction_is_linear_and_of_the_reflected_inertia() -> None:
+    """Wheel b alone: I v' = -coulomb, with I = m r^2 / 2 + N^2 I_rotor."""
+    builder, plant = two_joints()
+    gear, rotor = 100.0, 2e-5
+    actuator = plant.GetJointActuatorByName("b")
+    actuator.set_default_gear_ratio(gear)
+    actuator.set_default_rotor_inertia(rotor)
+    joints = [plant.GetJointByName("a"), plant.GetJointByName("b")]
+    drives = builder.AddSystem(JointDrives(plant, joints, period=PERIOD, coulomb=[0.0, 0.9], coulomb_velocity=0.01))
+    builder.Connect(plant.get_state_output_port(), drives.GetInputPort("state"))
+    builder.Connect(drives.get_output_port(), plant.get_actuation_input_port())
+    idle = builder.AddSystem(TrajectorySource(PiecewisePolynomial(np.zeros((2, 1)))))
+    builder.Connect(idle.get_output_port(), drives.GetInputPort("command"))
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetVelocities(context, [0.0, 2.0])
+    joints[0].Lock(context)
+    simulator.AdvanceTo(0.5)
+    inertia = 2.0 * 0.5**2 / 2 + gear**2 * rotor
+    # The drive feels the first velocity one period late.
+    expected = 2.0 - 0.9 / inertia * (0.5 - PERIOD)
+    assert plant.GetVelocities(context)[1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_every_value_is_a_variable() -> None:
+    _, plant = two_joints()
+    drives = JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], period=PERIOD, max_delay=3)
+    names = [e.name for e in drives.variables]
+    assert names == [
+        "torque",
+        "motor_torque",
+        "reference",
+        "limit",
+        "rate",
+        "viscous",
+        "coulomb",
+        "coulomb_velocity",
+        "time_constant",
+        "delay",
+        "in_transit",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"limit": -1.0}, "limit must not be negative"),
+        ({"viscous": [0.0, np.nan]}, "viscous must not be negative or NaN"),
+        ({"delay": 1.5}, "whole number of periods"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_impossible_values_are_refused(values: dict, message: str) -> None:
+    _, plant = two_joints()
+    with pytest.raises(ValueError, match=message):
+        JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], **{"period": PERIOD, **values})
+
+
+def test_joint_without_its_one_velocity_is_refused() -> None:
+    plant = MultibodyPlant(0.0)
+    plant.AddRigidBody("free", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.Finalize()
+    with pytest.raises(ValueError, match="6 velocities"):
+        JointDrives(plant, [plant.GetJointByName("free")], period=PERIOD)
