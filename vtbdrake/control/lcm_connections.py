@@ -1,0 +1,195 @@
+"""Connections to an LCM bus, which tell when they are lost."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping
+from urllib.parse import urlsplit
+
+import lcm
+
+from vtbdrake.control.hub.tcpq import (
+    MAGIC_CLIENT,
+    MAGIC_SERVER,
+    PUBLISH,
+    SUBSCRIBE,
+    VERSION,
+    ProtocolError,
+    Reader,
+    Record,
+    publication,
+)
+
+Handler = Callable[[str, bytes], None]
+"""Takes the channel and the bytes of a message; it must not raise."""
+
+_DEFAULT_PORT = 7700
+_LONGEST_MESSAGE = 1 << 28  # LCM_MAX_MESSAGE_SIZE
+_RECEIVE = 1 << 16
+_WORDS = struct.Struct(">II")
+_HEAD = 12  # bytes of a publication beside its channel and its data
+
+
+class Connection(ABC):
+    """One connection. Its calls do not wait. After an OSError it is of no use any more."""
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """What becomes readable when messages arrive."""
+
+    @abstractmethod
+    def take(self, limit: int) -> int:
+        """Hands up to ``limit`` messages that have arrived to their handlers; says how many.
+
+        Raises:
+            OSError: the connection is lost.
+        """
+
+    @abstractmethod
+    def publish(self, channel: str, data: bytes) -> None:
+        """
+        Raises:
+            BlockingIOError: the bus takes nothing at present; the message is dropped.
+            OSError: the connection is lost.
+        """
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+
+def connect(url: str, handlers: Mapping[str, Handler], timeout: float) -> Connection:
+    """A connection to the bus at ``url``, subscribed to the channels of ``handlers``.
+
+    Raises:
+        OSError: there is no bus.
+    """
+    if url.startswith("tcpq://"):
+        return TcpqConnection(url, handlers, timeout)
+    return LibraryConnection(url, handlers)
+
+
+class LibraryConnection(Connection):
+    """By liblcm: udpm, mpudpm, memq, file."""
+
+    def __init__(self, url: str, handlers: Mapping[str, Handler]) -> None:
+        try:
+            self._lcm = lcm.LCM(url)
+        except RuntimeError as error:
+            raise OSError(f"liblcm: {error}") from None
+        for channel, handler in handlers.items():
+            if self._lcm.subscribe(_literally(channel), handler) is None:
+                raise OSError(f"liblcm cannot subscribe to {channel}")
+
+    def fileno(self) -> int:
+        return int(self._lcm.fileno())
+
+    def take(self, limit: int) -> int:
+        count = 0
+        while count < limit and self._lcm.handle_timeout(0):
+            count += 1
+        return count
+
+    def publish(self, channel: str, data: bytes) -> None:
+        self._lcm.publish(channel, data)
+
+    def close(self) -> None:
+        del self._lcm
+
+
+class TcpqConnection(Connection):
+    """To a tcpq hub, by a socket of its own that is never waited for.
+
+    liblcm's client writes a message in five sends, waits inside of a message for as long as the hub does, connects anew
+    (and waits again) in whatever call comes after a loss, even in the destructor, and believes any length that it is
+    told.
+    """
+
+    def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float) -> None:
+        self._handlers = {channel.encode(): (channel, handler) for channel, handler in handlers.items()}
+        self._reader = Reader(max_message=_LONGEST_MESSAGE)
+        self._reader.greeted = True  # the hub's greeting is read below; what follows has the form of a client's records
+        self._records: deque[Record] = deque()
+        self._unsent = b""
+        self._socket = socket.create_connection(tcpq_address(url), timeout)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._greet()
+            for channel in handlers:
+                name = _literally(channel).encode()
+                self._socket.sendall(_WORDS.pack(SUBSCRIBE, len(name)) + name)
+            self._socket.setblocking(False)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def _greet(self) -> None:
+        self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
+        answer = b""
+        while len(answer) < _WORDS.size:
+            chunk = self._socket.recv(_WORDS.size - len(answer))
+            if not chunk:
+                raise ConnectionResetError("it closed the connection")
+            answer += chunk
+        if _WORDS.unpack(answer)[0] != MAGIC_SERVER:
+            raise ConnectionError("what listens there is no tcpq hub")
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def take(self, limit: int) -> int:
+        count = self._dispatch(limit)
+        chunk_size = _RECEIVE
+        while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
+            try:
+                chunk = self._socket.recv(_RECEIVE)
+            except BlockingIOError:
+                break
+            chunk_size = len(chunk)
+            if not chunk:
+                raise ConnectionResetError("the hub closed the connection")
+            try:
+                self._records += self._reader.feed(chunk)
+            except ProtocolError as error:
+                raise ConnectionError(f"the hub {error}") from None
+            count += self._dispatch(limit - count)
+        return count
+
+    def _dispatch(self, limit: int) -> int:
+        records, count = self._records, 0
+        while records and count < limit:
+            kind, name, record = records.popleft()
+            known = self._handlers.get(name)
+            if kind == PUBLISH and known is not None:
+                channel, handler = known
+                handler(channel, bytes(record[_HEAD + len(name) :]))
+            count += 1
+        return count
+
+    def publish(self, channel: str, data: bytes) -> None:
+        if self._unsent:
+            self._unsent = self._unsent[self._socket.send(self._unsent) :]
+            if self._unsent:
+                raise BlockingIOError("an earlier message is still on its way")
+        record = publication(channel.encode(), data)
+        self._unsent = record[self._socket.send(record) :]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def tcpq_address(url: str) -> tuple[str, int]:
+    """Host and port of ``tcpq://host:port``; both may be left out.
+
+    Raises:
+        ValueError: the port is no number.
+    """
+    parts = urlsplit(url)
+    return parts.hostname or "127.0.0.1", _DEFAULT_PORT if parts.port is None else parts.port
+
+
+def _literally(channel: str) -> str:
+    """A subscription is a regular expression; this one means the channel's name only."""
+    return "".join(f"\\{c}" if c in r".^$*+?()[]{}|" + "\\" else c for c in channel)

@@ -1,0 +1,159 @@
+"""A link to an LCM bus that comes back by itself."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+from collections.abc import Mapping
+
+from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.lcm_connections import Connection, Handler, connect
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
+"""Seconds between attempts to connect; each is twice the one before."""
+
+
+class _Search(threading.Thread):
+    """Seeks a bus until it finds one or is cancelled; in a thread of its own, because connecting may take long."""
+
+    def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float) -> None:
+        super().__init__(name="vtbdrake-lcm-search", daemon=True)
+        self._arguments = (url, handlers, timeout)
+        self._cancelled = threading.Event()
+        self._lock = threading.Lock()
+        self._found: Connection | None = None
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        # A thread has the scheduling of the one that started it; this one must not compete with a real-time loop.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        pause = FIRST_PAUSE
+        while not self._cancelled.is_set():
+            try:
+                connection = connect(*self._arguments)
+            except OSError:
+                self._cancelled.wait(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+                continue
+            with self._lock:
+                if self._cancelled.is_set():
+                    connection.close()
+                else:
+                    self._found = connection
+            break
+        self.ended.set()
+
+    def result(self) -> Connection | None:
+        """The connection, once."""
+        with self._lock:
+            found, self._found = self._found, None
+        return found
+
+    def cancel(self) -> None:
+        with self._lock:
+            self._cancelled.set()
+            if self._found is not None:
+                self._found.close()
+                self._found = None
+
+
+class LcmLink:
+    """Receives and publishes while there is a bus, and seeks it while there is none.
+
+    Attributes:
+        url: the bus.
+        losses: how often the bus was lost.
+        reconnections: how often it was found again.
+    """
+
+    def __init__(self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float) -> None:
+        self.url = url
+        self.losses = 0
+        self.reconnections = 0
+        self._arguments = (url, handlers, connect_timeout)
+        self._connection: Connection | None = None
+        self._search: _Search | None = None
+
+    def open(self) -> None:
+        """
+        Raises:
+            BridgeError: there is no bus.
+        """
+        if self.is_open:
+            return
+        try:
+            self._connection = connect(*self._arguments)
+        except OSError as error:
+            remedy = "start a hub there (vtbdrake hub)" if self.url.startswith("tcpq:") else "is the URL right?"
+            raise BridgeError(f"no LCM bus at {self.url} ({error}); {remedy}") from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has a bus, or seeks it."""
+        return self._connection is not None or self._search is not None
+
+    @property
+    def connected(self) -> bool:
+        return self._current() is not None
+
+    def _current(self) -> Connection | None:
+        if self._search is not None:
+            self._connection = self._search.result()
+            if self._connection is not None:
+                self._search = None
+                self.reconnections += 1
+        return self._connection
+
+    def _required(self) -> Connection | None:
+        connection = self._connection or self._current()
+        if connection is None and self._search is None:
+            raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
+        return connection
+
+    def take(self, timeout: float, limit: int) -> int:
+        """Hands messages to their handlers, waiting up to ``timeout`` seconds for the first; says how many."""
+        connection = self._required()
+        if connection is None:
+            if timeout > 0 and self._search is not None:
+                self._search.ended.wait(timeout)
+            return 0
+        try:
+            count = connection.take(limit)
+            if not count and timeout > 0:
+                select.select((connection,), (), (), timeout)
+                count = connection.take(limit)
+            return count
+        except OSError:
+            self._lose()
+            return 0
+
+    def publish(self, channel: str, data: bytes) -> bool:
+        """Whether the message went to the bus."""
+        connection = self._required()
+        if connection is None:
+            return False
+        try:
+            connection.publish(channel, data)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._lose()
+            return False
+        return True
+
+    def _lose(self) -> None:
+        self.losses += 1
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        self._search = _Search(*self._arguments)
+        self._search.start()
+
+    def close(self) -> None:
+        if self._search is not None:
+            self._search.cancel()
+            self._search = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None

@@ -1,0 +1,222 @@
+"""What happens to the messages of one channel on their way in, and out."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from operator import le
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.control.bridge import Reception
+from vtbdrake.control.lcm_maps import LcmMap
+from vtbdrake.control.lcm_wire import MalformedError
+from vtbdrake.testbed import Signal
+
+_log = logging.getLogger(__name__)
+
+_LARGEST = np.finfo(float).max
+
+
+def within(lower: Sequence[float], entries: Sequence[float], upper: Sequence[float]) -> bool:
+    """Whether all entries are within their limits; for so few of them, quicker than numpy."""
+    return all(map(le, lower, entries)) and all(map(le, entries, upper))
+
+
+class Range:
+    """What a signal's values can be: arrays of its size, finite and within its limits, or objects of its type."""
+
+    def __init__(self, signal: Signal) -> None:
+        self._size = signal.size
+        if signal.size is None:
+            self._type: type = type(signal.abstract_value().get_value())
+        else:
+            # An infinite entry is never within the limits, a NaN fails every comparison.
+            self.lower: list[float] = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
+            self.upper: list[float] = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
+
+    def check(self, value: Any) -> str:
+        """Why ``value`` is not one of this signal; empty if it is."""
+        if self._size is None:
+            return "" if isinstance(value, self._type) else "type"
+        try:
+            entries = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            return "type"
+        if entries.shape != (self._size,):
+            return "size"
+        if within(self.lower, entries.tolist(), self.upper):
+            return ""
+        return "limits" if np.isfinite(entries).all() else "not finite"
+
+
+class Inlet:
+    """Takes in the messages of one channel.
+
+    Attributes:
+        channel: its name.
+        clock_jumps: how often the sender's time went back and was believed.
+    """
+
+    def __init__(
+        self, map: LcmMap, signals: Sequence[Signal], receptions: Mapping[str, Reception], reorder_window: float
+    ) -> None:
+        """
+        Raises:
+            ValueError: the map cannot carry the signals.
+        """
+        self.channel = map.channel
+        self.clock_jumps = 0
+        self._read = map.reader(signals)
+        self._receptions = {signal.name: receptions[signal.name] for signal in signals}
+        self._ranges = {signal.name: Range(signal) for signal in signals}
+        vectors = [self._ranges[signal.name] for signal in signals if signal.is_vector]
+        self._lower = [entry for vector in vectors for entry in vector.lower]
+        self._upper = [entry for vector in vectors for entry in vector.upper]
+        self._reorder_window = reorder_window
+        self._last = -inf
+        self._late_since = inf
+
+    def take(self, channel: str, data: bytes) -> None:
+        """Handles one message."""
+        now = time.monotonic()
+        try:
+            sent, values, numbers = self._read(data)
+            reason = self._order(sent, now)
+        except MalformedError as error:
+            reason = error.reason
+        except (Exception, SystemExit):  # a failed assertion in Drake's C++ is a SystemExit
+            reason = "decode"
+        if reason:
+            for reception in self._receptions.values():
+                reception.reject(reason)
+            return
+        good = numbers is not None and within(self._lower, numbers, self._upper)
+        accepted = good
+        for name, reception in self._receptions.items():
+            if not good:
+                reason = self._ranges[name].check(values[name]) if name in values else "decode"
+                if reason:
+                    reception.reject(reason)
+                    continue
+                accepted = True
+            reception.value = values[name]
+            reception.arrived = now
+            reception.sent = sent
+            reception.count += 1
+        if accepted:
+            if sent < self._last:
+                self.clock_jumps += 1
+            self._late_since = inf
+            if isfinite(sent):
+                self._last = sent
+
+    def _order(self, sent: float, now: float) -> str:
+        """Why a message of this time is not to be believed; empty if it is."""
+        if sent > self._last or not isfinite(sent):
+            return ""
+        if sent == self._last:
+            return "duplicate"
+        self._late_since = min(self._late_since, now)
+        return "" if now - self._late_since > self._reorder_window else "out of order"
+
+
+@dataclass
+class Transmission:
+    """What is known of one actuator signal.
+
+    Attributes:
+        count: how many commands left.
+        withheld: how many did not, by the reason: ``size``, ``not finite``, ``limits``, ``incomplete`` (its message
+            cannot go without another signal), ``companion`` (another signal of its message was at fault), ``encode``,
+            ``no bus``.
+    """
+
+    count: int = 0
+    withheld: dict[str, int] = field(default_factory=dict)
+
+    def withhold(self, reason: str) -> None:
+        """Counts a command that did not leave."""
+        self.withheld[reason] = self.withheld.get(reason, 0) + 1
+
+
+class Outlet:
+    """Makes the messages of one channel."""
+
+    def __init__(
+        self, map: LcmMap, signals: Sequence[Signal], transmissions: MutableMapping[str, Transmission]
+    ) -> None:
+        """
+        Raises:
+            ValueError: the map cannot carry the signals.
+        """
+        self.channel = map.channel
+        self._write = map.writer(signals)
+        self._ranges = {signal.name: Range(signal) for signal in signals}
+        self._transmissions = transmissions
+        self._named: list[str] = []
+
+    def message(self, commands: Mapping[str, Any], utime: int) -> bytes | None:
+        """The message of those commands that are this channel's; None if there are none, or none may leave."""
+        values = {name: commands[name] for name in self._ranges if name in commands}
+        self._named = list(values)
+        if not values:
+            return None
+        faults = {name: reason for name in values if (reason := self._ranges[name].check(values[name]))}
+        if not faults:
+            try:
+                return self._write(values, utime)
+            except LookupError:
+                faults = dict.fromkeys(values, "incomplete")
+            except (Exception, SystemExit):
+                faults = dict.fromkeys(values, "encode")
+        for name in values:
+            self._transmissions[name].withhold(faults.get(name, "companion"))
+        return None
+
+    def count(self, sent: bool) -> None:
+        """Counts what became of the last message."""
+        for name in self._named:
+            if sent:
+                self._transmissions[name].count += 1
+            else:
+                self._transmissions[name].withhold("no bus")
+
+
+class CommandWatch:
+    """Tells messages on an own command channel that somebody else has sent.
+
+    Attributes:
+        alarms: how many there were.
+    """
+
+    _MEMORY = 256  # own messages that may be on their way at a time; what is lost on the way makes room for new ones
+
+    def __init__(self, on_alarm: Callable[[str, bytes], None] | None) -> None:
+        self.alarms = 0
+        self._on_alarm = on_alarm
+        self._own: deque[bytes] = deque(maxlen=self._MEMORY)
+
+    def expect(self, data: bytes) -> None:
+        """Remembers a message that is about to be sent."""
+        self._own.append(data)
+
+    def take(self, channel: str, data: bytes) -> None:
+        """Handles one message that came."""
+        if data in self._own:
+            while self._own.popleft() != data:
+                pass
+            return
+        self.alarms += 1
+        if self._on_alarm is None:
+            return
+        try:
+            self._on_alarm(channel, data)
+        except Exception:
+            _log.exception("what was to be told of alarms raised, and is told nothing from now on")
+            self._on_alarm = None
