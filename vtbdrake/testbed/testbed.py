@@ -177,6 +177,11 @@ class VirtualTestbed(AddressedDiagram):
                 raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
         snapshots.apply(snapshot, self.diagram, context, self._variables)
 
+    @property
+    def believes(self) -> bool:
+        """Whether it declares what of its DPS sets its simulated world."""
+        return bool(self._beliefs)
+
     def start_from_belief(self, context: Context) -> None:
         """s_sim(t0) from s_dps(t): sets the simulated world to what the DPS in ``context`` believes.
 

@@ -1,0 +1,128 @@
+"""A machine in the same process, in lock-step with the runtime's own clock: for what has to be exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
+from pydrake.systems.primitives import DiscreteTimeIntegrator, ZeroOrderHold
+
+from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.clock import Clock
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+
+PERIOD = 0.001
+
+
+class ScriptedBridge(Bridge):
+    """Delivers what ``sensors(t)`` says at every poll, and keeps what is published, with the time."""
+
+    def __init__(self, interface: Interface, clock: Clock, sensors: Callable[[float], Mapping[str, Any]]) -> None:
+        self.interface = interface
+        self.sensed = {signal.name: Reception() for signal in interface.sense}
+        self.commanded = {}
+        self.sent: list[tuple[float, dict[str, Any]]] = []
+        self.sensors = sensors
+        self.up = True
+        self._clock = clock
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def connected(self) -> bool:
+        return self.up
+
+    def poll(self, timeout: float = 0.0) -> int:
+        if timeout:
+            self._clock.wait_until(self._clock.now() + min(timeout, PERIOD))
+        now = self._clock.now()
+        values = self.sensors(now)
+        for name, value in values.items():
+            reception = self.sensed[name]
+            reception.value, reception.arrived, reception.count = np.asarray(value), now, reception.count + 1
+        return len(values)
+
+    def publish(self, commands: Mapping[str, Any]) -> None:
+        self.sent.append((self._clock.now(), {name: np.array(value) for name, value in commands.items()}))
+
+
+class Servo(LeafSystem):
+    """A DPS: velocity = gain (target - position), sampled; it raises or commands NaN when it is told to.
+
+    .. pydrake_system::
+
+        name: Servo
+        input_ports:
+        - position
+        - speed
+        - target
+        output_ports:
+        - velocity
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._position = self.DeclareVectorInputPort("position", 2)
+        self.DeclareVectorInputPort("speed", 2)
+        self._target = self.DeclareVectorInputPort("target", 2)
+        gain = self.DeclareNumericParameter(BasicVector([5.0]))
+        trouble = self.DeclareNumericParameter(BasicVector([0.0]))
+        velocity, ticks, seen = (self.DeclareDiscreteState(size) for size in (2, 1, 2))
+        self.DeclareStateOutputPort("velocity", velocity)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
+        self.variables = (
+            parameter("gain", gain, unit="1/s", bounds=(0.0, 1e3)),
+            parameter("trouble", trouble, bounds=(0.0, 2.0)),
+            discrete_state("velocity", velocity, shape=(2,), unit="m/s"),
+            discrete_state("ticks", ticks),
+            discrete_state("seen", seen, shape=(2,), unit="m"),
+        )
+
+    def _update(self, context: Context, discrete: Any) -> None:
+        (trouble,) = context.get_numeric_parameter(1).value()
+        if trouble == 1.0:
+            raise RuntimeError("out of ideas")
+        (gain,) = context.get_numeric_parameter(0).value()
+        position = self._position.Eval(context)
+        velocity = gain * (self._target.Eval(context) - position)
+        discrete.set_value(0, velocity if trouble == 0.0 else [np.nan, 0.0])
+        discrete.set_value(1, context.get_discrete_state(1).value() + 1.0)
+        discrete.set_value(2, position)
+
+
+@dataclass
+class ServoScenario(Scenario):
+    """Two axes without mass that are commanded by their velocity; a rate of 0 is no limit."""
+
+    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-6))
+    rate: float = 2.0
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[
+                Signal("position", size=2, unit="m", lower=-2.0, upper=2.0, max_age=0.0105),
+                Signal("speed", size=2, unit="m/s", max_age=0.0105),
+            ],
+            act=[Signal("velocity", size=2, unit="m/s", lower=-1.0, upper=1.0, rate=self.rate or np.inf, idle=0.0)],
+            commands=[Signal("target", size=2, unit="m")],
+        )
+
+    def make_dps(self) -> System:
+        return Servo()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        axes = builder.add("sys", "axes", DiscreteTimeIntegrator(2, PERIOD))
+        drives = builder.add("act", "drives", ZeroOrderHold(PERIOD, 2))
+        builder.builder.Connect(drives.get_output_port(), axes.get_input_port())
+        builder.sim_sensor("position", axes.get_output_port())
+        builder.sim_sensor("speed", drives.get_output_port())
+        builder.sim_actuator("velocity", drives.get_input_port())
+        builder.believe("sim.sys.axes.discrete_state_0", of=["dps.seen"])

@@ -1,0 +1,262 @@
+"""The runtime's loop in lock-step with a simulated clock: what is stepped, sent, missed, refused and survived."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.testbed import DpsAlone
+
+TARGET = np.array([0.2, -0.1])
+
+
+def still(t):
+    return {"position": [0.05, 0.0], "speed": [0.0, 0.0]}
+
+
+def make(*, alone=False, sensors=still, rate=2.0, lateness=(), **more):
+    scenario = ServoScenario(rate=rate)
+    target = DpsAlone(scenario) if alone else scenario.build()
+    clock = SimulatedClock(lateness=lateness)
+    bridge = ScriptedBridge(scenario.interface(), clock, sensors)
+    runtime = Runtime(target, bridge, period=PERIOD, clock=clock, **more)
+    target.write(runtime.context, {"u.target": TARGET})
+    return runtime, bridge, clock
+
+
+def switched(**settings):
+    """A runtime on real, whose command departs from the measured speed."""
+    runtime, bridge, clock = make(**{"continuity": {"velocity": ("speed", 5.0)}, **settings})
+    runtime.cycle()
+    runtime.switch("real")
+    return runtime, bridge, clock
+
+
+def sent(bridge):
+    return np.array([commands["velocity"] for _, commands in bridge.sent])
+
+
+def test_on_sim_nothing_is_sent_and_the_world_is_driven():
+    runtime, bridge, _ = make()
+    runtime.run(cycles=2000)
+    assert bridge.sent == []
+    axes = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
+    assert axes == pytest.approx(TARGET, abs=1e-3)
+    assert runtime.time == 2000 * PERIOD and runtime.target.read(runtime.context, "dps.ticks") == 2000.0
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_the_machine_gets_what_the_dps_commands(alone):
+    runtime, bridge, _ = switched(alone=alone, rate=0.0)
+    runtime.run(cycles=10)
+    expected = 5.0 * (TARGET - [0.05, 0.0])
+    assert np.array_equal(sent(bridge), np.tile(expected, (10, 1)))
+    assert runtime.guards.latched == ()
+
+
+def test_the_whole_testbed_and_the_dps_alone_send_the_same():
+    def moving(t):
+        return {**still(t), "position": [0.1 * np.sin(30.0 * t), 0.05 * np.cos(17.0 * t)]}
+
+    (whole, a, _), (alone, b, _) = (switched(alone=alone, sensors=moving) for alone in (False, True))
+    whole.run(cycles=300)
+    alone.run(cycles=300)
+    assert np.array_equal(sent(a), sent(b)) and len(sent(a)) == 300
+
+
+def test_in_shadow_the_dps_listens_and_nothing_is_sent():
+    runtime, bridge, _ = make()
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=50)
+    assert bridge.sent == []
+    assert np.array_equal(runtime.command("velocity"), 5.0 * (TARGET - [0.05, 0.0]))
+
+
+def test_in_twin_the_simulated_world_gets_the_command_too():
+    runtime, bridge, _ = make(rate=0.0)
+    runtime.cycle()
+    before = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
+    runtime.switch("twin")
+    runtime.run(cycles=100)
+    moved = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0") - before
+    # The command of each cycle reaches the world in the next one.
+    assert moved == pytest.approx(99 * PERIOD * 5.0 * (TARGET - [0.05, 0.0]), rel=0.03)
+    assert len(sent(bridge)) == 100
+
+
+def test_no_command_steps_by_more_than_its_rate_limit_at_any_switch():
+    runtime, bridge, _ = switched(rate=2.0)
+    runtime.run(cycles=700)
+    steps = np.abs(np.diff(sent(bridge), axis=0, prepend=[[0.0, 0.0]]))
+    assert steps.max() <= 2.0 * PERIOD * (1 + 1e-9)
+    assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
+
+
+def test_from_real_to_sim_the_world_starts_from_what_the_dps_believes():
+    runtime, bridge, _ = switched()
+    runtime.run(cycles=5)
+    runtime.switch("sim")
+    axes = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
+    assert np.array_equal(axes, [0.05, 0.0])
+    count = len(bridge.sent)
+    runtime.run(cycles=50)
+    assert len(bridge.sent) == count
+
+
+# -- what is refused
+
+
+def refusal(runtime, mode="real"):
+    preparation = runtime.prepare(mode)
+    positions = getattr(runtime.target, "positions", lambda context: None)(runtime.context)
+    with pytest.raises(SwitchRefusedError):
+        runtime.perform(preparation)
+    assert getattr(runtime.target, "positions", lambda context: None)(runtime.context) == positions
+    return "; ".join(preparation.reasons)
+
+
+def test_a_switch_to_a_sensor_that_never_spoke_is_refused():
+    runtime, _, _ = make(sensors=lambda t: {})
+    runtime.cycle()
+    assert "position" in refusal(runtime, "shadow")
+
+
+def test_a_switch_to_a_machine_out_of_reach_or_not_ready_is_refused():
+    runtime, bridge, _ = make(rate=0.0, ready=lambda: "its brakes are closed")
+    runtime.cycle()
+    bridge.up = False
+    reasons = refusal(runtime)
+    assert "the bridge is not connected" in reasons and "its brakes are closed" in reasons
+
+
+def test_a_command_that_would_jump_is_refused():
+    runtime, bridge, _ = make(continuity={"velocity": ("speed", 0.3)})
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=3)
+    assert "is 0.75 away from the measured speed; 0.3 is allowed" in refusal(runtime)
+    runtime.target.write(runtime.context, {"dps.gain": 1.0})
+    runtime.run(cycles=3)
+    runtime.switch("real")
+    runtime.run(cycles=1)
+    assert np.abs(sent(bridge)[0]).max() <= 2.0 * PERIOD * (1 + 1e-9), "it departs from what is measured"
+
+
+def test_a_rate_limit_without_a_measured_start_is_refused():
+    runtime, _, _ = make()
+    runtime.cycle()
+    assert "give continuity={'velocity'" in refusal(runtime)
+
+
+# -- what is survived
+
+
+@pytest.mark.parametrize(("trouble", "kind"), [(1.0, "out of ideas"), (2.0, "not finite")])
+def test_a_dps_that_raises_or_commands_nan_is_replaced_in_the_same_cycle(trouble, kind):
+    runtime, bridge, _ = switched(rate=0.0)
+    runtime.run(cycles=5)
+    runtime.target.write(runtime.context, {"dps.trouble": trouble})
+    runtime.run(cycles=20)
+    commands = sent(bridge)
+    assert len(commands) == 25 and np.isfinite(commands).all()
+    assert kind in runtime.guards.latched[0].reason
+    assert commands[-1] == pytest.approx([0.0, 0.0])
+    with pytest.raises(SwitchRefusedError):
+        runtime.reset()
+    runtime.target.write(runtime.context, {"dps.trouble": 0.0})
+    runtime.run(cycles=1)
+    runtime.reset()
+    runtime.run(cycles=5)
+    assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
+
+
+def test_a_machine_that_falls_silent_leads_to_the_fallback_within_its_age_and_a_cycle():
+    silent_from = 0.1
+
+    def sensors(t):
+        return still(t) if t < silent_from else {}
+
+    runtime, bridge, _ = switched(sensors=sensors, rate=0.0)
+    runtime.run(cycles=200)
+    assert runtime.guards.latched[0].kind == "stale"
+    age = runtime.target.interface.sense[0].max_age
+    times = np.array([t for t, _ in bridge.sent])
+    stopped = times[np.flatnonzero((np.abs(sent(bridge)) < 1e-12).all(axis=1))[0]]
+    last = silent_from - PERIOD
+    assert stopped <= last + age + PERIOD + 1e-9
+
+
+def test_a_missed_deadline_is_left_out_and_no_command_is_sent_twice():
+    # The fifth waking is 3.4 periods late.
+    runtime, bridge, clock = switched(rate=0.0, lateness=[0.0] * 4 + [3.4 * PERIOD])
+    begin = clock.now()
+    runtime.run(cycles=10)
+    times = np.array([t for t, _ in bridge.sent]) - begin
+    assert runtime.missed == 3 and len(times) == 10
+    assert np.diff(times).min() >= 0.5 * PERIOD
+    assert times[-1] == pytest.approx(12 * PERIOD)
+    # The DPS's time is that of the cycles that were.
+    assert runtime.target.read(runtime.context, "dps.ticks") == 11.0
+
+
+def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
+    runtime, bridge, clock = switched(rate=0.0, pace="position")
+    before = bridge.sensed["position"].count
+    runtime.run(cycles=30)
+    assert len(bridge.sent) == 30
+    assert bridge.sensed["position"].count >= before + 30
+
+
+def test_a_watcher_that_raises_is_left_out_and_the_others_go_on():
+    seen = []
+
+    def broken(cycle):
+        raise OSError("disk full")
+
+    runtime, _, _ = make(watchers=(broken, seen.append))
+    runtime.run(cycles=5)
+    assert [cycle.number for cycle in seen] == [0, 1, 2, 3, 4]
+
+
+def test_requests_of_other_threads_are_served_between_cycles():
+    runtime, bridge, _ = switched(rate=0.0)
+    futures = []
+
+    def ask():
+        futures.append(runtime.request(lambda: runtime.target.write(runtime.context, {"u.target": [0.0, 0.0]})))
+        futures.append(runtime.request(lambda: runtime.switch("nowhere")))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    thread.join()
+    runtime.run(cycles=3)
+    assert futures[0].result(timeout=1) is None
+    with pytest.raises(ValueError, match="nowhere"):
+        futures[1].result(timeout=1)
+    assert sent(bridge)[-1] == pytest.approx(5.0 * np.array([-0.05, 0.0]))
+
+
+def test_an_interruption_sends_the_fallback_once():
+    runtime, bridge, _ = switched(rate=0.0)
+
+    def interrupt():
+        if runtime.cycles == 6:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        runtime.run(cycles=100, until=interrupt)
+    assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
+
+
+@pytest.mark.parametrize(("settings", "message"), [({"period": 0.0}, "positive"), ({"pace": "x"}, "position")])
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    scenario = ServoScenario()
+    clock = SimulatedClock()
+    with pytest.raises(ValueError, match=message):
+        Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)

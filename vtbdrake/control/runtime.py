@@ -1,0 +1,320 @@
+"""Runs a DPS against the machine: the testbed as the controller, cycle by cycle."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from math import floor, inf
+from typing import Any
+
+from pydrake.systems.framework import Context
+
+from vtbdrake.control.boundary import RealPorts
+from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.clock import Clock, WallClock
+from vtbdrake.control.guard import Guards, Verdict
+from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake.testbed.switch import REAL
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What happened in one cycle, for those who watch: a recorder, a plot.
+
+    Attributes:
+        number: of the cycle, from 0.
+        time: of the DPS, in seconds, at the end of the cycle.
+        now: on the runtime's clock, when the cycle's messages had been taken in.
+        commands: what the DPS commanded, by signal; empty if it raised.
+        verdict: what the guards made of it; `Verdict.commands` is what was sent.
+    """
+
+    number: int
+    time: float
+    now: float
+    commands: Mapping[str, Any]
+    verdict: Verdict
+
+
+class Runtime:
+    """Steps a testbed, or the DPS alone, once per period, with the machine on the other side of a bridge.
+
+    A cycle takes in what has arrived, gives it to the DPS, steps it by one period, lets the guards look at its
+    commands and sends them. The DPS's time is the number of cycles times the period, exactly: a cycle that is missed
+    is left out and counted, it is never caught up with, so that no burst of old commands goes out.
+
+    A testbed begins with its switches as they stand in ``context``; the DPS alone begins idle: it is stepped, and
+    commands, from its switch to ``real`` on.
+
+    Args:
+        target: what is stepped.
+        bridge: open; it is polled and publishes in the thread that runs the cycles.
+        period: of a cycle, in seconds.
+        context: where the target begins; by default its defaults. It is the runtime's own from here on.
+        clock: the wall clock by default; a `SimulatedClock` makes tests deterministic.
+        guards: limits, watchdogs and fallbacks; by default those that follow from the interface.
+        pace: by default the clock; the name of a sensor signal lets every message of it begin a cycle (lock-step with
+            the machine), or the clock, where none comes for ``patience`` periods.
+        continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
+            differ by more.
+        ready: says why the machine is not ready to be commanded, or None.
+        statistics: of the loop's timing.
+        watchers: called with every `Cycle`; one that raises is left out from then on, and the loop goes on.
+
+    Attributes:
+        cycles: how many there were.
+        missed: how many were left out.
+    """
+
+    def __init__(
+        self,
+        target: VirtualTestbed | DpsAlone,
+        bridge: Bridge,
+        *,
+        period: float = 1e-3,
+        context: Context | None = None,
+        clock: Clock | None = None,
+        guards: Guards | None = None,
+        pace: str | None = None,
+        patience: float = 3.0,
+        continuity: Mapping[str, tuple[str, float]] | None = None,
+        ready: Callable[[], str | None] = lambda: None,
+        statistics: LoopStatistics | None = None,
+        watchers: tuple[Callable[[Cycle], None], ...] = (),
+    ) -> None:
+        if not (0.0 < period < inf):
+            raise ValueError(f"the period of a loop is positive and finite, not {period} s")
+        if pace is not None and pace not in bridge.sensed:
+            raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
+        self.target = target
+        self.bridge = bridge
+        self.period = period
+        self.clock = clock or WallClock()
+        self.guards = guards or Guards(target.interface, period)
+        self.statistics = statistics or LoopStatistics(period)
+        self.continuity = dict(continuity or {})
+        self.ready = ready
+        self.cycles = 0
+        self.missed = 0
+        self._steps = 0
+        self._missed_in_a_row = 0
+        self._pace = pace
+        self._patience = patience * period
+        self._watchers = list(watchers)
+        self._simulator = target.simulator(context, restored=context is not None)
+        self._context = self._simulator.get_mutable_context()
+        self._t0 = self._context.get_time()
+        self._ports = RealPorts(target, self._context)
+        self._idle = isinstance(target, DpsAlone)
+        self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._stop = threading.Event()
+        self._watched: Mapping[str, Reception] = {}
+        self.look()
+
+    @property
+    def context(self) -> Context:
+        """The target's context; only the thread that runs the cycles may touch it while they run."""
+        return self._context
+
+    @property
+    def time(self) -> float:
+        """The DPS's time in seconds."""
+        return float(self._context.get_time())
+
+    # -- the loop
+
+    def run(
+        self,
+        *,
+        cycles: int | None = None,
+        seconds: float | None = None,
+        until: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Runs cycles until there were enough, or `stop` is called. Ctrl-C sends the fallback commands once, and ends
+        it.
+
+        Args:
+            cycles: how many.
+            seconds: on the clock.
+            until: asked after every cycle.
+        """
+        self._stop.clear()
+        begin = self.clock.now()
+        deadline, done = begin, 0
+        try:
+            while not self._stop.is_set():
+                if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
+                    return
+                woke = self._await(deadline)
+                lateness = 0.0 if self._pace is not None else woke - deadline
+                self.cycle(lateness=lateness)
+                done += 1
+                if until():
+                    return
+                deadline = self._next(deadline)
+        except BaseException:
+            self._send_fallback("the loop ended")
+            raise
+
+    def stop(self) -> None:
+        """Ends `run` after the present cycle; from any thread."""
+        self._stop.set()
+
+    def _await(self, deadline: float) -> float:
+        if self._pace is None:
+            return self.clock.wait_until(deadline)
+        reception = self.bridge.sensed[self._pace]
+        count, limit = reception.count, self.clock.now() + self._patience
+        while reception.count == count:
+            left = limit - self.clock.now()
+            if left <= 0.0:
+                break
+            self.bridge.poll(left)
+        return self.clock.now()
+
+    def _next(self, deadline: float) -> float:
+        """The next deadline; those that have passed already are left out and counted."""
+        if self._pace is not None:
+            return self.clock.now()
+        behind = floor((self.clock.now() - deadline) / self.period)
+        if behind >= 1:
+            # The one that is due just now can still be kept.
+            self.missed += behind
+            self.statistics.miss(behind)
+        self._missed_in_a_row = self._missed_in_a_row + behind if behind >= 1 else 0
+        return deadline + (max(behind, 0) + 1) * self.period
+
+    def cycle(self, *, lateness: float = 0.0) -> Cycle:
+        """One cycle, now."""
+        begin = self.clock.now()
+        self.bridge.poll()
+        now = self.clock.now()
+        self._serve()
+        self.feed()
+        active = [] if self._idle else self._ports.active()
+        error, commands = self._step(active)
+        stepped = self.clock.now()
+        verdict = self.guards.check(
+            now,
+            self._watched,
+            commands,
+            active,
+            error=error,
+            missed=self._missed_in_a_row,
+            not_ready=self.ready() if active else None,
+        )
+        if verdict.commands:
+            self.bridge.publish(verdict.commands)
+        self.statistics.record(lateness=lateness, step=stepped - now, cycle=self.clock.now() - begin)
+        done = Cycle(self.cycles, self.time, now, commands, verdict)
+        self.cycles += 1
+        for watcher in list(self._watchers):
+            try:
+                watcher(done)
+            except Exception:
+                _log.exception("a watcher of the loop raised, and is left out from now on")
+                self._watchers.remove(watcher)
+        return done
+
+    def _step(self, active: Iterable[str]) -> tuple[BaseException | None, dict[str, Any]]:
+        """Steps by one period; what is raised inside is the guards' business, not the loop's end."""
+        if self._idle:
+            return None, {}
+        try:
+            # A multiple of the period, exactly: a sum would give none or two updates now and then.
+            self._simulator.AdvanceTo(self._t0 + (self._steps + 1) * self.period)
+            self._steps += 1
+            return None, self._ports.commands(active)
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # The time stays where it was: the step is tried again in the next cycle.
+            return error, {}
+
+    def begin(self) -> None:
+        """Lets the DPS alone be stepped, and command."""
+        self._idle = False
+        self.look()
+
+    def look(self) -> None:
+        """Looks which sensor signals are on real; they are watched."""
+        sensed = self.bridge.sensed
+        if isinstance(self.target, DpsAlone):
+            self._watched = {} if self._idle else sensed
+        else:
+            positions = self.target.positions(self._context)["sense"]
+            self._watched = {name: sensed[name] for name, position in positions.items() if position == REAL}
+
+    def feed(self) -> None:
+        """Gives the newest samples to the DPS's real ports."""
+        for name, reception in self.bridge.sensed.items():
+            if reception.value is not None:
+                self._ports.feed(name, reception.value)
+
+    def command(self, name: str) -> Any:
+        """What the DPS would command now for an actuator signal, wherever its switch stands; None if it has not
+        begun."""
+        if self._idle:
+            return None
+        port = self.target.dps.GetOutputPort(name)
+        return port.Eval(self.target.dps.GetMyContextFromRoot(self._context))
+
+    def _send_fallback(self, reason: str) -> None:
+        verdict = self.guards.fault(reason, self.clock.now(), self._watched)
+        if verdict.commands and not self._idle:
+            self.bridge.publish({name: verdict.commands[name] for name in self._ports.active()})
+
+    # -- switches
+
+    def prepare(self, mode: str | None = None, **sides: Any) -> Preparation:
+        """First phase: looks whether switches can be thrown, and changes nothing; arguments as
+        `VirtualTestbed.switch`."""
+        return prepare(self, mode, **sides)
+
+    def perform(self, preparation: Preparation) -> None:
+        """Second phase: throws the switches of a preparation that has nothing against it, between two cycles.
+
+        Raises:
+            SwitchRefusedError: it has.
+        """
+        if preparation.reasons:
+            raise SwitchRefusedError("; ".join(preparation.reasons))
+        preparation.perform()
+
+    def switch(self, mode: str | None = None, **sides: Any) -> None:
+        """Both phases at once, in the thread that runs the cycles, or between them.
+
+        Raises:
+            SwitchRefusedError: something speaks against it; nothing has changed.
+        """
+        self.perform(self.prepare(mode, **sides))
+
+    def request(self, action: Callable[[], Any]) -> Future[Any]:
+        """Has ``action`` (a switch, a write to a variable) done at the beginning of the next cycle; from any thread."""
+        future: Future[Any] = Future()
+        self._requests.append((action, future))
+        return future
+
+    def _serve(self) -> None:
+        while self._requests:
+            action, future = self._requests.popleft()
+            try:
+                future.set_result(action())
+            except Exception as error:
+                future.set_exception(error)
+
+    def reset(self) -> None:
+        """Releases the latch of the guards; the DPS's commands go out again from the next cycle on.
+
+        Raises:
+            SwitchRefusedError: what they latched for is still there.
+        """
+        reasons = self.guards.reset(self.clock.now(), self._watched)
+        if reasons:
+            raise SwitchRefusedError("; ".join(reasons))

@@ -1,0 +1,127 @@
+"""Switching between simulation and reality in two phases: prepare may refuse and changes nothing, perform is quick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed.switch import REAL, SIM
+from vtbdrake.testbed.testbed import MODES, check_mode
+
+if TYPE_CHECKING:
+    from vtbdrake.control.runtime import Runtime
+
+
+class SwitchRefusedError(RuntimeError):
+    """A switch that was not thrown, with all that speaks against it."""
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What speaks against a switch, and how it is thrown if nothing does.
+
+    Attributes:
+        reasons: empty if nothing speaks against it.
+        perform: throws it.
+    """
+
+    reasons: tuple[str, ...]
+    perform: Callable[[], None]
+
+
+def prepare(
+    runtime: Runtime,
+    mode: str | None = None,
+    *,
+    sense: str | Mapping[str, str] | None = None,
+    act: str | Mapping[str, str] | None = None,
+) -> Preparation:
+    """See `Runtime.prepare`.
+
+    A sensor signal that becomes real has to be fresh and plausible, an actuator signal that becomes real has to
+    continue what is measured, and the machine has to be ready and within reach.
+
+    Raises:
+        ValueError: the mode, a signal or a position is unknown.
+    """
+    target = runtime.target
+    if mode is not None:
+        check_mode(mode)
+        sense, act = MODES[mode]
+    interface = target.interface
+    senses = _positions(sense, [signal.name for signal in interface.sense])
+    acts = _positions(act, [signal.name for signal in interface.act])
+    if isinstance(target, DpsAlone) and any(position != REAL for position in [*senses.values(), *acts.values()]):
+        raise ValueError("the DPS alone has no simulated world: it can be switched to real only")
+    now = runtime.clock.now()
+    reasons = []
+    becoming = [name for name, position in acts.items() if position != SIM]
+    if (becoming or REAL in senses.values()) and not runtime.bridge.connected:
+        reasons.append("the bridge is not connected")
+    for name, position in senses.items():
+        if position == REAL:
+            reasons += runtime.guards.doubts(name, now, runtime.bridge.sensed[name])
+    if becoming:
+        reasons += [f"the guards are latched ({fault.reason}): reset them first" for fault in runtime.guards.latched]
+        not_ready = runtime.ready()
+        if not_ready is not None:
+            reasons.append(f"the machine is not ready: {not_ready}")
+        reasons += _jumps(runtime, becoming)
+
+    def perform() -> None:
+        _throw(runtime, senses, acts)
+
+    return Preparation(tuple(reasons), perform)
+
+
+def _positions(wanted: str | Mapping[str, str] | None, names: list[str]) -> dict[str, str]:
+    if wanted is None:
+        return {}
+    return dict.fromkeys(names, wanted) if isinstance(wanted, str) else dict(wanted)
+
+
+def _jumps(runtime: Runtime, names: list[str]) -> list[str]:
+    """The actuator signals whose command would not continue what the machine measures."""
+    found = []
+    for name in names:
+        if name not in runtime.continuity:
+            if runtime.guards.needs_start(name):
+                found.append(
+                    f"the command {name} has a limit of its rate or acceleration, and nothing measured that it could "
+                    f"depart from: give continuity={{{name!r}: (sensor signal, largest difference)}}"
+                )
+            continue
+        sensor, limit = runtime.continuity[name]
+        measured = runtime.bridge.sensed[sensor].value
+        command = runtime.command(name)
+        if measured is None:
+            found.append(f"nothing is measured of {sensor}, from which the command {name} departs")
+            continue
+        if command is None:
+            continue  # A DPS that has not begun has no command.
+        gap = float(np.abs(command - measured).max())
+        if not gap <= limit:
+            found.append(f"the command {name} is {gap:.3g} away from the measured {sensor}; {limit:g} is allowed")
+    return found
+
+
+def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
+    target, context = runtime.target, runtime.context
+    for name, position in acts.items():
+        if position != SIM and name in runtime.continuity:
+            # Within its limits, the command departs from what is measured.
+            runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
+    if isinstance(target, DpsAlone):
+        runtime.begin()
+        return
+    before = target.positions(context)
+    runtime.feed()
+    target.switch(context, sense=senses or None, act=acts or None)
+    if SIM in acts.values() and any(before["act"][name] != SIM for name in acts) and target.believes:
+        # The simulated world takes over where the machine is.
+        target.start_from_belief(context)
+    runtime.look()
