@@ -20,6 +20,11 @@ BENCHMARKS: Registry = {
     "parallel_efficiency_python": "benchmarks.parallel:parallel_efficiency_python",
     "cluster_projection": "benchmarks.cluster:cluster_projection",
     "casadi_system": "benchmarks.casadi_system:casadi_system",
+    "study_overhead_threads": "benchmarks.study:study_overhead_threads",
+    "study_overhead_processes": "benchmarks.study:study_overhead_processes",
+    "study_against_optuna": "benchmarks.study:study_against_optuna",
+    "racing_savings": "benchmarks.study:racing_savings",
+    "time_to_target": "benchmarks.gait:time_to_target",
 }
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
