@@ -15,7 +15,7 @@ from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import StudyError
+from vtbdrake.optimization.study_file import StudyError, encode
 
 if TYPE_CHECKING:
     import optuna
@@ -78,9 +78,10 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
             names = ", ".join(optuna.get_all_study_names(opened)) or "none"
             raise StudyError(f"Optuna's storage has no study {name!r}; it has {names}") from error
         trials = found.get_trials(deepcopy=False)
-    known = {tuple(trial.parameters.values()) for trial in study.trials}
+    # By their text: 1 and True are equal as numbers.
+    known = {encode(tuple(trial.parameters.values())) for trial in study.trials}
     points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
-    return [point for point in dict.fromkeys(points) if point not in known]
+    return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
 
 
 def importances(study: Study) -> tuple[dict[str, float], ...]:
@@ -160,7 +161,6 @@ def _ours(exported: optuna.Study) -> Iterator[FrozenTrial]:
 
 
 def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
-    # As text: 1 and True are equal as numbers.
     return batch, json.dumps(params, sort_keys=True)
 
 
