@@ -310,9 +310,10 @@ def explained_by_one(direction: str) -> Study:
 
 
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])
-def test_the_parameter_that_explains_all_has_nearly_all_of_the_importance(direction):
+def test_the_parameter_that_explains_all_has_nearly_all_of_the_importance(direction, recwarn):
     pytest.importorskip("optuna")
     axes = plot_importances(explained_by_one(direction)).axes[0]
+    assert not recwarn.list
     shares = [bar.get_width() for bar in axes.patches]
     names = [tick.get_text() for tick in axes.get_yticklabels()]
     assert names[0] == "a" and shares[0] > 0.95

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
@@ -100,7 +101,9 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
     if len(values) < _FEWEST:
         raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
     found = []
-    with quiet():
+    with quiet(), warnings.catch_warnings():
+        # It says so of every target, also of one whose sign is right.
+        warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes the importances")
         exported = to_optuna(study, optuna.storages.InMemoryStorage(), name="importances")
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         for k, (name, direction) in enumerate(zip(study.names, study.directions, strict=True)):
