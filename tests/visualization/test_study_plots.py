@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.cbook import STEP_LOOKUP_MAP
 from matplotlib.figure import Figure
 
-from tests.optimization.studies import RATE, THETA, pendulum_problem
 from tests.optimization.recorded import point, recorded
+from tests.optimization.studies import RATE, THETA, pendulum_problem
 from vtbdrake.optimization import Choice, Parameter, Study
 from vtbdrake.visualization.study_plots import (
     plot_history,
