@@ -7,6 +7,7 @@ from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.strip import DpsAlone
 from vtbdrake.testbed.switch import Command
 from vtbdrake.testbed.testbed import VirtualTestbed
+from vtbdrake.testbed.world import WorldAlone
 
 __all__ = [
     "Command",
@@ -20,5 +21,6 @@ __all__ = [
     "SimulatorFields",
     "VirtualTestbed",
     "VirtualTestbedBuilder",
+    "WorldAlone",
     "load_scenario",
 ]

@@ -1,4 +1,4 @@
-"""A Diagram with addresses: what a testbed and the DPS alone have in common."""
+"""A Diagram with addresses: what a testbed, the DPS alone and the world alone have in common."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ class AddressedDiagram:
     """A Diagram, what lies in its Context by address, and how it is simulated.
 
     Attributes:
-        diagram: its input ports ``real.sense.<signal>`` and its output ports ``real.act.<signal>`` lead to a machine.
+        diagram: the input and output ports of it carry the DPS's signals.
         interface: the DPS's signals.
-        dps: the data processing system, a direct subsystem of the diagram.
         simulator_fields: how it is to be integrated.
         scenario: what built it, or None.
 
@@ -40,14 +39,12 @@ class AddressedDiagram:
         *,
         diagram: Diagram,
         interface: Interface,
-        dps: System,
         simulator: SimulatorFields,
         scenario: Scenario | None,
         variables: Variables,
     ) -> None:
         self.diagram = diagram
         self.interface = interface
-        self.dps = dps
         self.simulator_fields = simulator
         self.scenario = scenario
         self._variables = variables

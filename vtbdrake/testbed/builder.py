@@ -32,6 +32,10 @@ class VirtualTestbedBuilder:
 
     ``builder`` is the DiagramBuilder of the testbed: add and connect the inner parts of the simulated world there,
     or with `add`, which names a system by its role.
+
+    Attributes:
+        sensors, actuators: the ports of the simulated world, by signal.
+        extra_variables: those that `add_variable` lists.
     """
 
     def __init__(self, interface: Interface, *, simulator: SimulatorFields | None = None) -> None:
@@ -41,12 +45,12 @@ class VirtualTestbedBuilder:
         self.plant: MultibodyPlant | None = None
         self.scene_graph: SceneGraph | None = None
         self._dps: System | None = None
-        self._sensors: dict[str, OutputPort] = {}
-        self._actuators: dict[str, InputPort] = {}
+        self.sensors: dict[str, OutputPort] = {}
+        self.actuators: dict[str, InputPort] = {}
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
         self._beliefs: list[Belief] = []
-        self._extra: list[Variable] = []
+        self.extra_variables: list[Variable] = []
 
     def add(self, role: str, name: str, system: S) -> S:
         """Adds a part of the simulated world as ``sim.<role>.<name>``; role is sense, sys, act or env."""
@@ -72,13 +76,13 @@ class VirtualTestbedBuilder:
 
     def sim_sensor(self, name: str, port: OutputPort) -> None:
         """The simulated sensor signal ``name`` comes from ``port``."""
-        self._claim(self.interface.sense, name, "sensor", self._sensors).check_port(port, _owner(port))
-        self._sensors[name] = port
+        self._claim(self.interface.sense, name, "sensor", self.sensors).check_port(port, _owner(port))
+        self.sensors[name] = port
 
     def sim_actuator(self, name: str, port: InputPort) -> None:
         """The simulated actuator signal ``name`` goes to ``port``."""
-        self._claim(self.interface.act, name, "actuator", self._actuators).check_port(port, _owner(port))
-        self._actuators[name] = port
+        self._claim(self.interface.act, name, "actuator", self.actuators).check_port(port, _owner(port))
+        self.actuators[name] = port
 
     def command(self, name: str, port: OutputPort) -> None:
         """The command ``name`` comes from ``port``, instead of a constant that is the variable ``u.<name>``."""
@@ -128,7 +132,7 @@ class VirtualTestbedBuilder:
 
     def add_variable(self, variable: Variable) -> None:
         """Lists a further variable, derived from others, say."""
-        self._extra.append(variable)
+        self.extra_variables.append(variable)
 
     def build(
         self, *, mode: str = "sim", scenario: Scenario | None = None, meshcat: Meshcat | None = None, prefix: str = ""
@@ -145,15 +149,7 @@ class VirtualTestbedBuilder:
         check_mode(mode)
         if self._dps is None:
             raise SignalError("the testbed has no DPS: call set_dps")
-        for signal in self.interface.sense:
-            if signal.name not in self._sensors:
-                raise SignalError(f"no simulated sensor offers {signal.name}: call sim_sensor({signal.name!r}, port)")
-        for signal in self.interface.act:
-            if signal.name not in self._actuators:
-                raise SignalError(
-                    f"no simulated actuator takes {signal.name}: call sim_actuator({signal.name!r}, port)"
-                )
-        self._finish_plant()
+        self.finish_world()
         sense_position, act_position = MODES[mode]
         defaults = {s.name: s.vector(0.0 if s.default is None else s.default) for s in self.interface.commands}
         u = {name: value for name, value in defaults.items() if name not in self._commands}
@@ -167,9 +163,7 @@ class VirtualTestbedBuilder:
                 raise ValueError("there is nothing to draw: the testbed has no plant with a SceneGraph")
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.builder, self.scene_graph, meshcat, parameters)
-        diagram = self.builder.Build()
-        diagram.set_name("vtb")
-        self._refuse_what_cannot_be_repeated(diagram)
+        diagram = self.build_diagram("vtb")
         return VirtualTestbed(
             diagram=diagram,
             interface=self.interface,
@@ -181,13 +175,19 @@ class VirtualTestbedBuilder:
             simulator=self.simulator,
             scenario=scenario,
             beliefs=tuple(self._beliefs),
-            extra_variables=commands + tuple(self._extra),
-            plant_roles=self._plant_roles(),
+            extra_variables=commands + tuple(self.extra_variables),
+            plant_roles=self.plant_roles(),
             visualized=meshcat is not None,
         )
 
-    @staticmethod
-    def _refuse_what_cannot_be_repeated(diagram: Diagram) -> None:
+    def build_diagram(self, name: str) -> Diagram:
+        """The Diagram of what has been added.
+
+        Raises:
+            ValueError: it has a system that copies of its state could not repeat.
+        """
+        diagram = self.builder.Build()
+        diagram.set_name(name)
         for path, system in leaves(diagram):
             if "@" in path:
                 raise ValueError(f"the system {path} has no name, by which copies could find it: use AddNamedSystem")
@@ -196,25 +196,40 @@ class VirtualTestbedBuilder:
                     f"{path} is a RandomSource, whose generator no copy can continue; compute noise from (seed, "
                     "stream, tick), as the sensors in vtbdrake.components do"
                 )
+        return diagram
 
-    def _finish_plant(self) -> None:
+    def finish_world(self) -> None:
+        """Finalizes the plant.
+
+        Raises:
+            SignalError: the simulated world lacks a signal of the interface.
+        """
+        for signal in self.interface.sense:
+            if signal.name not in self.sensors:
+                raise SignalError(f"no simulated sensor offers {signal.name}: call sim_sensor({signal.name!r}, port)")
+        for signal in self.interface.act:
+            if signal.name not in self.actuators:
+                raise SignalError(
+                    f"no simulated actuator takes {signal.name}: call sim_actuator({signal.name!r}, port)"
+                )
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
-        for name, sensor in self._sensors.items():
+        for name, sensor in self.sensors.items():
             self.builder.Connect(sensor, switches.sim_sense[name])
             self.builder.ExportInput(switches.real_sense[name], f"real.sense.{name}")
             self.builder.Connect(switches.dps_sense[name], dps.GetInputPort(name))
-        for name, actuator in self._actuators.items():
+        for name, actuator in self.actuators.items():
             self.builder.Connect(switches.sim_act[name], actuator)
             self.builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
-        if self._actuators:
+        if self.actuators:
             self.builder.ExportOutput(switches.active, "real.act.active")
         for name, port in {**switches.commands, **self._commands}.items():
             self.builder.Connect(port, dps.GetInputPort(name))
 
-    def _plant_roles(self) -> dict[str, str]:
+    def plant_roles(self) -> dict[str, str]:
+        """The role of every model instance of the plant: ``sys`` or ``env``."""
         if self.plant is None:
             return {}
         roles = {}

@@ -28,6 +28,9 @@ class DpsAlone(AddressedDiagram):
 
     What the DPS needs to know of the world (a map, a model of the robot) is part of the DPS, and stays. Every actuator
     signal commands: ``real.act.active`` is 1 throughout.
+
+    Attributes:
+        dps: the data processing system, a direct subsystem of the diagram.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -53,7 +56,6 @@ class DpsAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            dps=dps,
             simulator=_without_plant(scenario.simulator),
             scenario=scenario,
             variables=collect(
@@ -62,6 +64,7 @@ class DpsAlone(AddressedDiagram):
                 extra=[clock, *board.command_variables(interface.commands)],
             ),
         )
+        self.dps = dps
         self._copiers: dict[int, StateCopier] = {}
 
     def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:

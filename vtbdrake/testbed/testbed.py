@@ -43,6 +43,7 @@ class VirtualTestbed(AddressedDiagram):
             for every actuator signal that commands, else 0). While an actuator signal's switch is on sim, its real
             port carries no command: NaN, or an empty `Command` for an abstract signal. No system in it touches
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
+        dps: the data processing system, a direct subsystem of the diagram.
         plant, scene_graph: of the simulated world, if it has them.
         visualized: True if a Meshcat draws it.
     """
@@ -67,7 +68,6 @@ class VirtualTestbed(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            dps=dps,
             simulator=simulator,
             scenario=scenario,
             variables=collect(
@@ -81,6 +81,7 @@ class VirtualTestbed(AddressedDiagram):
                 ],
             ),
         )
+        self.dps = dps
         self.plant = plant
         self.scene_graph = scene_graph
         self.visualized = visualized

@@ -1,0 +1,77 @@
+"""The simulated world alone, as it plays the robot: the same systems, without the DPS that they are made for."""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, Any
+
+from pydrake.systems.framework import Context
+
+from vtbdrake.state import Variable, collect
+from vtbdrake.state.variable import X
+from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.builder import VirtualTestbedBuilder
+
+if TYPE_CHECKING:
+    from vtbdrake.testbed.scenario import Scenario
+
+
+class WorldAlone(AddressedDiagram):
+    """The simulated world of a scenario without its DPS: what is left of the testbed when `DpsAlone` is taken away.
+
+    Its variables have the addresses that they have in the testbed.
+
+    Attributes:
+        diagram: input ports ``act.<signal>``, which lead to the simulated actuators, and output ports
+            ``sense.<signal>``, which come from the simulated sensors.
+        plant: of the simulated world, if it has one.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """
+        Raises:
+            ScenarioError: a field of the scenario has a value that nothing can be built with.
+            SignalError: the world lacks a signal of the interface.
+        """
+        scenario.validate()
+        own = copy.deepcopy(scenario)
+        parts = VirtualTestbedBuilder(own.interface(), simulator=own.simulator)
+        own.add_world(parts)
+        parts.finish_world()
+        for signal in parts.interface.sense:
+            parts.builder.ExportOutput(parts.sensors[signal.name], f"sense.{signal.name}")
+        for signal in parts.interface.act:
+            parts.builder.ExportInput(parts.actuators[signal.name], f"act.{signal.name}")
+        diagram = parts.build_diagram("world_alone")
+        roles = parts.plant_roles()
+        clock = Variable("time", X, (), "s", lambda context: context.get_time())
+        super().__init__(
+            diagram=diagram,
+            interface=parts.interface,
+            simulator=own.simulator,
+            scenario=own,
+            variables=collect(
+                diagram,
+                plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
+                extra=[clock, *parts.extra_variables],
+            ),
+        )
+        self.plant = parts.plant
+
+    def default_context(self) -> Context:
+        """A new context: s0 from defaults, every actuator with its idle command."""
+        context = super().default_context()
+        for signal in self.interface.act:
+            self.command(context, signal.name, signal.idle)
+        return context
+
+    def command(self, context: Context, name: str, value: Any) -> None:
+        """Gives the simulated actuator ``name`` a command, which lasts until the next one."""
+        signal = next(signal for signal in self.interface.act if signal.name == name)
+        port = self.diagram.GetInputPort(f"act.{name}")
+        if signal.is_vector:
+            port.FixValue(context, signal.vector(value))
+        else:
+            wrapped = signal.abstract_value()
+            wrapped.set_value(value)
+            port.FixValue(context, wrapped)
