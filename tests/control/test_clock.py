@@ -1,0 +1,146 @@
+"""Clocks wait for absolute deadlines."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from math import inf, nan
+from pathlib import Path
+
+import pytest
+
+from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_wall_clock_tells_monotonic_time() -> None:
+    before = time.monotonic()
+    now = WallClock().now()
+    assert before <= now <= time.monotonic()
+
+
+@pytest.mark.parametrize("spin", [0.0, 2e-3])
+def test_wall_clock_never_wakes_up_early(spin: float) -> None:
+    clock = WallClock(spin=spin)
+    begin = clock.now()
+    for k in range(1, 21):
+        deadline = begin + 1e-3 * k
+        assert deadline <= clock.wait_until(deadline) <= clock.now()
+
+
+def test_wall_clock_sleeps_while_it_waits() -> None:
+    clock = WallClock()
+    used = time.thread_time()
+    clock.wait_until(clock.now() + 0.2)
+    assert time.thread_time() - used < 0.1
+
+
+def test_wall_clock_polls_for_the_rest_if_it_is_to_spin() -> None:
+    clock = WallClock(spin=0.2)
+    used = time.thread_time()
+    deadline = clock.now() + 0.2
+    clock.wait_until(deadline)
+    polled = time.thread_time() - used
+    assert polled > 1e-3
+
+
+def test_deadline_that_has_passed_is_not_waited_for() -> None:
+    clock = WallClock()
+    assert clock.wait_until(clock.now() - 1e6) <= clock.now()
+
+
+def test_other_threads_run_while_the_wall_clock_waits() -> None:
+    clock, done = WallClock(), []
+    deadline = clock.now() + 0.3
+    thread = threading.Thread(target=lambda: done.append(clock.now()))
+    timer = threading.Timer(0.01, thread.start)
+    timer.start()
+    clock.wait_until(deadline)
+    timer.join()
+    thread.join()
+    assert done and done[0] < deadline
+
+
+def test_signal_handler_runs_and_the_wait_goes_on() -> None:
+    clock, handled = WallClock(), []
+    before = signal.signal(signal.SIGALRM, lambda *_: handled.append(clock.now()))
+    try:
+        deadline = clock.now() + 0.2
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        assert clock.wait_until(deadline) >= deadline
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert handled and handled[0] < deadline
+
+
+def test_ctrl_c_ends_the_wait() -> None:
+    code = (
+        "import time; from vtbdrake.control.clock import WallClock; c = WallClock()\n"
+        "print('waits', flush=True)\n"
+        "try: c.wait_until(c.now() + 60.0)\n"
+        "except KeyboardInterrupt: print('interrupted')"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "waits\n"
+            process.send_signal(signal.SIGINT)
+            rest, _ = process.communicate(timeout=30.0)
+        finally:
+            process.kill()
+    assert rest == "interrupted\n"
+
+
+@pytest.mark.parametrize("clock", [WallClock(), SimulatedClock()])
+@pytest.mark.parametrize("t", [nan, inf])
+def test_only_finite_times_can_be_waited_for(clock: Clock, t: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        clock.wait_until(t)
+
+
+@pytest.mark.parametrize("spin", [-1e-6, 1.0, nan])
+def test_spin_is_a_part_of_a_cycle(spin: float) -> None:
+    with pytest.raises(ValueError, match="spin"):
+        WallClock(spin=spin)
+
+
+def test_simulated_clock_is_at_once_where_it_is_to_be() -> None:
+    clock = SimulatedClock(start=2.0)
+    assert clock.now() == 2.0
+    assert clock.wait_until(3.5) == 3.5 == clock.now()
+
+
+def test_simulated_clock_never_runs_backwards() -> None:
+    clock = SimulatedClock(start=2.0)
+    assert clock.wait_until(1.0) == 2.0
+
+
+def test_simulated_clock_is_late_by_script() -> None:
+    clock = SimulatedClock(lateness=[0.25, 0.0, 0.5])
+    assert [clock.wait_until(float(t)) for t in (1, 2, 3, 4)] == [1.25, 2.0, 3.5, 4.0]
+
+
+def test_simulated_clock_is_late_by_a_function_of_the_call() -> None:
+    clock = SimulatedClock(lateness=lambda call: 0.125 * call)
+    assert [clock.wait_until(float(t)) for t in (1, 2, 3)] == [1.0, 2.125, 3.25]
+
+
+def test_work_takes_simulated_time() -> None:
+    clock = SimulatedClock()
+    clock.advance(0.75)
+    assert clock.wait_until(0.5) == 0.75
+
+
+@pytest.mark.parametrize("seconds", [-1.0, nan, inf])
+def test_simulated_time_runs_forwards(seconds: float) -> None:
+    with pytest.raises(ValueError, match="forwards"):
+        SimulatedClock().advance(seconds)
+
+
+def test_simulated_clock_is_never_early() -> None:
+    with pytest.raises(ValueError, match="late or in time"):
+        SimulatedClock(lateness=[-0.1]).wait_until(1.0)

@@ -1,0 +1,259 @@
+"""Commands leave a guard within all limits, and are left alone where they keep to them."""
+
+from __future__ import annotations
+
+import math
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vtbdrake.control.limits import AbstractGuard, CommandFault, CommandGuard
+from vtbdrake.testbed import Signal
+
+T = 1e-3
+EPS = np.finfo(float).eps
+
+
+def signal(size: int = 1, **limits: object) -> Signal:
+    return Signal("joint_position", size=size, unit="rad", idle=0.0, **limits)
+
+
+def guard(start: float | None = 0.0, **limits: object) -> CommandGuard:
+    made = CommandGuard(signal(**limits), period=T)
+    if start is not None:
+        made.start_from([start])
+    return made
+
+
+def way_to_rest(w: float, a: float) -> float:
+    """The way of a step w and all that follow it while each is shorter by a."""
+    way = 0.0
+    while w > 0.0:
+        way, w = way + w, w - a
+    return way
+
+
+def longest_step(d: float, a: float, most: float = 5e-3) -> float:
+    """By bisection: the longest step, up to ``most``, after which there is a rest within d."""
+    low, high = 0.0, min(d, most)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if way_to_rest(middle, a) <= d else (low, middle)
+    return low
+
+
+positive = st.floats(1e-2, 1e3)
+limited = st.one_of(positive, st.just(inf))
+entry = st.one_of(st.floats(-5.0, 5.0), st.floats(allow_nan=False, allow_infinity=False))
+
+
+@settings(deadline=None)
+@given(
+    rate=limited,
+    acceleration=st.one_of(st.floats(1.0, 1e4), st.just(inf)),
+    lower=st.one_of(st.floats(-3.0, 0.0), st.just(-inf)),
+    upper=st.one_of(st.floats(0.0, 3.0), st.just(inf)),
+    start=st.floats(-1.0, 1.0),
+    commands=st.lists(st.tuples(entry, st.integers(1, 30)), min_size=1, max_size=20),
+)
+def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
+    rate: float,
+    acceleration: float,
+    lower: float,
+    upper: float,
+    start: float,
+    commands: list[tuple[float, int]],
+) -> None:
+    one = guard(None, rate=rate, acceleration=acceleration, lower=lower, upper=upper)
+    one.start_from([start])
+    before = min(max(start, lower), upper)
+    step_before = 0.0
+    assert one.last_sent == before
+    for command, times in commands:
+        for _ in range(times):
+            sent = one.limit([command]).item()
+            step = sent - before
+            rounding = 8 * EPS * max(abs(sent), abs(before), abs(step_before))
+            assert lower <= sent <= upper
+            assert abs(step) <= rate * T + rounding
+            assert abs(step - step_before) <= acceleration * T**2 + rounding
+            before, step_before = sent, step
+
+
+@settings(deadline=None)
+@given(
+    acceleration=st.floats(1.0, 1e4),
+    upper=st.floats(0.01, 0.5),
+    waits=st.integers(0, 60),
+)
+def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int) -> None:
+    a, rate = acceleration * T**2, 5.0
+    one = guard(rate=rate, acceleration=acceleration, upper=upper)
+    position, step = 0.0, 0.0
+    for _ in range(waits):
+        sent = one.limit([1e6]).item()
+        expected = min(rate * T, step + a, longest_step(upper - position, a))
+        assert sent - position == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        position, step = sent, sent - position
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-0.999, 0.999), min_size=1, max_size=60))
+def test_sequence_that_can_go_on_for_ever_passes_unchanged(shares: list[float]) -> None:
+    rate, acceleration, bound = 0.5, 20.0, 0.002
+    a = acceleration * T**2
+    one = guard(rate=rate, acceleration=acceleration, lower=-bound, upper=bound)
+    s, x = 0.0, 0.0
+    for share in shares:
+        most = min(rate * T, x + a, longest_step(bound - s, a))
+        least = max(-rate * T, x - a, -longest_step(bound + s, a))
+        command = s + 0.5 * (most + least) + 0.5 * share * (most - least)
+        assert one.limit([command]).item() == command
+        s, x = command, command - s
+    assert [count.count for count in one.counts.values()] == [0, 0, 0]
+
+
+def test_motion_from_end_to_end_of_the_range_passes_unchanged() -> None:
+    bound, frequency = 0.3, 4.0
+    one = guard(
+        -bound, rate=1.01 * bound * frequency, acceleration=1.01 * bound * frequency**2, lower=-bound, upper=bound
+    )
+    for k in range(2000):
+        command = -bound * math.cos(frequency * k * T)
+        assert one.limit([command]).item() == command
+
+
+def test_step_command_takes_the_time_of_full_acceleration_and_full_braking() -> None:
+    one = guard(rate=inf, acceleration=10.0, upper=0.4)
+    sent = [one.limit([1.0]).item() for _ in range(1000)]
+    first_at_end = next(k for k, s in enumerate(sent, 1) if s >= 0.4 - 1e-9)
+    assert first_at_end * T == pytest.approx(2.0 * math.sqrt(0.4 / 10.0), abs=2 * T)
+    assert sent[-1] == 0.4
+
+
+def test_speed_at_a_distance_from_the_end_is_that_of_constant_braking() -> None:
+    one = guard(rate=inf, acceleration=10.0, upper=0.4)
+    before = 0.0
+    while (sent := one.limit([1.0]).item()) < 0.3:
+        before = sent
+    assert (sent - before) / T == pytest.approx(math.sqrt(2.0 * 10.0 * 0.1), rel=0.02)
+
+
+def test_hold_after_motion_brakes_at_the_limit_of_acceleration() -> None:
+    one = guard(rate=1.0, acceleration=10.0)
+    for _ in range(50):
+        one.limit([10.0])
+    steps = []
+    for _ in range(60):
+        before = one.last_sent
+        steps.append((one.limit(before) - before).item() / T)
+    expected = [max(0.0, 0.5 - 0.01 * k) for k in range(1, 61)]
+    assert steps == pytest.approx(expected, abs=1e-9)
+
+
+def test_entries_have_limits_of_their_own() -> None:
+    one = CommandGuard(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
+    one.start_from([0.0, 0.5, 0.0])
+    assert one.limit([1.0, -1.0, 2.0]).tolist() == [1e-3, 0.5 - 2e-3, 0.5]
+
+
+def test_counts_tell_how_often_and_by_how_much_each_limit_acted() -> None:
+    one = guard(rate=1.0, upper=0.0015)
+    one.limit([0.0005])
+    one.limit([0.1])
+    one.limit([0.2])
+    assert {name: count.count for name, count in one.counts.items()} == {"range": 1, "rate": 1, "acceleration": 0}
+    assert one.counts["rate"].largest == pytest.approx(0.1 - 0.0015)
+    assert one.counts["range"].largest == pytest.approx(0.2 - 0.0015)
+
+
+def test_limit_of_acceleration_counts() -> None:
+    one = guard(acceleration=10.0)
+    one.limit([1.0])
+    assert one.counts["acceleration"].count == 1
+    assert one.counts["acceleration"].largest == pytest.approx(1.0 - 1e-5)
+
+
+def test_rounding_of_a_command_at_its_limit_does_not_count() -> None:
+    one = guard(rate=0.7)
+    for k in range(1, 1000):
+        command = 0.7 * k * T
+        assert one.limit([command]).item() == pytest.approx(command, rel=1e-14)
+    assert one.counts["rate"].count == 0
+
+
+def test_start_is_left_at_rest_whatever_the_motion_before() -> None:
+    one = guard(acceleration=10.0)
+    for _ in range(100):
+        one.limit([1.0])
+    one.start_from([0.3])
+    assert one.limit([1.0]).item() == pytest.approx(0.3 + 1e-5, rel=1e-12)
+
+
+@pytest.mark.parametrize(("limits"), [{"rate": 1.0}, {"acceleration": 1.0}])
+def test_limited_rate_without_a_start_is_a_fault(limits: dict[str, float]) -> None:
+    one = guard(None, **limits)
+    assert one.needs_start and not one.has_start
+    with pytest.raises(CommandFault, match="no start") as caught:
+        one.limit([0.0])
+    assert caught.value.kind == "not started"
+
+
+def test_range_alone_needs_no_start() -> None:
+    one = guard(None, lower=-1.0, upper=1.0)
+    assert [one.limit([c]).item() for c in (3.0, -0.5, -2.0)] == [1.0, -0.5, -1.0]
+
+
+def test_released_guard_forgets_what_was_sent() -> None:
+    one = guard(rate=1.0)
+    one.release()
+    assert one.last_sent is None and not one.has_start
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+def test_entry_that_is_not_finite_is_a_fault_and_changes_nothing(bad: float) -> None:
+    one = CommandGuard(signal(2, rate=1.0), period=T)
+    one.start_from([0.0, 0.0])
+    with pytest.raises(CommandFault, match="not finite") as caught:
+        one.limit([1.0, bad])
+    assert caught.value.kind == "not finite"
+    assert one.last_sent.tolist() == [0.0, 0.0]
+
+
+def test_large_finite_entries_are_finite() -> None:
+    one = CommandGuard(signal(2, lower=-1.0, upper=1.0), period=T)
+    assert one.limit([1.7e308, 1.7e308]).tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "bad", [[0.0], [0.0, 0.0, 0.0], 0.0, [[0.0, 0.0]], None, "ab", [0.0, "x"], [[0.0], [1.0, 2.0]]]
+)
+def test_command_of_another_size_is_a_fault(bad: object) -> None:
+    one = CommandGuard(signal(2), period=T)
+    with pytest.raises(CommandFault) as caught:
+        one.limit(bad)
+    assert caught.value.kind == "size"
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, nan, inf])
+def test_period_must_be_positive(period: float) -> None:
+    with pytest.raises(ValueError, match="positive period"):
+        CommandGuard(signal(), period=period)
+
+
+def test_limits_that_leave_no_step_are_refused() -> None:
+    with pytest.raises(ValueError, match="leave no step"):
+        CommandGuard(signal(acceleration=1e-300), period=T)
+
+
+def test_abstract_signal_has_no_limits_but_remembers() -> None:
+    picture = Signal("lamp", model_value="off", idle="off")
+    with pytest.raises(ValueError, match="abstract"):
+        CommandGuard(picture, period=T)
+    one = AbstractGuard(picture)
+    assert one.limit("on") == "on" and one.last_sent == "on"
+    with pytest.raises(CommandFault):
+        one.limit(None)

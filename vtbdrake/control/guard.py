@@ -1,0 +1,263 @@
+"""Guards: whatever the DPS does, the machine gets commands within limits, or those of a fallback."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping
+from math import isnan
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from vtbdrake.control.bridge import Reception
+from vtbdrake.control.fallback import Fallback, chain, default_fallback
+from vtbdrake.control.limits import NOT_STARTED, AbstractGuard, CommandFault, CommandGuard
+from vtbdrake.control.watchdog import Fault, Watchdog
+from vtbdrake.testbed import Interface, Signal
+
+_log = logging.getLogger(__name__)
+
+
+class Verdict(NamedTuple):
+    """What the guards made of a cycle.
+
+    Attributes:
+        commands: what is to be sent, by actuator signal.
+        ok: whether these are the DPS's commands, limited; else they are the fallbacks'.
+        faults: what is wrong in this cycle; a latch can outlast it.
+    """
+
+    commands: dict[str, Any]
+    ok: bool
+    faults: tuple[Fault, ...]
+
+
+class Guards:
+    """Stands between a DPS and a machine.
+
+    In every cycle, `check` limits the commands of the actuator signals that are on real, unless there is a fault: a
+    sensor signal that is stale or implausible; a DPS that raised; a command that is missing, not finite or of a wrong
+    size; too many missed deadlines in a row; a machine that is not ready. A fault *latches* in the same cycle: from
+    then on the fallbacks command all signals that are on real, until `reset`. While nothing is on real, faults are
+    told, but nothing latches.
+
+    A signal with a limit of its rate or acceleration needs `start` before it is commanded. What has neither a start nor
+    a command that was sent is not sent at all: there is nothing to hold.
+
+    Fallbacks go on when the machine is gone, with the sensor signals that are still fresh: `Brake` turns into `Zero`
+    when its velocity is stale.
+
+    Args:
+        interface: of the DPS.
+        period: of the loop, in seconds.
+        fallback: by actuator signal; see `default_fallback` for the others.
+        jump_tolerance: by sensor signal; see `Watchdog`.
+        max_missed: more deadlines missed in a row are a fault.
+        log_size: how many faults `log` keeps.
+
+    Attributes:
+        commands: the guard of each actuator signal, with its counts.
+        watchdogs: of each sensor signal.
+        log: the newest faults, each once while it lasts.
+
+    Raises:
+        ValueError: a fallback is missing, for an unknown signal or does not fit its signal.
+    """
+
+    def __init__(
+        self,
+        interface: Interface,
+        period: float,
+        *,
+        fallback: Mapping[str, Fallback] | None = None,
+        jump_tolerance: Mapping[str, ArrayLike] | None = None,
+        max_missed: float = 10,
+        log_size: int = 1000,
+    ) -> None:
+        fallback, jump_tolerance = dict(fallback or {}), dict(jump_tolerance or {})
+        _refuse_unknown("fallback", fallback, interface.act)
+        _refuse_unknown("jump_tolerance", jump_tolerance, interface.sense)
+        if isnan(max_missed) or max_missed < 0:
+            raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
+        self.commands: dict[str, CommandGuard | AbstractGuard] = {
+            s.name: CommandGuard(s, period=period) if s.is_vector else AbstractGuard(s) for s in interface.act
+        }
+        self.watchdogs = {s.name: Watchdog(s, jump_tolerance=jump_tolerance.get(s.name)) for s in interface.sense}
+        self.log: deque[Fault] = deque(maxlen=log_size)
+        self._fallbacks = {
+            s.name: chain(fallback.get(s.name) or default_fallback(s), s, interface=interface) for s in interface.act
+        }
+        self._max_missed = max_missed
+        self._period = period
+        self._latched: tuple[Fault, ...] = ()
+        self._faults: tuple[Fault, ...] = ()
+        self._causes: tuple[Fault, ...] = ()  # Those of them that are not about sensor signals.
+        self._failed: set[Fallback] = set()
+        self._active: frozenset[str] = frozenset()
+        self._last: float | None = None
+
+    @property
+    def latched(self) -> tuple[Fault, ...]:
+        """The faults that latched; empty while the DPS commands."""
+        return self._latched
+
+    def needs_start(self, name: str) -> bool:
+        """Whether an actuator signal has a limit of its rate or acceleration, which counts from somewhere."""
+        return self.commands[name].needs_start
+
+    def start(self, name: str, value: Any) -> None:
+        """Lets the commands of an actuator signal depart from ``value``, at rest.
+
+        When its switch is thrown to real, that is what is measured.
+
+        Raises:
+            ValueError: it has another size or is not finite.
+        """
+        self.commands[name].start_from(value)
+
+    def doubts(self, name: str, now: float, reception: Reception) -> list[str]:
+        """What is wrong with a sensor signal now."""
+        fault = self.watchdogs[name].check(now, reception)
+        return [fault.reason] if fault else []
+
+    def check(
+        self,
+        now: float,
+        receptions: Mapping[str, Reception],
+        commands: Mapping[str, Any],
+        active: Collection[str] | None = None,
+        *,
+        error: BaseException | None = None,
+        missed: int = 0,
+        not_ready: str | None = None,
+    ) -> Verdict:
+        """One cycle. What it returns counts as sent.
+
+        Args:
+            now: the time on the clock of `Reception.arrived`, in seconds.
+            receptions: of the sensor signals that are on real; no others are watched.
+            commands: of the DPS, by actuator signal.
+            active: the actuator signals that are on real; by default those of ``commands``, and those of the cycle
+                before if the DPS raised.
+            error: what the DPS raised, if it did.
+            missed: how many deadlines were missed in a row, up to now.
+            not_ready: why the machine is not ready, if it is not.
+        """
+        driven = self._activate(active if active is not None else self._active if error else commands)
+        faults = self._whole(now, error, missed, not_ready)
+        wanted = {}
+        if error is None:
+            for name in driven:
+                try:
+                    wanted[name] = self._checked(name, commands)
+                except CommandFault as problem:
+                    faults.append(Fault(now, name, problem.kind, f"the command {name} {problem}"))
+        causes = len(faults)
+        watchdogs = self.watchdogs
+        for name, reception in receptions.items():
+            if fault := watchdogs[name].check(now, reception):
+                faults.append(fault)
+        if faults or self._faults:
+            self._note(faults, causes)
+            if faults and driven and not self._latched:
+                self._latch(self._faults)
+        if self._latched:
+            return Verdict(self._fall_back(now, receptions), False, self._faults)
+        self._last = now
+        return Verdict({name: self.commands[name].send(values) for name, values in wanted.items()}, True, self._faults)
+
+    def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
+        """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
+        told = Fault(now, None, "told", reason)
+        self.log.append(told)
+        if not self._latched:
+            self._latch((told,))
+        return Verdict(self._fall_back(now, receptions), False, (*self._faults, told))
+
+    def reset(self, now: float, receptions: Mapping[str, Reception]) -> tuple[str, ...]:
+        """Releases the latch, unless a cause persists: the DPS's and the loop's as of the last `check`, the sensor
+        signals' as of now.
+
+        Returns:
+            Why it stays; empty if it was released.
+        """
+        doubts = (self.watchdogs[name].check(now, reception) for name, reception in receptions.items())
+        reasons = tuple(fault.reason for fault in (*self._causes, *doubts) if fault)
+        if not reasons:
+            self._latched = ()
+        return reasons
+
+    def _activate(self, names: Iterable[str]) -> frozenset[str]:
+        """Takes note of what is on real; a signal that no longer is has to start anew."""
+        active = frozenset(names)
+        if active != self._active:
+            for name in self._active - active:
+                self.commands[name].release()
+            self._active = active
+        return active
+
+    def _whole(self, now: float, error: BaseException | None, missed: int, not_ready: str | None) -> list[Fault]:
+        """The faults that are not about one signal."""
+        faults = []
+        if error is not None:
+            faults.append(Fault(now, None, "raised", f"the DPS raised {type(error).__name__}: {error}"))
+        if missed > self._max_missed:
+            reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
+            faults.append(Fault(now, None, "missed", reason))
+        if not_ready is not None:
+            faults.append(Fault(now, None, "not ready", f"the machine is not ready: {not_ready}"))
+        return faults
+
+    def _checked(self, name: str, commands: Mapping[str, Any]) -> Any:
+        guard = self.commands[name]
+        if name not in commands:
+            raise CommandFault("missing", "is missing")
+        if guard.needs_start and not guard.has_start:
+            raise CommandFault("not started", NOT_STARTED)
+        return guard.checked(commands[name])
+
+    def _note(self, faults: list[Fault], causes: int) -> None:
+        """Logs the faults that the cycle before did not have."""
+        known = {(fault.signal, fault.kind) for fault in self._faults}
+        self.log.extend(fault for fault in faults if (fault.signal, fault.kind) not in known)
+        self._faults, self._causes = tuple(faults), tuple(faults[:causes])
+
+    def _latch(self, faults: tuple[Fault, ...]) -> None:
+        self._latched = faults
+        self._failed.clear()
+        _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
+
+    def _fall_back(self, now: float, receptions: Mapping[str, Reception]) -> dict[str, Any]:
+        """The fallbacks' commands, within the limits."""
+        dt = self._period if self._last is None else now - self._last
+        self._last = now
+        sensed = {
+            name: reception.value
+            for name, reception in receptions.items()
+            if self.watchdogs[name].check(now, reception) is None
+        }
+        return {
+            name: self._fallback_command(name, now, sensed, dt)
+            for name, guard in self.commands.items()
+            if name in self._active and guard.has_start
+        }
+
+    def _fallback_command(self, name: str, now: float, sensed: Mapping[str, Any], dt: float) -> Any:
+        guard: Any = self.commands[name]
+        last_sent = guard.last_sent
+        for fallback in self._fallbacks[name]:
+            try:
+                return guard.limit(fallback.command(last_sent, sensed, dt))
+            except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+                if fallback not in self._failed:
+                    self._failed.add(fallback)
+                    reason = f"{type(fallback).__name__} cannot command {name}: {type(error).__name__}: {error}"
+                    self.log.append(Fault(now, name, "fallback", reason))
+        return guard.send(guard.checked(last_sent))
+
+
+def _refuse_unknown(what: str, given: Iterable[str], signals: Iterable[Signal]) -> None:
+    names = [signal.name for signal in signals]
+    if unknown := sorted(set(given) - set(names)):
+        raise ValueError(f"{what} is given for {', '.join(unknown)}, but the signals are {', '.join(names)}")

@@ -1,0 +1,244 @@
+"""What a command has to keep to before it may be sent: size, finite entries, range, rate and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.testbed import Signal
+
+# What stands for "no limit" of a range. Its square is still finite, so that no arithmetic of limits overflows.
+_FAR = 1e150
+
+# Of the magnitude of a command: a difference that only comes from how the command was computed is no limiting.
+_ROUNDING = 1e-12
+
+NOT_STARTED = "has a limit of its rate or acceleration, but no start: say what it departs from"
+
+
+class CommandFault(ValueError):  # noqa: N818 - a fault is what the guards of a machine call it
+    """A command that cannot be sent, whatever the limits.
+
+    Attributes:
+        kind: ``size``, ``not finite`` or ``not started``.
+    """
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+
+
+@dataclass
+class LimitCount:
+    """What a limit did.
+
+    Attributes:
+        count: how many entries of commands it changed.
+        largest: by how much at most, in the signal's unit.
+    """
+
+    count: int = 0
+    largest: float = 0.0
+
+
+class CommandGuard:
+    """Keeps the commands of a vector actuator signal within its limits.
+
+    With the period T, the command c, what was sent last s and the step before it x, the step that is sent, w = s' - s,
+    keeps, entry by entry,
+
+        |w| <= rate T,    |w - x| <= acceleration T^2,    lower <= s' <= upper,
+
+    and stops in time: after it, steps that shrink by a = acceleration T^2 each come to rest within the range. Since w
+    is followed by w - a, w - 2 a, ..., the way that a step takes in all is
+
+        f(w) = sum_{j >= 0} max(0, w - j a),
+
+    and the largest step towards an end at the distance d is the solution of f(w) = d: with the whole number m for which
+    a m (m + 1) / 2 <= d < a (m + 1) (m + 2) / 2,
+
+        w = d / (m + 1) + a m / 2,
+
+    which is the known approach speed sqrt(2 acceleration d) in steps. No other limiter is more generous: a sequence of
+    commands passes unchanged if and only if it can be continued for ever within the limits. Three limits never
+    contradict each other, because what was sent before kept to them too.
+
+    Args:
+        signal: its limits count.
+        period: T, in seconds: the time from one command to the next.
+
+    Attributes:
+        counts: what each limit did, by its name: ``range`` (stopping before its end included), ``rate``,
+            ``acceleration``. An entry that several limit counts for the last of rate, acceleration and range.
+    """
+
+    def __init__(self, signal: Signal, *, period: float) -> None:
+        if signal.size is None:
+            raise ValueError(f"the actuator signal {signal.name} is abstract: only vectors can be limited")
+        if not (period > 0.0 and isfinite(period)):
+            raise ValueError(f"commands are limited for a positive period, not {period} s")
+        self.signal = signal
+        self.counts = {name: LimitCount() for name in ("range", "rate", "acceleration")}
+        self._size = signal.size
+        steps = signal.vector(signal.rate) * period
+        changes = signal.vector(signal.acceleration) * period**2
+        if not (steps.min() > 1 / _FAR and changes.min() > 1 / _FAR):
+            raise ValueError(
+                f"signal {signal.name}: its rate {signal.rate} and acceleration {signal.acceleration} leave no step at "
+                f"a period of {period} s"
+            )
+        lower = np.maximum(signal.vector(signal.lower), -_FAR)
+        upper = np.minimum(signal.vector(signal.upper), _FAR)
+        self._limits: list[tuple[float, float, float, float]] = list(
+            zip(steps.tolist(), changes.tolist(), lower.tolist(), upper.tolist(), strict=True)
+        )
+        self.needs_start = bool(np.isfinite(steps).any() or np.isfinite(changes).any())
+        self._sent: list[float] | None = None
+        self._steps = [0.0] * self._size
+
+    @property
+    def has_start(self) -> bool:
+        """Whether there is something that the next command departs from."""
+        return self._sent is not None
+
+    @property
+    def last_sent(self) -> NDArray[np.float64] | None:
+        """Of shape (size,); None while there is neither a start nor a command."""
+        return None if self._sent is None else np.array(self._sent)
+
+    def start_from(self, value: ArrayLike) -> None:
+        """Lets the next command depart from ``value`` (shape (size,)), at rest; out of range, from the range's end.
+
+        Raises:
+            CommandFault: it has another size or is not finite.
+        """
+        self._sent = [
+            min(max(entry, lower), upper)
+            for entry, (_, _, lower, upper) in zip(self.checked(value), self._limits, strict=True)
+        ]
+        self._steps = [0.0] * self._size
+
+    def release(self) -> None:
+        """Forgets what was sent: from now on somebody else commands."""
+        self._sent = None
+
+    def limit(self, command: ArrayLike) -> NDArray[np.float64]:
+        """What may be sent for ``command``, of shape (size,); it counts as sent.
+
+        Raises:
+            CommandFault: it has another size or is not finite, or a limit of rate or acceleration lacks a start.
+        """
+        return self.send(self.checked(command))
+
+    def checked(self, command: ArrayLike) -> list[float]:
+        """The entries of ``command``; nothing is sent.
+
+        Raises:
+            CommandFault: as `limit`.
+        """
+        try:
+            array = np.asarray(command, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise CommandFault("size", f"is not a vector of {self._size} numbers: {error}") from error
+        if array.shape != (self._size,):
+            raise CommandFault("size", f"has the shape {array.shape} instead of ({self._size},)")
+        values: list[float] = array.tolist()
+        # The sum is quick, but large entries overflow it.
+        if not isfinite(sum(values)) and not all(map(isfinite, values)):
+            raise CommandFault("not finite", f"is not finite: {values}")
+        return values
+
+    def send(self, values: Sequence[float]) -> NDArray[np.float64]:
+        """As `limit`, for entries that were `checked`."""
+        sent = self._sent
+        if sent is None:
+            if self.needs_start:
+                raise CommandFault("not started", NOT_STARTED)
+            self._sent = sent = [
+                min(max(c, lower), upper) for c, (_, _, lower, upper) in zip(values, self._limits, strict=True)
+            ]
+        new, steps = list(values), self._steps
+        for i, (c, s, x, (step, change, lower, upper)) in enumerate(
+            zip(values, sent, steps, self._limits, strict=True)
+        ):
+            w = c - s
+            # A parabola half a change ahead lies above f: what it lets pass may pass, and most does.
+            reach = (w if w > 0.0 else -w) + 0.5 * change
+            if not (
+                -step <= w <= step
+                and -change <= w - x <= change
+                and lower <= c <= upper
+                and reach * reach <= 2.0 * change * (upper - s if w > 0.0 else s - lower)
+            ):
+                new[i] = self._limited(c, s, x, step, change, lower, upper)
+                w = new[i] - s
+            steps[i] = w
+        self._sent = new
+        return np.array(new)
+
+    def _limited(self, c: float, s: float, x: float, step: float, change: float, lower: float, upper: float) -> float:
+        """One entry of what is sent."""
+        w, acted = c - s, ""
+        if abs(w) > step:
+            w, acted = step if w > 0.0 else -step, "rate"
+        if abs(w - x) > change:
+            w, acted = x + change if w > x else x - change, "acceleration"
+        # The range comes last: where rounding makes limits contradict each other, it is the one that holds exactly.
+        if w > (most := _longest_step(upper - s, change)):
+            w, acted = most, "range"
+        elif w < (least := -_longest_step(s - lower, change)):
+            w, acted = least, "range"
+        # Unless a limit acted, c passes as it is, without the rounding of s + w.
+        sent = min(max(s + w if acted else c, lower), upper)
+        amount = abs(sent - c)
+        if acted and amount > _ROUNDING * (abs(s) + abs(c)):
+            count = self.counts[acted]
+            count.count += 1
+            count.largest = max(count.largest, amount)
+        return sent
+
+
+def _longest_step(d: float, a: float) -> float:
+    """The step w with f(w) = d; see `CommandGuard`."""
+    if d <= a:
+        return d
+    m = (sqrt(1.0 + 8.0 * d / a) - 1.0) // 2.0
+    return d / (m + 1.0) + 0.5 * a * m
+
+
+class AbstractGuard:
+    """Stands for `CommandGuard` where the actuator signal is abstract: it remembers what was sent, no more."""
+
+    needs_start = False
+
+    def __init__(self, signal: Signal) -> None:
+        self.signal = signal
+        self.counts: dict[str, LimitCount] = {}
+        self.last_sent: Any = None
+
+    @property
+    def has_start(self) -> bool:
+        return self.last_sent is not None
+
+    def start_from(self, value: Any) -> None:
+        self.last_sent = value
+
+    def release(self) -> None:
+        self.last_sent = None
+
+    def limit(self, command: Any) -> Any:
+        return self.send(self.checked(command))
+
+    def checked(self, command: Any) -> Any:
+        if command is None:
+            raise CommandFault("size", "is None")
+        return command
+
+    def send(self, command: Any) -> Any:
+        self.last_sent = command
+        return command

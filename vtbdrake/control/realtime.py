@@ -1,0 +1,235 @@
+"""Asks the operating system for what a punctual loop needs, and tells what it granted."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import gc
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+
+class RealTimeError(RuntimeError):
+    """Something that was required was refused."""
+
+
+@dataclass(frozen=True)
+class Grant:
+    """The answer to one request.
+
+    Attributes:
+        request: what was asked for.
+        granted: whether one got it.
+        reason: why not; empty if granted.
+        remedy: what to do about it; empty if granted.
+    """
+
+    request: str
+    granted: bool
+    reason: str = ""
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.request}: " + ("granted" if self.granted else f"refused ({self.reason}): {self.remedy}")
+
+
+class RealTime:
+    """Makes the calling thread, and the process, fit for a punctual loop; afterwards all is as it was.
+
+    ::
+
+        with RealTime(priority=80) as real_time:
+            print(real_time)
+            runtime.run()
+
+    The thread gets SCHED_FIFO (threads and processes that it starts do not) and a timer slack of 1 ns, which is what
+    counts where SCHED_FIFO is refused. The process's memory is locked, Python's garbage collector rests, with all that
+    exists set aside from it, and threads hand over the GIL quickly. It is to be entered and left in one thread.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; None leaves the scheduler alone.
+        lock_memory: whether to keep present and future memory from being paged out. Under a limit of locked memory (see
+            ``ulimit -l``), later allocations fail when it is reached.
+        cpus: the processors to run on; None leaves them alone.
+        collect_garbage: whether Python's garbage collector goes on. What refers to itself is not freed while it rests.
+        switch_interval: after how many seconds a thread that waits for the GIL asks for it; None leaves it alone.
+        require: whether a refusal is an error.
+
+    Attributes:
+        grants: the answers, in order, once entered.
+    """
+
+    def __init__(
+        self,
+        *,
+        priority: int | None = 80,
+        lock_memory: bool = True,
+        cpus: set[int] | None = None,
+        collect_garbage: bool = False,
+        switch_interval: float | None = 5e-5,
+        require: bool = False,
+    ) -> None:
+        if priority is not None and not 1 <= priority <= 99:
+            raise ValueError(f"a priority of SCHED_FIFO lies in 1 to 99, not at {priority}")
+        if cpus is not None and not cpus:
+            raise ValueError("a thread needs at least one processor to run on: give cpus={0}, for example, or None")
+        if switch_interval is not None and not switch_interval > 0.0:
+            raise ValueError(f"the switch interval is a positive time, not {switch_interval} s")
+        self.grants: tuple[Grant, ...] = ()
+        self._require = require
+        self._requests: list[tuple[str, Callable[[], AbstractContextManager[None]], str]] = []
+        if cpus is not None:
+            self._requests.append((f"processors {sorted(cpus)}", partial(_affinity, frozenset(cpus)), _CPUS))
+        if lock_memory:
+            self._requests.append(("locked memory", _locked_memory, _MEMORY))
+        if not collect_garbage:
+            self._requests.append(("no garbage collection", _no_collection, ""))
+        if switch_interval is not None:
+            text = f"switch interval {1e6 * switch_interval:g} us"
+            self._requests.append((text, partial(_switch_interval, switch_interval), ""))
+        self._requests.append(("timer slack 1 ns", _timer_slack, _SLACK))
+        if priority is not None:
+            self._requests.append((f"SCHED_FIFO {priority}", partial(_fifo, priority), _FIFO))
+        self._undo = ExitStack()
+
+    def __enter__(self) -> Self:
+        """
+        Raises:
+            RealTimeError: something was refused, and is required; all is as before.
+        """
+        with ExitStack() as undo:
+            self.grants = tuple(_ask(undo, *request) for request in self._requests)
+            refused = [str(grant) for grant in self.grants if not grant.granted]
+            if refused and self._require:
+                raise RealTimeError("; ".join(refused))
+            self._undo = undo.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._undo.close()
+
+    def __str__(self) -> str:
+        """One line per request."""
+        return "\n".join(map(str, self.grants))
+
+
+_FIFO = (
+    "run as root, or give the user rtprio in /etc/security/limits.conf, or the container --cap-add SYS_NICE "
+    "--ulimit rtprio=99"
+)
+_MEMORY = (
+    "run as root, or give the user 'memlock unlimited' in /etc/security/limits.conf, or the container "
+    "--ulimit memlock=-1"
+)
+_CPUS = "choose from those that the process may use (os.sched_getaffinity(0)), or widen the container's cpuset"
+_SLACK = "use a kernel that has PR_SET_TIMERSLACK"
+
+
+def _ask(undo: ExitStack, request: str, setting: Callable[[], AbstractContextManager[None]], remedy: str) -> Grant:
+    """Applies a setting, to be taken back by ``undo``."""
+    try:
+        undo.enter_context(setting())
+    except OSError as error:
+        name = errno.errorcode.get(error.errno or 0, str(error.errno))
+        return Grant(request, False, f"{name}, {error.strerror}", remedy)
+    return Grant(request, True)
+
+
+@contextmanager
+def _affinity(cpus: frozenset[int]) -> Iterator[None]:
+    before = os.sched_getaffinity(0)
+    # The kernel takes what it can of a set; one that is not wholly there is not what was asked for.
+    if not cpus <= before:
+        raise OSError(errno.EINVAL, f"only {sorted(before)} may be used")
+    os.sched_setaffinity(0, cpus)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@contextmanager
+def _locked_memory() -> Iterator[None]:
+    was_locked = _locked_kilobytes() > 0
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error))
+    try:
+        yield
+    finally:
+        if not was_locked:
+            libc.munlockall()
+
+
+def _locked_kilobytes() -> int:
+    found = re.search(r"^VmLck:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="ascii"), re.MULTILINE)
+    return int(found[1]) if found else 0
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    was_enabled, was_frozen = gc.isenabled(), gc.get_freeze_count() > 0
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        # Python thaws all or nothing: what somebody else froze stays so, and what was added with it.
+        if not was_frozen:
+            gc.unfreeze()
+        if was_enabled:
+            gc.enable()
+
+
+@contextmanager
+def _switch_interval(seconds: float) -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(seconds)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextmanager
+def _timer_slack() -> Iterator[None]:
+    libc = ctypes.CDLL(None, use_errno=True)
+    before = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    if before < 0 or libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0) != 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error))
+    try:
+        yield
+    finally:
+        # Under SCHED_FIFO a thread has none, and cannot be given any: the kernel answers 0.
+        libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(before), 0, 0, 0)
+
+
+@contextmanager
+def _fifo(priority: int) -> Iterator[None]:
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    try:
+        yield
+    finally:
+        try:
+            os.sched_setscheduler(0, policy, parameters)
+        except PermissionError:
+            # Without privileges the flag cannot be taken back; it only keeps children from inheriting more.
+            os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
+
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2  # <sys/mman.h>
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # <linux/prctl.h>

@@ -1,0 +1,289 @@
+"""How punctual a loop is: histograms of durations, counts of misses and of what exceeds thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import accumulate
+from math import ceil, exp, inf, log, nan
+from typing import Any
+
+
+class Histogram:
+    """Durations in bins of equal ratio, in constant memory.
+
+    A percentile is the upper end of the bin in which it lies: never below the true one (of the kind "inverted_cdf"),
+    and above it by at most a factor of 1 + resolution; below ``lowest`` it is ``lowest``, above ``highest`` the
+    largest. Count, total, least and largest are exact.
+
+    Args:
+        resolution: ratio of the ends of a bin, less one.
+        lowest: in seconds; what is shorter, or negative, shares one bin.
+        highest: in seconds; what is longer shares one bin.
+    """
+
+    def __init__(self, *, resolution: float = 0.01, lowest: float = 1e-6, highest: float = 10.0) -> None:
+        if not 0.0 < resolution <= 1.0:
+            raise ValueError(f"the resolution of a histogram lies above 0 and is at most 1, not {resolution}")
+        if not 0.0 < lowest < highest < inf:
+            raise ValueError(f"a histogram needs 0 < lowest < highest, not {lowest} and {highest}")
+        self.resolution, self.lowest, self.highest = resolution, lowest, highest
+        self.count = 0
+        self.total = 0.0
+        self._least, self._largest = inf, -inf
+        self._scale = 1.0 / log(1.0 + resolution)
+        # Bin 0 ends at `lowest`; bin k > 0 ends at lowest (1 + resolution)^k; the last one ends nowhere.
+        self._shift = 1.0 - self._scale * log(lowest)
+        self._bins = [0] * (ceil(self._scale * log(highest / lowest)) + 2)
+
+    def record(self, seconds: float) -> None:
+        """Adds one duration.
+
+        Raises:
+            ValueError: it is NaN.
+        """
+        if seconds <= self.lowest:
+            index = 0
+        elif seconds >= self.highest:
+            index = -1
+        else:
+            index = int(log(seconds) * self._scale + self._shift)
+        self._bins[index] += 1
+        self.count += 1
+        self.total += seconds
+        if seconds > self._largest:
+            self._largest = seconds
+        if seconds < self._least:
+            self._least = seconds
+
+    @property
+    def mean(self) -> float:
+        """In seconds; NaN if there is none."""
+        return self.total / self.count if self.count else nan
+
+    @property
+    def least(self) -> float:
+        """In seconds; NaN if there is none."""
+        return self._least if self.count else nan
+
+    @property
+    def largest(self) -> float:
+        """In seconds; NaN if there is none."""
+        return self._largest if self.count else nan
+
+    def percentile(self, percent: float) -> float:
+        """In seconds; NaN if there is none. The duration that ``percent`` of all do not exceed."""
+        if not 0.0 <= percent <= 100.0:
+            raise ValueError(f"a percentile lies in 0 to 100, not at {percent}")
+        if self.count == 0:
+            return nan
+        if percent == 100.0:
+            return self._largest
+        # The rounding guards 99.9 % of 1000, which is 999.0000000000001.
+        rank = max(1, ceil(round(percent / 100.0 * self.count, 6)))
+        index = next(index for index, passed in enumerate(accumulate(self._bins)) if passed >= rank)
+        end = inf if index == len(self._bins) - 1 else self.lowest * exp(index / self._scale)
+        return min(end, self._largest)
+
+    def merge(self, other: Histogram) -> None:
+        """Adds all durations of ``other``.
+
+        Raises:
+            ValueError: its bins are others.
+        """
+        if self._shape() != other._shape():
+            raise ValueError(
+                "histograms merge if their resolution, lowest and highest agree, but these are "
+                f"{self._shape()} and {other._shape()}"
+            )
+        self._bins = [mine + its for mine, its in zip(self._bins, other._bins, strict=True)]
+        self.count += other.count
+        self.total += other.total
+        self._least = min(self._least, other._least)
+        self._largest = max(self._largest, other._largest)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, fit for JSON."""
+        return {
+            "resolution": self.resolution,
+            "lowest": self.lowest,
+            "highest": self.highest,
+            "total": self.total,
+            "least": self._least if self.count else None,
+            "largest": self._largest if self.count else None,
+            "bins": {str(index): number for index, number in enumerate(self._bins) if number},
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Histogram:
+        """What `to_dict` gave.
+
+        Raises:
+            ValueError: it has a bin that such a histogram has not.
+        """
+        histogram = cls(resolution=data["resolution"], lowest=data["lowest"], highest=data["highest"])
+        for index, number in data["bins"].items():
+            if not (0 <= int(index) < len(histogram._bins) and number > 0):
+                raise ValueError(f"a histogram of {len(histogram._bins)} bins has no bin {index} with {number} entries")
+            histogram._bins[int(index)] = number
+        histogram.count = sum(data["bins"].values())
+        histogram.total = data["total"]
+        if histogram.count:
+            histogram._least, histogram._largest = data["least"], data["largest"]
+        return histogram
+
+    def _shape(self) -> tuple[float, float, float]:
+        return self.resolution, self.lowest, self.highest
+
+
+class Level(IntEnum):
+    """How bad it is."""
+
+    OK = 0
+    WARNING = 1
+    ERROR = 2
+
+
+@dataclass
+class Threshold:
+    """From which duration on, in seconds, one worries; and how often that was so.
+
+    Attributes:
+        warning, error: what is longer counts.
+        warnings, errors: how many were; an error is not a warning, too.
+    """
+
+    warning: float
+    error: float
+    warnings: int = 0
+    errors: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.warning <= self.error:
+            raise ValueError(f"a threshold needs 0 <= warning <= error, not {self.warning} and {self.error}")
+
+    @property
+    def level(self) -> Level:
+        """The worst so far."""
+        return Level.ERROR if self.errors else Level.WARNING if self.warnings else Level.OK
+
+
+QUANTITIES = ("lateness", "step", "cycle")
+
+
+class LoopStatistics:
+    """What a loop of a fixed period did, in constant memory.
+
+    Attributes:
+        histograms: of ``lateness`` (from the deadline to the wake-up), ``step`` (of the DPS) and ``cycle`` (all work of
+            a cycle, from the wake-up on).
+        thresholds: the same; warning at half a period, error at a whole one, if not given.
+        misses: deadlines that passed while the loop was at work on an earlier cycle.
+        run: how many of them in a row, up to now.
+        longest_run: the longest such run.
+    """
+
+    def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
+        if not 0.0 < period < inf:
+            raise ValueError(f"a loop has a positive period, not {period} s")
+        thresholds = thresholds or {}
+        if unknown := sorted(set(thresholds) - set(QUANTITIES)):
+            raise ValueError(f"there are thresholds for {', '.join(QUANTITIES)}, but none for {', '.join(unknown)}")
+        self.period = period
+        self.histograms = {name: Histogram() for name in QUANTITIES}
+        self.thresholds = {
+            name: thresholds[name] if name in thresholds else Threshold(0.5 * period, period) for name in QUANTITIES
+        }
+        self.misses = 0
+        self.run = 0
+        self.longest_run = 0
+        self._missed = False
+        self._recorders = tuple((self.histograms[name].record, self.thresholds[name]) for name in QUANTITIES)
+
+    def record(self, *, lateness: float, step: float, cycle: float) -> None:
+        """One cycle: its durations in seconds."""
+        for (record, threshold), seconds in zip(self._recorders, (lateness, step, cycle), strict=True):
+            record(seconds)
+            if seconds > threshold.warning:
+                if seconds > threshold.error:
+                    threshold.errors += 1
+                else:
+                    threshold.warnings += 1
+        if not self._missed:
+            self.run = 0
+        self._missed = False
+
+    def miss(self, number: int) -> None:
+        """After a cycle: how many deadlines passed before it ended. One without any ends the run."""
+        if number < 0:
+            raise ValueError(f"one misses no deadline or some, not {number}")
+        self._missed = number > 0
+        self.misses += number
+        self.run = self.run + number if number else 0
+        self.longest_run = max(self.longest_run, self.run)
+
+    @property
+    def cycles(self) -> int:
+        return self.histograms["cycle"].count
+
+    @property
+    def level(self) -> Level:
+        """The worst of all thresholds so far."""
+        return max(threshold.level for threshold in self.thresholds.values())
+
+    def merge(self, other: LoopStatistics) -> None:
+        """Adds another run of the same period and thresholds. Its misses and ours are not in a row.
+
+        Raises:
+            ValueError: its period or a threshold is another.
+        """
+        if self._shape() != other._shape():
+            raise ValueError(
+                "statistics merge if their period and thresholds agree, but these are "
+                f"{self._shape()} and {other._shape()}"
+            )
+        for name in QUANTITIES:
+            self.histograms[name].merge(other.histograms[name])
+            self.thresholds[name].warnings += other.thresholds[name].warnings
+            self.thresholds[name].errors += other.thresholds[name].errors
+        self.misses += other.misses
+        self.run = other.run
+        self.longest_run = max(self.longest_run, other.longest_run)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, fit for JSON."""
+        return {
+            "period": self.period,
+            "histograms": {name: histogram.to_dict() for name, histogram in self.histograms.items()},
+            "thresholds": {name: vars(threshold).copy() for name, threshold in self.thresholds.items()},
+            "misses": self.misses,
+            "run": self.run,
+            "longest_run": self.longest_run,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> LoopStatistics:
+        """What `to_dict` gave."""
+        thresholds = {name: Threshold(**threshold) for name, threshold in data["thresholds"].items()}
+        statistics = cls(data["period"], thresholds=thresholds)
+        for name in QUANTITIES:
+            statistics.histograms[name].merge(Histogram.from_dict(data["histograms"][name]))
+        statistics.misses, statistics.run = data["misses"], data["run"]
+        statistics.longest_run = data["longest_run"]
+        return statistics
+
+    def __str__(self) -> str:
+        """A table, in microseconds."""
+        form = "{:9}" + "{:>9}" * 7
+        lines = [form.format("us", "mean", "p50", "p99", "p99.9", "max", "warnings", "errors")]
+        for name, histogram in self.histograms.items():
+            durations = [histogram.mean, *map(histogram.percentile, (50.0, 99.0, 99.9)), histogram.largest]
+            threshold = self.thresholds[name]
+            cells = [f"{1e6 * seconds:.0f}" for seconds in durations]
+            lines.append(form.format(name, *cells, threshold.warnings, threshold.errors))
+        summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
+        return "\n".join([*lines, f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}"])
+
+    def _shape(self) -> tuple[Any, ...]:
+        return self.period, *((t.warning, t.error) for t in self.thresholds.values())
