@@ -83,6 +83,11 @@ def test_delay_counts_periods(delay: int) -> None:
     np.testing.assert_array_equal(y[delay:, 0], np.arange(1.0, 13.0 - delay))
 
 
+def test_drive_starts_with_the_torque_it_had() -> None:
+    y = torques(4, delay=2, max_delay=2, rate=1000.0, time_constant=0.0, initial=[3.0, -3.0])
+    np.testing.assert_allclose(y, [[3.0, -3.0], [3.0, -3.0], [4.0, -4.0], [5.0, -4.0]], atol=1e-12)
+
+
 def test_friction_opposes_the_motion() -> None:
     v = np.array([0.3, -0.004])
     y = torques(2, v=tuple(v), viscous=[2.0, 3.0], coulomb=[1.0, 0.5], coulomb_velocity=0.01)

@@ -62,10 +62,12 @@ class JointDrives(LeafSystem):
         coulomb_velocity: ArrayLike = 0.01,
         delay: int = 0,
         max_delay: int = 0,
+        initial: ArrayLike = 0.0,
     ) -> None:
         """
         Args:
             period: T in seconds.
+            initial: the torque that was commanded, and reached, before the first sample, in N m.
             limit, rate: of the torque, in N m and N m/s; scalars or one per joint, like the three of friction.
             time_constant: of the current loop, in seconds.
             viscous, coulomb, coulomb_velocity: of the friction, in N m s/rad, N m and rad/s.
@@ -95,16 +97,17 @@ class JointDrives(LeafSystem):
         self._velocities = np.array([plant.num_positions() + joint.velocity_start() for joint in joints], dtype=int)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        self._torque = self.DeclareDiscreteState(n)
-        self._motor = self.DeclareDiscreteState(n)
-        self._reference = self.DeclareDiscreteState(n)
+        before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
+        self._torque = self.DeclareDiscreteState(before)
+        self._motor = self.DeclareDiscreteState(before)
+        self._reference = self.DeclareDiscreteState(before)
         self.DeclareStateOutputPort("torque", self._torque)
         values = [*np.concatenate(list(entries.values())), float(time_constant), float(delay)]
         self._parameters = self.DeclareNumericParameter(BasicVector(values))
-        self.variables = self._elements()
+        self.variables = self._elements(before)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
-    def _elements(self) -> tuple[Element, ...]:
+    def _elements(self, before: NDArray[np.float64]) -> tuple[Element, ...]:
         n = self._n
         units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
         elements = [
@@ -119,7 +122,7 @@ class JointDrives(LeafSystem):
             parameter("delay", self._parameters, start=5 * n + 1, unit="period", bounds=(0.0, float(self._max_delay))),
         ]
         if self._max_delay:
-            self._line = self.DeclareDiscreteState(self._max_delay * n)
+            self._line = self.DeclareDiscreteState(np.tile(before, self._max_delay))
             elements.append(discrete_state("in_transit", self._line, shape=(self._max_delay, n), unit="N m"))
         return tuple(elements)
 
@@ -144,7 +147,7 @@ class JointDrives(LeafSystem):
         state.set_value(self._torque, motor - viscous * v - coulomb * smooth)
 
     def _delayed(self, context: Context, state: DiscreteValues, delay: int) -> NDArray[np.float64]:
-        """The command of ``delay`` periods ago; 0 before the first."""
+        """The command of ``delay`` periods ago."""
         u: NDArray[np.float64] = self._command.Eval(context)
         if not self._max_delay:
             return u

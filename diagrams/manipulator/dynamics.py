@@ -1,0 +1,133 @@
+"""The arm's kinematics and dynamics in CasADi: what its controllers know of it.
+
+This model is the controllers' own; it shares the numbers of `Arm` with the simulated arm, and no code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
+
+Expression = Any  # casadi.SX or casadi.DM
+
+
+@dataclass(frozen=True)
+class TipMotion:
+    """Pose of T in the world, and J with V_WT = [w; v] = J qdot, as in Drake's SpatialVelocity."""
+
+    R: Expression
+    p: Expression
+    J: Expression
+
+
+class ArmDynamics:
+    """Symbolic kinematics and dynamics of `Arm`."""
+
+    def __init__(self, arm: Arm | None = None) -> None:
+        self.arm = arm or Arm()
+        self._bodies = []
+        for k in range(JOINTS):
+            M = self.arm.link_inertia(k)
+            if k == JOINTS - 1:
+                tool = self.arm.tool_inertia().Shift([0.0, 0.0, -self.arm.lengths[-1]])
+                M += tool
+            com = M.get_com()
+            I_cm = M.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
+            self._bodies.append((M.get_mass(), _sparse(com), _sparse(I_cm)))
+
+    def tip(self, q: Expression) -> TipMotion:
+        """Of the tool's tip T, for q (7)."""
+        R, p = casadi.SX.eye(3), casadi.SX.zeros(3)
+        axes, origins = [], []
+        for k in range(JOINTS):
+            p = p + self.arm.offsets[k] * R[:, 2]
+            axes.append(R @ _sparse(np.array(self.arm.axes[k], dtype=float)))
+            origins.append(p)
+            R = R @ self._rotation(k, q[k])
+        p = p + self.arm.tip_offset * R[:, 2]
+        columns = [casadi.vertcat(a, casadi.cross(a, p - o)) for a, o in zip(axes, origins, strict=True)]
+        return TipMotion(R, p, casadi.densify(casadi.horzcat(*columns)))
+
+    def inverse_dynamics(
+        self, q: Expression, v: Expression, a: Expression, *, gravity: float = GRAVITY, rotors: bool = True
+    ) -> Expression:
+        """tau (7) = M(q) a + C(q, v) v + g(q), by the recursion of Newton and Euler in the links' frames.
+
+        With ``rotors``, M has their reflected inertia on its diagonal, and tau is the drives' torque; without, tau is
+        what the joints' torque sensors see. Luh, Walker, Paul, "On-Line Computational Scheme for Mechanical
+        Manipulators", 1980.
+        """
+        zero = casadi.SX(3, 1)
+        omega, alpha = zero, zero
+        # A base that accelerates upwards feels like gravity.
+        acceleration = _sparse(np.array([0.0, 0.0, gravity]))
+        rotations, forces, moments = [], [], []
+        for k, (mass, com, inertia) in enumerate(self._bodies):
+            R = self._rotation(k, q[k])
+            offset = _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
+            axis = _sparse(np.array(self.arm.axes[k], dtype=float))
+            acceleration = R.T @ (acceleration + _turned(omega, alpha, offset))
+            carried = R.T @ omega
+            alpha = R.T @ alpha + casadi.cross(carried, axis) * v[k] + axis * a[k]
+            omega = carried + axis * v[k]
+            forces.append(mass * (acceleration + _turned(omega, alpha, com)))
+            moments.append(inertia @ alpha + casadi.cross(omega, inertia @ omega))
+            rotations.append(R)
+        tau = [casadi.SX(0)] * JOINTS
+        force, moment = zero, zero
+        for k in reversed(range(JOINTS)):
+            _, com, _ = self._bodies[k]
+            own = forces[k]
+            moment = moments[k] + casadi.cross(com, own) + moment
+            force = own + force
+            axis = _sparse(np.array(self.arm.axes[k], dtype=float))
+            tau[k] = casadi.dot(axis, moment)
+            if rotors:
+                tau[k] += self.arm.reflected_inertias[k] * a[k]
+            # In the frame of the link before, about its origin.
+            force = rotations[k] @ force
+            offset = _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
+            moment = rotations[k] @ moment + casadi.cross(offset, force)
+        return casadi.densify(casadi.vertcat(*tau))
+
+    def momentum(self, q: Expression, v: Expression) -> tuple[Expression, Expression]:
+        """p = M(q) v of the links, and dL/dq of their Lagrangian L = v' M v / 2 - U: Lagrange's equation is then
+
+        dp/dt = dL/dq + tau, for the torques tau that act on the links.
+        """
+        zero = casadi.SX(JOINTS, 1)
+        p = self.inverse_dynamics(q, zero, v, gravity=0.0, rotors=False)
+        gravity = self.inverse_dynamics(q, zero, zero, rotors=False)
+        return p, casadi.gradient(casadi.dot(v, p) / 2, q) - gravity
+
+    def _rotation(self, k: int, angle: Expression) -> Expression:
+        """Of link k in the one before."""
+        sign = sum(self.arm.axes[k])
+        c, s = casadi.cos(angle), sign * casadi.sin(angle)
+        R = casadi.SX(3, 3)
+        if self.arm.axes[k][2]:
+            R[0, 0], R[0, 1], R[1, 0], R[1, 1], R[2, 2] = c, -s, s, c, 1.0
+        else:
+            R[0, 0], R[0, 2], R[2, 0], R[2, 2], R[1, 1] = c, s, -s, c, 1.0
+        return R
+
+
+def function(name: str, arguments: dict[str, Expression], results: dict[str, Expression]) -> casadi.Function:
+    """A casadi.Function of named arguments, with what is computed twice computed once."""
+    dense = [casadi.densify(value) for value in results.values()]
+    return casadi.Function(name, list(arguments.values()), dense, list(arguments), list(results), {"cse": True})
+
+
+def _turned(omega: Expression, alpha: Expression, r: Expression) -> Expression:
+    """Acceleration at r that comes from turning."""
+    return casadi.cross(alpha, r) + casadi.cross(omega, casadi.cross(omega, r))
+
+
+def _sparse(values: np.ndarray) -> casadi.SX:
+    """Zeros that CasADi leaves out."""
+    return casadi.sparsify(casadi.SX(casadi.DM(np.where(np.abs(values) < 1e-15, 0.0, values))))

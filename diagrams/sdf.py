@@ -1,0 +1,105 @@
+"""Pieces of SDF files that the diagrams write for their robots."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree as ET
+
+from pydrake.multibody.tree import SpatialInertia
+
+
+def start_model(name: str, canonical_link: str, *, note: str) -> tuple[ET.Element, ET.Element]:
+    """The document and the model in it; ``note`` becomes a comment."""
+    root = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
+    root.append(ET.Comment(f" {note} "))
+    return root, ET.SubElement(root, "model", name=name, canonical_link=canonical_link)
+
+
+def add_link(model: ET.Element, name: str, parent: tuple[str, str] | None, inertia: SpatialInertia) -> ET.Element:
+    """A link with the inertia M_LLo_L; ``parent`` is the link that its pose is relative to, and the pose."""
+    link = ET.SubElement(model, "link", name=name)
+    if parent is not None:
+        ET.SubElement(link, "pose", relative_to=parent[0]).text = parent[1]
+    inertial = ET.SubElement(link, "inertial")
+    p_LoLcm = inertia.get_com()
+    ET.SubElement(inertial, "pose").text = f"{' '.join(text(v) for v in p_LoLcm)} 0 0 0"
+    ET.SubElement(inertial, "mass").text = text(inertia.get_mass())
+    I_LLcm = inertia.Shift(p_LoLcm).CalcRotationalInertia().CopyToFullMatrix3()
+    tensor = ET.SubElement(inertial, "inertia")
+    for name, i, j in (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2)):
+        ET.SubElement(tensor, name).text = text(I_LLcm[i, j])
+    return link
+
+
+def add_joint(
+    model: ET.Element,
+    name: str,
+    parent: str,
+    child: str,
+    *,
+    axis_J: str,
+    limits: tuple[float, float],
+    speed: float,
+    torque: float,
+) -> ET.Element:
+    """A revolute joint; ``speed`` and ``torque`` are the largest of its drive."""
+    joint = ET.SubElement(model, "joint", name=name, type="revolute")
+    ET.SubElement(joint, "parent").text = parent
+    ET.SubElement(joint, "child").text = child
+    axis = ET.SubElement(joint, "axis")
+    ET.SubElement(axis, "xyz").text = axis_J
+    limit = ET.SubElement(axis, "limit")
+    for tag, value in zip(("lower", "upper", "velocity", "effort"), (*limits, speed, torque), strict=True):
+        ET.SubElement(limit, tag).text = text(value)
+    return joint
+
+
+def add_frame(model: ET.Element, name: str, attached_to: str, pose: str) -> None:
+    """A frame that is fixed to a link."""
+    frame = ET.SubElement(model, "frame", name=name, attached_to=attached_to)
+    ET.SubElement(frame, "pose").text = pose
+
+
+def add_visual(link: ET.Element, name: str, shape: ET.Element, pose: str, color: str) -> None:
+    """A shape to be seen; ``color`` is red, green, blue and opacity."""
+    visual = ET.SubElement(link, "visual", name=name)
+    add_geometry(visual, shape, pose)
+    ET.SubElement(ET.SubElement(visual, "material"), "diffuse").text = color
+
+
+def add_geometry(owner: ET.Element, shape: ET.Element, pose: str) -> None:
+    """The pose and shape of a visual or collision."""
+    ET.SubElement(owner, "pose").text = pose
+    ET.SubElement(owner, "geometry").append(shape)
+
+
+def box(x: float, y: float, z: float) -> ET.Element:
+    """Edges in metres."""
+    element = ET.Element("box")
+    ET.SubElement(element, "size").text = f"{text(x)} {text(y)} {text(z)}"
+    return element
+
+
+def cylinder(radius: float, length: float) -> ET.Element:
+    """Along z, in metres."""
+    element = ET.Element("cylinder")
+    ET.SubElement(element, "radius").text = text(radius)
+    ET.SubElement(element, "length").text = text(length)
+    return element
+
+
+def sphere(radius: float) -> ET.Element:
+    """In metres."""
+    element = ET.Element("sphere")
+    ET.SubElement(element, "radius").text = text(radius)
+    return element
+
+
+def text(value: float) -> str:
+    """12 digits: the same text whatever the last bits are."""
+    return f"{round(float(value), 12) + 0.0:.12g}"
+
+
+def document(root: ET.Element) -> str:
+    """The file's text."""
+    ET.indent(root)
+    return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'
