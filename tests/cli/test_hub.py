@@ -1,0 +1,76 @@
+"""``vtbdrake hub`` as its users run it."""
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+
+import lcm
+import pytest
+
+from tests.cli.program import ROOT, run
+
+
+@contextlib.contextmanager
+def running(*arguments: object):
+    """The program, and the URL that it has printed."""
+    command = [sys.executable, "-m", "vtbdrake.cli", "hub", *map(str, arguments)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        try:
+            assert program.stdout is not None
+            yield program, program.stdout.readline().strip()
+        finally:
+            program.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_prints_its_url_relays_and_ends_cleanly(number: signal.Signals) -> None:
+    with running("--port", 0, "--protect", "COMMAND") as (program, url):
+        first, second = lcm.LCM(url), lcm.LCM(url)
+        received: list[bytes] = []
+        first.subscribe("COMMAND", lambda _, data: received.append(data))
+        first.publish("COMMAND", b"command")
+        assert first.handle_timeout(30_000)
+        second.publish("COMMAND", b"intruder")
+        second.subscribe("OTHER", lambda _, data: received.append(data))
+        second.publish("OTHER", b"handled")
+        assert second.handle_timeout(30_000)
+        program.send_signal(number)
+        stdout, stderr = program.communicate(timeout=30)
+    assert received == [b"command", b"handled"]
+    assert program.returncode == 0
+    assert stdout == "2 messages relayed, 1 refused, 0 lost by slow clients\n"
+    assert "COMMAND: refused" in stderr
+    assert "Traceback" not in stderr
+
+
+def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        program = run("hub", "--port", port)
+    assert (program.returncode, program.stdout) == (2, "")
+    assert program.stderr.startswith(f"Error: port {port} of 127.0.0.1 is in use")
+    assert program.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--port", 70000), "port lies between 0 and 65535, it cannot be 70000"),
+        (("--port", 0, "--max-message", 64), "max_queue lies between"),
+        (("--port", 0, "--max-message", 0), "max-message"),
+        (("--port", 0, "--max-queue", "inf"), "'inf' is not a valid integer"),
+        (("--port", 0, "--protect", "VTB_HUB"), "'VTB_HUB' is the hub's own"),
+        (("--port", 0, "--lease", 0), "lease is a positive time"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[object, ...], named: str) -> None:
+    program = run("hub", *arguments)
+    assert (program.returncode, program.stdout) == (2, "")
+    assert program.stderr.startswith("Error: ") and program.stderr.count("\n") == 1
+    assert named in program.stderr
+
+
+def test_help_shows_an_example() -> None:
+    assert "Example:\n    vtbdrake hub " in run("hub", "--help").stdout

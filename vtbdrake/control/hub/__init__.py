@@ -1,0 +1,48 @@
+"""A tcpq hub: an LCM bus over TCP for places where multicast does not work, with channels that one client commands.
+
+Unmodified LCM clients use it: ``lcm.LCM(hub.url)``, ``DrakeLcm(hub.url)``. It relays every publication, byte for byte,
+to all clients that subscribed to its channel, the publisher included.
+
+* **Nobody holds up the others.** The hub never waits for a client. What a client does not read is queued, up to
+  ``max_queue`` bytes; beyond that its oldest messages are dropped and counted; a client that takes nothing off its
+  queue for ``patience`` seconds is disconnected. So is one that breaks the protocol or sends a message larger than
+  ``max_message``.
+* **Protected channels** have one publisher at a time, the owner.
+
+  1. The first client to publish on the channel becomes the owner. Each of its publications renews its lease, which
+     lasts ``lease`` seconds.
+  2. What any other client publishes there is dropped, counted and reported. That the owner's lease is over does not
+     change this: a pause (or a freeze) of the owner lets nobody in who did not ask.
+  3. A client that wants to succeed publishes on ``VTB_HUB_TAKE/<channel>`` (the content does not matter). It becomes
+     the owner if there is none, or if the owner's lease is over; otherwise the request is refused and reported. When
+     the former owner thaws, it is any other client: rule 2.
+  4. When the owner's connection closes, there is no owner: rule 1.
+
+  Requests are decided after all that had arrived with them has been read, so that an owner does not lose its channel
+  because the hub itself was held up.
+* **Status.** The hub publishes its `Statistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within
+  10 ms when the owner of a channel changes or something is refused. Clients have the names of their sockets,
+  ``127.0.0.1:41234``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.
+
+It listens on loopback unless another address is asked for by name; there, whoever reaches the address is a client.
+"""
+
+from vtbdrake.control.hub.config import HubConfig
+from vtbdrake.control.hub.process import Hub, HubError, serve
+from vtbdrake.control.hub.server import HubAddressError, HubServer
+from vtbdrake.control.hub.statistics import ChannelStatistics, Statistics
+from vtbdrake.control.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX, client_name
+
+__all__ = [
+    "STATUS_CHANNEL",
+    "TAKE_PREFIX",
+    "ChannelStatistics",
+    "Hub",
+    "HubAddressError",
+    "HubConfig",
+    "HubError",
+    "HubServer",
+    "Statistics",
+    "client_name",
+    "serve",
+]

@@ -1,0 +1,149 @@
+"""The hub's end of the connection to one client."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import Callable
+
+from vtbdrake.control.hub.patterns import matcher
+from vtbdrake.control.hub.tcpq import ProtocolError, Reader, address_name
+
+# A slice of a large message: while it is copied to the kernel, or from there, all others wait (some 50 us).
+SLICE = 256 * 1024
+
+MAX_SUBSCRIPTIONS = 1024
+
+
+class Connection:
+    """A client: its socket, its subscriptions, and the queue of what it has not read yet.
+
+    Args:
+        sock: connected; the connection owns it.
+        max_message, max_queue: in bytes.
+        now: the time, on the hub's clock, in seconds.
+
+    Attributes:
+        name: ``host:port`` of the client.
+        reader: of what comes from it.
+        progressed: when it connected, when its queue began, or when it last took something off it.
+        watched: whether the hub waits for it to take more.
+        queued: bytes that wait for it.
+        closed: whether the hub has closed it.
+    """
+
+    def __init__(self, sock: socket.socket, *, max_message: int, max_queue: int, now: float) -> None:
+        self.socket = sock
+        self.fileno = sock.fileno()
+        self.name = address_name(sock.getpeername())
+        self.reader = Reader(max_message=max_message)
+        self.progressed = now
+        self.watched = False
+        self.queued = 0
+        self.closed = False
+        self._max_queue = max_queue
+        self._queue: deque[bytes | bytearray] = deque()
+        self._offset = 0  # of the first message of the queue: so much of it is sent
+        self._subscriptions: list[tuple[bytes, Callable[[str], object]]] = []
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def acknowledge(self) -> None:
+        """Acknowledges at once what was read: liblcm writes a message in five pieces, and leaves Nagle's algorithm on,
+        which holds back the second piece until the first is acknowledged (by default 40 ms later).
+        The kernel forgets the option, so it takes one call for every piece read."""
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
+    def subscribe(self, pattern: bytes) -> None:
+        """
+        Raises:
+            ProtocolError: it is not text, or one too many.
+        """
+        if len(self._subscriptions) >= MAX_SUBSCRIPTIONS:
+            raise ProtocolError("malformed", f"subscribes more than {MAX_SUBSCRIPTIONS} times")
+        self._subscriptions.append((pattern, matcher(text(pattern))))
+
+    def unsubscribe(self, pattern: bytes) -> None:
+        """Ends one subscription of the pattern; there may be more."""
+        for i, (subscribed, _) in enumerate(self._subscriptions):
+            if subscribed == pattern:
+                del self._subscriptions[i]
+                return
+
+    def wants(self, channel: str) -> bool:
+        """Whether it has subscribed to the channel."""
+        return any(matches(channel) for _, matches in self._subscriptions)
+
+    def send(self, message: bytes | bytearray, now: float) -> int:
+        """Sends a message, or queues what of it cannot be sent at once; says how many messages that drops.
+
+        Raises:
+            OSError: the connection is lost.
+        """
+        if self._queue:
+            return self._enqueue(message)
+        sent = self._send(message)
+        if sent < len(message):
+            self.progressed = now
+            self._offset = sent
+            self._queue.append(message)
+            self.queued = len(message) - sent
+        return 0
+
+    def flush(self, now: float) -> None:
+        """Sends a slice of what is queued.
+
+        Raises:
+            OSError: the connection is lost.
+        """
+        room = SLICE
+        while self._queue and room > 0:
+            first = self._queue[0]
+            sent = self._send(memoryview(first)[self._offset :])
+            if not sent:
+                return
+            room -= sent
+            self.progressed = now
+            self.queued -= sent
+            self._offset += sent
+            if self._offset == len(first):
+                self._queue.popleft()
+                self._offset = 0
+
+    def _send(self, data: bytes | bytearray | memoryview) -> int:
+        try:
+            return self.socket.send(data if len(data) <= SLICE else memoryview(data)[:SLICE])
+        except BlockingIOError:
+            return 0
+
+    def _enqueue(self, message: bytes | bytearray) -> int:
+        self._queue.append(message)
+        self.queued += len(message)
+        oldest = 1 if self._offset else 0  # what has begun must end
+        dropped = 0
+        while self.queued > self._max_queue and len(self._queue) > oldest:
+            self.queued -= len(self._queue[oldest])
+            del self._queue[oldest]
+            dropped += 1
+        return dropped
+
+    def close(self) -> None:
+        self.closed = True
+        self._queue.clear()
+        self.queued = 0
+        self.socket.close()
+
+
+def text(channel: bytes) -> str:
+    """A channel or pattern as text, as liblcm's clients in Python and Java need it.
+
+    Raises:
+        ProtocolError: it is none.
+    """
+    try:
+        name = channel.decode()
+    except UnicodeDecodeError:
+        raise ProtocolError("malformed", f"names a channel {channel!r}, which is not UTF-8") from None
+    if "\0" in name:
+        raise ProtocolError("malformed", f"names a channel {channel!r}, with a null character")
+    return name

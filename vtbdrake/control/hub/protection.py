@@ -1,0 +1,96 @@
+"""A channel with one publisher at a time."""
+
+from __future__ import annotations
+
+import logging
+from math import inf
+
+from vtbdrake.control.hub.connection import Connection
+from vtbdrake.control.hub.statistics import ChannelStatistics
+
+_log = logging.getLogger(__name__)
+
+_LOG_PERIOD = 1.0
+
+
+class ProtectedChannel:
+    """Who may publish on a channel; the package's docstring has the rules.
+
+    Args:
+        name: of the channel.
+        lease: in seconds.
+
+    Attributes:
+        owner: the client that may publish, None before the first and after the last.
+    """
+
+    def __init__(self, name: str, *, lease: float) -> None:
+        self.name = name
+        self._lease = lease
+        self.owner: Connection | None = None
+        self._renewed = -inf
+        self._refused = 0
+        self._last_refused: str | None = None
+        self._logged = -inf
+        self._taken = 0
+
+    def admit(self, client: Connection, now: float) -> bool:
+        """Whether what the client publishes at the time ``now`` may pass."""
+        if client is self.owner:
+            self._renewed = now
+            return True
+        if self.owner is None:
+            self._give(client, now)
+            return True
+        self._refuse(client, now, "publishes on it")
+        return False
+
+    def take(self, client: Connection, now: float) -> bool:
+        """Whether the client, which asks for the channel, has it now."""
+        if self.owner is not None and client is not self.owner:
+            if now - self._renewed <= self._lease:
+                self._refuse(client, now, "asks for it")
+                return False
+            self._taken += 1
+        self._give(client, now)
+        return True
+
+    def release(self, client: Connection) -> bool:
+        """The client is gone; says whether it was the owner."""
+        if client is not self.owner:
+            return False
+        _log.warning("%s: its owner %s is gone", self.name, client.name)
+        self.owner = None
+        return True
+
+    def statistics(self, now: float) -> ChannelStatistics:
+        owner = self.owner
+        return ChannelStatistics(
+            owner=None if owner is None else owner.name,
+            lease_over=owner is not None and now - self._renewed > self._lease,
+            refused=self._refused,
+            last_refused=self._last_refused,
+            taken=self._taken,
+        )
+
+    def _give(self, client: Connection, now: float) -> None:
+        if client is not self.owner:
+            before = "" if self.owner is None else f", until now {self.owner.name}"
+            _log.warning("%s: its owner is %s%s", self.name, client.name, before)
+        self.owner, self._renewed = client, now
+
+    def _refuse(self, client: Connection, now: float, what: str) -> None:
+        assert self.owner is not None
+        self._refused += 1
+        self._last_refused = client.name
+        # An intruder may publish a thousand times a second.
+        if now - self._logged >= _LOG_PERIOD:
+            self._logged = now
+            _log.warning(
+                "%s: refused, %s %s and its owner is %s (%d refused so far)",
+                self.name,
+                client.name,
+                what,
+                self.owner.name,
+                self._refused,
+            )

@@ -1,0 +1,168 @@
+"""What becomes of the records that come in: whom they go to, and whether they may."""
+
+from __future__ import annotations
+
+import logging
+from typing import NamedTuple
+
+from vtbdrake.control.hub import tcpq
+from vtbdrake.control.hub.config import HubConfig
+from vtbdrake.control.hub.connection import Connection, text
+from vtbdrake.control.hub.protection import ProtectedChannel
+from vtbdrake.control.hub.statistics import Statistics
+
+_log = logging.getLogger(__name__)
+
+# Channels whose subscribers are remembered; clients may publish on any number of channels.
+_MAX_ROUTES = 4096
+
+
+class _Route(NamedTuple):
+    """Where a channel's messages go.
+
+    Attributes:
+        channel: its name.
+        subscribers: all clients that want them.
+        protection: who may publish, if not everybody.
+        reserved: whether it is the hub's own, and nothing is relayed.
+    """
+
+    channel: str
+    subscribers: tuple[Connection, ...]
+    protection: ProtectedChannel | None
+    reserved: bool
+
+
+class Relay:
+    """Clients, their subscriptions, and the messages between them. It reads no socket and waits for nothing.
+
+    Attributes:
+        lost: clients whose connection failed when something was sent, and how; to be cleared by who has seen to it.
+        behind: clients that have begun to queue; likewise.
+        requests: for protected channels, to be decided when all that came with them has been handled.
+        news: whether an owner changed or something was refused since the last status.
+    """
+
+    def __init__(self, config: HubConfig) -> None:
+        self.lost: list[tuple[Connection, OSError]] = []
+        self.behind: list[Connection] = []
+        self.requests: list[tuple[Connection, str]] = []
+        self.news = False
+        self._clients: list[Connection] = []
+        self._routes: dict[bytes, _Route] = {}
+        self._protected = {name: ProtectedChannel(name, lease=config.lease) for name in config.protect}
+        self._statistics = Statistics()
+
+    def join(self, client: Connection) -> None:
+        self._clients.append(client)
+
+    def leave(self, client: Connection, reason: str) -> None:
+        """The client is gone."""
+        self._clients.remove(client)
+        self._routes.clear()
+        self.turn_away(reason)
+        for protected in self._protected.values():
+            self.news |= protected.release(client)
+
+    def turn_away(self, reason: str) -> None:
+        """Counts a client that is no more, or never was."""
+        disconnected = self._statistics.disconnected
+        disconnected[reason] = disconnected.get(reason, 0) + 1
+
+    def handle(self, client: Connection, record: tcpq.Record, now: float) -> None:
+        """
+        Raises:
+            ProtocolError: the client is of no use any more.
+        """
+        kind, channel, content = record
+        if kind == tcpq.PUBLISH:
+            self._publish(client, channel, content, now)
+        elif kind == tcpq.SUBSCRIBE:
+            client.subscribe(channel)
+            self._routes.clear()
+        elif kind == tcpq.UNSUBSCRIBE:
+            client.unsubscribe(channel)
+            self._routes.clear()
+        else:
+            self._send(client, tcpq.GREETING, now)
+
+    def _publish(self, client: Connection, channel: bytes, content: bytes | bytearray, now: float) -> None:
+        statistics = self._statistics
+        route = self._routes.get(channel) or self._find_route(channel)
+        if route.reserved:
+            self._receive_request(client, route.channel)
+        elif route.protection is not None and not self._admit(client, route.protection, now):
+            statistics.refused += 1
+        else:
+            statistics.messages += 1
+            statistics.volume += len(content)
+            self._distribute(route, content, now)
+
+    def _find_route(self, channel: bytes) -> _Route:
+        name = text(channel)
+        route = _Route(
+            channel=name,
+            subscribers=tuple(client for client in self._clients if client.wants(name)),
+            protection=self._protected.get(name),
+            reserved=name == tcpq.STATUS_CHANNEL or name.startswith(tcpq.TAKE_PREFIX),
+        )
+        if len(self._routes) >= _MAX_ROUTES:
+            self._routes.clear()
+        self._routes[channel] = route
+        return route
+
+    def _distribute(self, route: _Route, content: bytes | bytearray, now: float) -> None:
+        for subscriber in route.subscribers:
+            if not subscriber.closed:
+                self._send(subscriber, content, now)
+                self._statistics.delivered += 1
+
+    def _send(self, client: Connection, content: bytes | bytearray, now: float) -> None:
+        try:
+            self._statistics.dropped += client.send(content, now)
+        except OSError as error:
+            client.close()
+            self.lost.append((client, error))
+            return
+        if client.queued and not client.watched:
+            client.watched = True
+            self.behind.append(client)
+
+    def _admit(self, client: Connection, protection: ProtectedChannel, now: float) -> bool:
+        owner = protection.owner
+        admitted = protection.admit(client, now)
+        self.news |= not admitted or protection.owner is not owner
+        return admitted
+
+    def _receive_request(self, client: Connection, channel: str) -> None:
+        wanted = channel.removeprefix(tcpq.TAKE_PREFIX)
+        if wanted in self._protected:
+            self.requests.append((client, wanted))
+            return
+        self._statistics.refused += 1
+        self.news = True
+        _log.warning("refused: %s publishes on %s; the hub protects %s", client.name, channel, list(self._protected))
+
+    def decide(self, now: float) -> None:
+        """Grants or refuses the requests."""
+        for client, channel in self.requests:
+            if not client.closed:
+                granted = self._protected[channel].take(client, now)
+                self._statistics.refused += not granted
+                self.news = True
+        self.requests.clear()
+
+    def publish_status(self, now: float) -> None:
+        """Tells those who want to know."""
+        self.news = False
+        channel = tcpq.STATUS_CHANNEL.encode()
+        route = self._routes.get(channel) or self._find_route(channel)
+        if route.subscribers:
+            self._distribute(route, tcpq.publication(channel, self.statistics(now).to_json()), now)
+
+    def statistics(self, now: float) -> Statistics:
+        statistics = self._statistics
+        statistics.clients = len(self._clients)
+        statistics.queued = sum(client.queued for client in self._clients)
+        statistics.protected = {name: protected.statistics(now) for name, protected in self._protected.items()}
+        return statistics

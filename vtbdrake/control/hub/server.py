@@ -1,0 +1,259 @@
+"""The hub itself: one thread that waits for all its clients, and for none of them."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+
+from vtbdrake.control.hub import tcpq
+from vtbdrake.control.hub.config import HubConfig
+from vtbdrake.control.hub.connection import SLICE, Connection
+from vtbdrake.control.hub.relay import Relay
+from vtbdrake.control.hub.statistics import Statistics
+
+_log = logging.getLogger(__name__)
+
+_LOOPBACK = "127."
+
+_READS = 8  # liblcm writes a message in five pieces
+_NEWS_PERIOD = 0.01
+_ACCEPT_PAUSE = 1.0
+
+
+class HubAddressError(ValueError):
+    """The hub cannot listen at its address."""
+
+
+def listen(config: HubConfig) -> socket.socket:
+    """A socket that listens where the hub is told to.
+
+    Raises:
+        HubAddressError: it cannot.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind((config.host, config.port))
+        sock.listen()
+    except OSError as error:
+        sock.close()
+        if error.errno == errno.EADDRINUSE:
+            raise HubAddressError(
+                f"port {config.port} of {config.host} is in use, perhaps by another hub: end that one, or choose "
+                "another port (0 for any that is free)"
+            ) from error
+        raise HubAddressError(
+            f"the hub cannot listen on port {config.port} of {config.host!r} ({error.strerror}): choose an IPv4 "
+            "address of this machine, and a port that you may use"
+        ) from error
+    if not sock.getsockname()[0].startswith(_LOOPBACK):
+        _log.warning("listens on %s, not on loopback: whoever reaches that address is a client", config.host)
+    return sock
+
+
+class HubServer:
+    """A hub that runs in the thread that calls `serve_forever`.
+
+    ``lcm.LCM(url)`` holds Python's interpreter lock until the hub has answered. So clients of the same process need a
+    hub in another: `Hub`.
+
+    Args:
+        config: address, protected channels and limits.
+        listener: a listening socket to use instead of one at the configured address; the hub owns it.
+        control: a connected socket, which the hub owns: for every byte that comes in, the statistics go out as a line
+            of JSON; when its other end closes, the hub stops.
+
+    Raises:
+        HubAddressError: it cannot listen.
+    """
+
+    def __init__(
+        self, config: HubConfig, *, listener: socket.socket | None = None, control: socket.socket | None = None
+    ) -> None:
+        self.config = config
+        self._listener = listen(config) if listener is None else listener
+        self._listener.setblocking(False)
+        self.url = f"tcpq://{tcpq.address_name(self._listener.getsockname())}"
+        self._control = control
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK)
+        self._epoll = select.epoll()
+        self._others: dict[int, Callable[[], None]] = {self._listener.fileno(): self._accept, self._wake: self._stop}
+        if control is not None:
+            control.setblocking(False)
+            self._others[control.fileno()] = self._answer
+        for fileno in self._others:
+            self._epoll.register(fileno, select.EPOLLIN)
+
+        self._clients: dict[int, Connection] = {}
+        self._relay = Relay(config)
+        self._scratch = memoryview(bytearray(SLICE))
+        self._running = True
+        self._now = time.monotonic()
+        self._tick = min(config.status_period, config.patience / 4.0)
+        self._checked = self._reported = self._now
+        self._paused: float | None = None
+
+    def serve_forever(self) -> None:
+        """Relays until `stop`, then closes all connections."""
+        relay = self._relay
+        due = self._due()
+        try:
+            while self._running:
+                events = self._epoll.poll(max(0.0, due - self._now))
+                self._now = time.monotonic()
+                for fileno, event in events:
+                    client = self._clients.get(fileno)
+                    if client is not None:
+                        self._attend(client, event)
+                    elif fileno in self._others:  # or it is a client that another event has just disconnected
+                        self._others[fileno]()
+                    if relay.behind or relay.lost:
+                        self._follow_up()
+                if relay.requests:
+                    relay.decide(self._now)
+                if relay.news or self._now >= due:
+                    self._keep_house()
+                    self._follow_up()
+                    due = self._due()
+        finally:
+            self.close()
+
+    def stop(self) -> None:
+        """Ends `serve_forever`; from any thread, or from a signal handler."""
+        if not self._epoll.closed:
+            os.eventfd_write(self._wake, 1)
+
+    def close(self) -> None:
+        """Closes all sockets."""
+        for client in self._clients.values():
+            client.close()
+        self._clients.clear()
+        if not self._epoll.closed:
+            self._epoll.close()
+            self._listener.close()
+            os.close(self._wake)
+            if self._control is not None:
+                self._control.close()
+
+    def statistics(self) -> Statistics:
+        """Of this moment. To be asked in the thread of `serve_forever`, or when it has ended."""
+        return self._relay.statistics(self._now)
+
+    def _due(self) -> float:
+        """When the next thing is to be done that no client asks for."""
+        status = _NEWS_PERIOD if self._relay.news else self.config.status_period
+        return min(self._checked + self._tick, self._reported + status)
+
+    def _stop(self) -> None:
+        self._running = False
+
+    def _answer(self) -> None:
+        assert self._control is not None
+        try:
+            asked = self._control.recv(64)
+            self._control.send((self.statistics().to_json() + b"\n") * len(asked))
+        except OSError:
+            asked = b""
+        if not asked:
+            self._running = False
+
+    def _accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionError):
+            return
+        except OSError as error:
+            # Such as: no more file descriptors. The connection stays at the door, and would wake the hub for ever.
+            _log.warning("no client is accepted for %g s: %s", _ACCEPT_PAUSE, error)
+            self._epoll.unregister(self._listener.fileno())
+            self._paused = self._now
+            return
+        if len(self._clients) >= self.config.max_clients:
+            _log.warning("a client is turned away: there are %d, the most allowed", len(self._clients))
+            self._relay.turn_away("too many")
+            sock.close()
+            return
+        try:
+            client = Connection(
+                sock, max_message=self.config.max_message, max_queue=self.config.max_queue, now=self._now
+            )
+        except OSError:  # It is gone already.
+            sock.close()
+            return
+        self._clients[client.fileno] = client
+        self._relay.join(client)
+        self._epoll.register(client.fileno, select.EPOLLIN)
+
+    def _attend(self, client: Connection, event: int) -> None:
+        try:
+            if event & select.EPOLLOUT:
+                self._flush(client)
+            if event & ~select.EPOLLOUT:
+                self._read(client)
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            self._disconnect(client, "lost", f"is lost: {error}")
+        except tcpq.ProtocolError as error:
+            self._disconnect(client, error.reason, str(error))
+
+    def _flush(self, client: Connection) -> None:
+        client.flush(self._now)
+        if not client.queued:
+            client.watched = False
+            self._epoll.modify(client.fileno, select.EPOLLIN)
+
+    def _read(self, client: Connection) -> None:
+        for _ in range(_READS):
+            size = client.socket.recv_into(self._scratch)
+            if size == 0:
+                self._disconnect(client, "closed", "closed its connection")
+                return
+            for record in client.reader.feed(self._scratch[:size]):
+                self._relay.handle(client, record, self._now)
+            client.acknowledge()
+            # The rest of a message is there as soon as its beginning is acknowledged; but large messages come in turns.
+            if not client.reader.partial or size == SLICE:
+                return
+
+    def _disconnect(self, client: Connection, reason: str, message: str) -> None:
+        client.close()
+        if self._clients.pop(client.fileno, None) is not None:
+            log = _log.info if reason == "closed" else _log.warning
+            log("%s %s", client.name, message)
+            self._relay.leave(client, reason)
+
+    def _follow_up(self) -> None:
+        """Sees to the clients that did not take what was sent to them."""
+        relay = self._relay
+        for client, error in relay.lost:
+            self._disconnect(client, "lost", f"is lost: {error}")
+        for client in relay.behind:
+            if not client.closed:
+                self._epoll.modify(client.fileno, select.EPOLLIN | select.EPOLLOUT)
+        relay.lost.clear()
+        relay.behind.clear()
+
+    def _keep_house(self) -> None:
+        now, patience = self._now, self.config.patience
+        if now >= self._reported + (_NEWS_PERIOD if self._relay.news else self.config.status_period):
+            self._reported = now
+            self._relay.publish_status(now)
+        if now < self._checked + self._tick:
+            return
+        self._checked = now
+        for client in [c for c in self._clients.values() if now - c.progressed > patience]:
+            if client.queued:
+                self._disconnect(
+                    client, "stalled", f"has not read for {patience:g} s, {client.queued} bytes wait for it"
+                )
+            elif not client.reader.greeted:
+                self._disconnect(client, "greeting", f"has not greeted for {patience:g} s")
+        if self._paused is not None and now >= self._paused + _ACCEPT_PAUSE:
+            self._paused = None
+            self._epoll.register(self._listener.fileno(), select.EPOLLIN)
