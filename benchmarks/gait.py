@@ -9,7 +9,6 @@ from math import inf, isfinite
 
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
-from scipy.optimize import differential_evolution
 
 import vtbdrake as vtb
 from benchmarks.measure import HIGHER, Benchmark, spread
@@ -106,6 +105,9 @@ class _Reached(Exception):  # noqa: N818
 
 
 def _differential_evolution(seed: int) -> Search:
+    # Imported here, before the time counts: the workers of a study import this module, and have no use for it.
+    from scipy.optimize import differential_evolution
+
     values: list[float] = []
 
     def function(point: np.ndarray) -> float:
