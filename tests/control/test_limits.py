@@ -71,12 +71,13 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
     one.start_from([start])
     before = min(max(start, lower), upper)
     step_before = 0.0
+    width = max((abs(bound) for bound in (lower, upper) if bound not in (-inf, inf)), default=0.0)
     assert one.last_sent == before
     for command, times in commands:
         for _ in range(times):
             sent = one.limit([command]).item()
             step = sent - before
-            rounding = 8 * EPS * max(abs(sent), abs(before), abs(step_before))
+            rounding = 8 * EPS * max(abs(sent), abs(before), abs(step_before), width)
             assert lower <= sent <= upper
             assert abs(step) <= rate * T + rounding
             assert abs(step - step_before) <= acceleration * T**2 + rounding

@@ -173,7 +173,7 @@ def _locked_memory() -> Iterator[None]:
 
 
 def _locked_kilobytes() -> int:
-    found = re.search(r"^VmLck:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="ascii"), re.MULTILINE)
+    found = re.search(r"^VmLck:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
     return int(found[1]) if found else 0
 
 
@@ -200,7 +200,8 @@ def _switch_interval(seconds: float) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.setswitchinterval(before)
+        # Python cuts it to whole microseconds: 49.999999999999996 would become 49.
+        sys.setswitchinterval(before + 0.5e-6)
 
 
 @contextmanager

@@ -1,0 +1,205 @@
+"""What a loop asks of the operating system is granted or explained, and given back.
+
+The settings belong to a process, so each test has one of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vtbdrake.control.realtime import RealTime
+
+ROOT = Path(__file__).resolve().parents[2]
+
+STATE = """
+import ctypes, gc, json, os, re, sys
+from vtbdrake.control.realtime import RealTime, RealTimeError
+
+def state():
+    status = open("/proc/self/status").read()
+    return {
+        "policy": os.sched_getscheduler(0),
+        "priority": os.sched_getparam(0).sched_priority,
+        "cpus": sorted(os.sched_getaffinity(0)),
+        "locked": int(re.search(r"VmLck:\\s+(\\d+)", status)[1]) > 0,
+        "collects": gc.isenabled(),
+        "frozen": gc.get_freeze_count() > 0,
+        "switch": sys.getswitchinterval(),
+        "slack": ctypes.CDLL(None).prctl(30, 0, 0, 0, 0),
+    }
+
+def tell(**values):
+    print(json.dumps(values))
+
+def drop_rights():
+    import resource
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+    os.setgroups([])
+    os.setresgid(65534, 65534, 65534)
+    os.setresuid(65534, 65534, 65534)
+"""
+
+
+def told(code: str) -> dict[str, Any]:
+    """What ``code`` tells in a process of its own."""
+    command = [sys.executable, "-c", STATE + code]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=60)
+    return json.loads(result.stdout)
+
+
+def may_schedule() -> bool:
+    return told("r = RealTime()\nwith r: pass\ntell(all=all(g.granted for g in r.grants))")["all"]
+
+
+privileged = pytest.mark.skipif(
+    os.geteuid() != 0 or not may_schedule(), reason="needs the right to SCHED_FIFO and mlockall"
+)
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give up rights")
+
+
+@privileged
+def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
+    states = told(
+        "before = state()\n"
+        "with RealTime(priority=42, cpus={before['cpus'][0]}) as r: inside = state()\n"
+        "tell(before=before, inside=inside, after=state(), granted=[g.granted for g in r.grants])"
+    )
+    assert states["granted"] == [True] * 6
+    assert states["after"] == states["before"]
+    inside = states["inside"]
+    assert inside["policy"] & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+    assert inside["priority"] == 42
+    assert inside["cpus"] == states["before"]["cpus"][:1]
+    assert inside["locked"] and inside["frozen"] and not inside["collects"]
+    assert inside["switch"] == pytest.approx(5e-5)
+
+
+@privileged
+def test_all_is_given_back_after_an_exception() -> None:
+    states = told(
+        "before = state()\n"
+        "try:\n"
+        "    with RealTime(): raise KeyError('from inside')\n"
+        "except KeyError as error: seen = str(error)\n"
+        "tell(before=before, after=state(), seen=seen)"
+    )
+    assert states["after"] == states["before"]
+    assert states["seen"] == "'from inside'"
+
+
+@privileged
+def test_threads_that_are_started_inside_do_not_inherit_the_priority() -> None:
+    policies = told(
+        "import threading\n"
+        "found = []\n"
+        "with RealTime():\n"
+        "    thread = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0)))\n"
+        "    thread.start(); thread.join()\n"
+        "tell(thread=found[0])"
+    )
+    assert policies["thread"] == os.SCHED_OTHER
+
+
+@privileged
+def test_what_was_set_before_stays_set_after_an_inner_one() -> None:
+    states = told(
+        "with RealTime(priority=10):\n"
+        "    before = state()\n"
+        "    with RealTime(priority=20): inside = state()\n"
+        "    tell(before=before, inside=inside, after=state())"
+    )
+    assert states["after"] == states["before"]
+    assert states["inside"]["priority"] == 20
+
+
+@as_root
+def test_without_rights_the_refusals_tell_reason_and_remedy_and_the_rest_is_granted() -> None:
+    states = told(
+        "drop_rights()\n"
+        "before = state()\n"
+        "with RealTime(priority=80) as r: inside = state()\n"
+        "tell(before=before, inside=inside, after=state(), lines=str(r).splitlines())"
+    )
+    lines = {line.split(":")[0]: line for line in states["lines"]}
+    assert lines["SCHED_FIFO 80"].startswith("SCHED_FIFO 80: refused (EPERM, Operation not permitted): run as root, or")
+    assert "rtprio in /etc/security/limits.conf" in lines["SCHED_FIFO 80"]
+    assert lines["locked memory"].startswith("locked memory: refused (ENOMEM, ")
+    assert "memlock unlimited" in lines["locked memory"]
+    assert lines["no garbage collection"] == "no garbage collection: granted"
+    assert lines["switch interval 50 us"] == "switch interval 50 us: granted"
+    assert states["inside"]["slack"] == 1
+    assert not states["inside"]["collects"]
+    assert states["inside"]["policy"] == os.SCHED_OTHER
+    assert states["after"] == states["before"]
+
+
+@as_root
+def test_refusal_of_what_is_required_is_an_error_and_changes_nothing() -> None:
+    states = told(
+        "drop_rights()\n"
+        "before = state()\n"
+        "try:\n"
+        "    with RealTime(require=True): error = ''\n"
+        "except RealTimeError as refusal: error = str(refusal)\n"
+        "tell(before=before, after=state(), error=error)"
+    )
+    assert "SCHED_FIFO 80: refused (EPERM" in states["error"]
+    assert states["after"] == states["before"]
+
+
+@privileged
+def test_rights_that_were_given_up_inside_do_not_keep_it_from_being_left() -> None:
+    states = told(
+        "before = state()\n"
+        "with RealTime() as r:\n"
+        "    inside = state()\n"
+        "    drop_rights()\n"
+        "tell(before=before, inside=inside, after=state())"
+    )
+    assert states["inside"]["priority"] == 80
+    # The flag stays: without rights it cannot be taken back.
+    assert states["after"] == {**states["before"], "policy": os.SCHED_OTHER | os.SCHED_RESET_ON_FORK}
+
+
+def test_processors_that_may_not_be_used_are_refused() -> None:
+    there = sorted(os.sched_getaffinity(0))
+    states = told(
+        f"with RealTime(priority=None, lock_memory=False, cpus={{{there[0]}, 4095}}) as r: inside = state()\n"
+        "tell(inside=inside, line=str(r).splitlines()[0])"
+    )
+    assert states["inside"]["cpus"] == there
+    assert states["line"].startswith(f"processors [{there[0]}, 4095]: refused (EINVAL, only {there} may be used): ")
+
+
+def test_what_is_not_asked_for_is_left_alone() -> None:
+    states = told(
+        "before = state()\n"
+        "only = RealTime(priority=None, lock_memory=False, collect_garbage=True, switch_interval=None)\n"
+        "with only as r: inside = state()\n"
+        "tell(before=before, inside=inside, requests=[g.request for g in r.grants])"
+    )
+    assert states["requests"] == ["timer slack 1 ns"]
+    assert states["inside"] == {**states["before"], "slack": 1}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"priority": 0}, "1 to 99, not at 0"),
+        ({"priority": 100}, "1 to 99, not at 100"),
+        ({"cpus": set()}, "at least one processor"),
+        ({"switch_interval": 0.0}, "positive time"),
+    ],
+)
+def test_request_that_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RealTime(**options)

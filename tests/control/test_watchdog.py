@@ -1,0 +1,110 @@
+"""A sensor signal is relied on while it is fresh and plausible."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from vtbdrake.control.bridge import Reception
+from vtbdrake.control.watchdog import Watchdog
+from vtbdrake.testbed import Signal
+
+
+def signal(size: int = 2, **options: object) -> Signal:
+    return Signal("encoders", size=size, unit="rad", max_age=0.05, **options)
+
+
+def received(value: object, arrived: float = 0.0, count: int = 1) -> Reception:
+    return Reception(value=value, arrived=arrived, count=count)
+
+
+def kind(watchdog: Watchdog, now: float, reception: Reception) -> str | None:
+    fault = watchdog.check(now, reception)
+    return fault and fault.kind
+
+
+@pytest.mark.parametrize("max_age", [0.05, inf])
+def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
+    watchdog = Watchdog(Signal("encoders", size=2, max_age=max_age))
+    fault = watchdog.check(7.0, Reception())
+    assert (fault.kind, fault.signal, fault.time) == ("stale", "encoders", 7.0)
+    assert "never arrived" in str(fault)
+
+
+def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
+    watchdog, reception = Watchdog(signal()), received(np.zeros(2), arrived=1.0)
+    assert kind(watchdog, 1.0499, reception) is None
+    fault = watchdog.check(1.0625, reception)
+    assert fault.kind == "stale" and fault.reason == "sensor signal encoders is stale: 62.5 ms old, 50 allowed"
+    reception.arrived, reception.count = 1.0625, 2
+    assert kind(watchdog, 1.0625, reception) is None
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+@pytest.mark.parametrize("size", [2, 100])
+@pytest.mark.parametrize("place", [0, -1])
+def test_entry_that_is_not_finite_is_implausible_without_limits_too(bad: float, size: int, place: int) -> None:
+    value = np.zeros(size)
+    value[place] = bad
+    assert kind(Watchdog(signal(size)), 0.0, received(value)) == "implausible"
+
+
+@pytest.mark.parametrize("size", [2, 100])
+def test_entry_beyond_its_limit_is_implausible(size: int) -> None:
+    upper = np.ones(size)
+    upper[-1] = 2.0
+    watchdog = Watchdog(signal(size, lower=-1.0, upper=upper))
+    assert kind(watchdog, 0.0, received(upper)) is None
+    assert kind(watchdog, 0.0, received(1.001 * upper, count=2)) == "implausible"
+    assert kind(watchdog, 0.0, received(np.full(size, -1.001), count=3)) == "implausible"
+
+
+@pytest.mark.parametrize("value", [np.zeros(1), np.zeros(3), np.zeros((1, 2))])
+def test_sample_of_another_size_is_implausible(value: np.ndarray) -> None:
+    assert kind(Watchdog(signal()), 0.0, received(value)) == "implausible"
+
+
+def test_implausible_sample_is_a_fault_until_the_next_one() -> None:
+    watchdog, reception = Watchdog(signal(upper=1.0)), received(np.array([0.0, 2.0]))
+    assert [kind(watchdog, now, reception) for now in (0.0, 0.01)] == ["implausible"] * 2
+    reception.value, reception.count = np.zeros(2), 2
+    assert kind(watchdog, 0.02, reception) is None
+
+
+def test_jump_is_what_exceeds_rate_and_tolerance() -> None:
+    watchdog = Watchdog(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
+    at = [
+        received(np.array([0.0, 0.0]), 0.00, 1),
+        received(np.array([0.09, 0.0105]), 0.01, 2),
+        received(np.array([0.09, 0.0225]), 0.02, 3),
+        received(np.array([-0.02, 0.0225]), 0.03, 4),
+        received(np.array([-0.02, 0.0225]), 0.04, 5),
+    ]
+    assert [kind(watchdog, r.arrived, r) for r in at] == [None, None, "jump", "jump", None]
+
+
+def test_longer_silence_allows_a_larger_change() -> None:
+    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.0)
+    assert kind(watchdog, 0.0, received(np.zeros(2), 0.0, 1)) is None
+    assert kind(watchdog, 0.5, received(np.full(2, 0.49), 0.5, 2)) is None
+
+
+def test_sample_that_is_not_new_is_no_jump() -> None:
+    watchdog, reception = Watchdog(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
+    for now in (0.0, 0.001, 0.002):
+        assert kind(watchdog, now, reception) is None
+
+
+def test_abstract_signal_is_watched_for_its_age_only() -> None:
+    watchdog = Watchdog(Signal("picture", model_value="", max_age=0.1))
+    assert kind(watchdog, 0.0, received("cat")) is None
+    assert kind(watchdog, 0.2, received("cat")) == "stale"
+
+
+def test_jumps_need_a_finite_rate_and_a_vector() -> None:
+    with pytest.raises(ValueError, match="finite rate"):
+        Watchdog(signal(), jump_tolerance=0.1)
+    with pytest.raises(ValueError, match="abstract"):
+        Watchdog(Signal("picture", model_value=""), jump_tolerance=0.1)
