@@ -31,13 +31,13 @@ from vtbdrake.visualization.study_points import (
 )
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.study_record import StudyRecord
 
 _SINGLE = "#2166ac"
 _LEVELS = 12
 
 
-def plot_landscape(study: Study, *addresses: str) -> Figure:
+def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
     """Every quality over one or two parameters; where others vary too, the best found at each place.
 
     Over two: an image where the points fill a grid; else filled contours between the points if nothing but these two
@@ -71,7 +71,7 @@ def plot_landscape(study: Study, *addresses: str) -> Figure:
 
 
 def draw_slice(
-    axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
+    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
 ) -> None:
     """One quality over one parameter, with the best point; coloured by the order of the points unless ``style`` has a
     color."""
@@ -85,7 +85,9 @@ def draw_slice(
     finish(axes)
 
 
-def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, others: int) -> list[Artist]:
+def _draw_line(
+    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, others: int
+) -> list[Artist]:
     """Returns legend entries."""
     draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
     axes.set_ylabel(quality_label(study, quality))
@@ -109,7 +111,7 @@ def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, qualit
 
 
 def _draw_surface(
-    axes: Axes, study: Study, points: Points, x: Scale, y: Scale, *, quality: int, others: int
+    axes: Axes, study: StudyRecord, points: Points, x: Scale, y: Scale, *, quality: int, others: int
 ) -> list[Artist]:
     """Returns legend entries."""
     sign = signs(study)[quality]
@@ -165,7 +167,7 @@ def _spans_a_plane(unit: np.ndarray) -> bool:
 
 
 def _legend(
-    axes: Axes, study: Study, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
+    axes: Axes, study: StudyRecord, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
 ) -> None:
     best = points.best(study, quality)
     if best is not None:

@@ -32,7 +32,7 @@ from vtbdrake.visualization.study_points import (
 )
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.study_record import StudyRecord
 
 __all__ = ["plot_history", "plot_importances", "plot_landscape", "plot_pareto", "plot_slices"]
 
@@ -43,7 +43,7 @@ _PER_ROW = 4
 _ORDER_LABEL = "point, in the order of the study"
 
 
-def plot_history(study: Study) -> Figure:
+def plot_history(study: StudyRecord) -> Figure:
     """Every quality in the order of the points, coloured by the method that asked for them, and the best so far.
 
     Raises:
@@ -91,7 +91,7 @@ def plot_history(study: Study) -> Figure:
     return figure
 
 
-def plot_slices(study: Study) -> Figure:
+def plot_slices(study: StudyRecord) -> Figure:
     """Every quality over every parameter, coloured by the order of the points; the best point as a star.
 
     Raises:
@@ -124,7 +124,7 @@ def plot_slices(study: Study) -> Figure:
     return figure
 
 
-def plot_importances(study: Study) -> Figure:
+def plot_importances(study: StudyRecord) -> Figure:
     """How much each parameter decides about whether a point is among the best tenth, for every quality.
 
     See `vtbdrake.optimization.optuna_bridge.importances`.
@@ -154,7 +154,7 @@ def plot_importances(study: Study) -> Figure:
     return figure
 
 
-def plot_pareto(study: Study) -> Figure:
+def plot_pareto(study: StudyRecord) -> Figure:
     """Two qualities against each other, with the Pareto front; of three qualities, every pair of them.
 
     Raises:
@@ -198,7 +198,7 @@ def plot_pareto(study: Study) -> Figure:
     return figure
 
 
-def _draw_pair(axes: Axes, study: Study, points: Points, pair: tuple[int, int]) -> None:
+def _draw_pair(axes: Axes, study: StudyRecord, points: Points, pair: tuple[int, int]) -> None:
     i, j = pair
     axes.scatter(values(points.kept, i), values(points.kept, j), s=22, color=_BARS, alpha=0.6, linewidths=0, gid="kept")
     axes.plot(values(points.broken, i), values(points.broken, j), gid="broken", **BROKEN_STYLE)

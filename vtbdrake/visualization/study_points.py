@@ -18,7 +18,7 @@ from vtbdrake.visualization.figure import label
 from vtbdrake.visualization.trajectories import FAILED
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.study_record import StudyRecord
 
 BEST = "#d6604d"
 _BROKEN = "0.45"
@@ -42,7 +42,7 @@ class Points:
     failed: tuple[Trial, ...]
 
     @classmethod
-    def of(cls, study: Study) -> Points:
+    def of(cls, study: StudyRecord) -> Points:
         """
         Raises:
             ValueError: there are none.
@@ -77,7 +77,7 @@ class Points:
         )
         return Points(kept, broken, dropped, failed)
 
-    def best(self, study: Study, quality: int) -> Trial | None:
+    def best(self, study: StudyRecord, quality: int) -> Trial | None:
         """The best in one quality; None if no point keeps the constraints."""
         sign = signs(study)[quality]
         return max(self.kept, key=lambda trial: sign * trial.values[quality], default=None)
@@ -92,7 +92,7 @@ def _kind(trial: Trial) -> str:
     return "kept" if trial.feasible else "broken"
 
 
-def signs(study: Study) -> tuple[float, ...]:
+def signs(study: StudyRecord) -> tuple[float, ...]:
     """1 for a quality, -1 for a cost."""
     return tuple(1.0 if direction == "maximize" else -1.0 for direction in study.directions)
 
@@ -102,13 +102,13 @@ def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
     return np.array([trial.values[quality] for trial in trials], dtype=float)
 
 
-def name(study: Study, quality: int) -> str:
+def name(study: StudyRecord, quality: int) -> str:
     """Of a quality; of a function without a name, h."""
     found = study.names[quality]
     return found if found.isidentifier() else "h(s⁰)"
 
 
-def quality_label(study: Study, quality: int) -> str:
+def quality_label(study: StudyRecord, quality: int) -> str:
     """An axis label: ``energy (cost, worst of 5 conditions)``."""
     described = study.record["problem"]
     conditions = len(described["conditions"])
@@ -164,13 +164,19 @@ def _wrapped(text: str, width: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def scales(study: Study) -> dict[str, Scale]:
+def scales(study: StudyRecord) -> dict[str, Scale]:
     """By address."""
     return {p.address: Scale(p, unit) for p, unit in zip(study.parameters, study.units, strict=True)}
 
 
 def draw_points(
-    axes: Axes, study: Study, points: Points, x: Callable[[Sequence[Trial]], np.ndarray], *, quality: int, **style: Any
+    axes: Axes,
+    study: StudyRecord,
+    points: Points,
+    x: Callable[[Sequence[Trial]], np.ndarray],
+    *,
+    quality: int,
+    **style: Any,
 ) -> None:
     """All points at the places ``x`` and their values: those that keep the constraints with ``style`` of `scatter`.
 
@@ -239,13 +245,13 @@ def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]
     return _keys(marks)
 
 
-def point_keys(study: Study, points: Points) -> list[Line2D]:
+def point_keys(study: StudyRecord, points: Points) -> list[Line2D]:
     """Legend entries of what `draw_points` marks in a way of its own."""
     dropped = "dropped by racing: no better than this", _dropped_style(study, 0)
     return _keys(_marks(points, broken=BROKEN_STYLE, dropped=dropped))
 
 
-def _dropped_style(study: Study, quality: int) -> dict[str, Any]:
+def _dropped_style(study: StudyRecord, quality: int) -> dict[str, Any]:
     # It points to where the value may be.
     return {**_DROPPED_STYLE, "marker": "v" if signs(study)[quality] > 0.0 else "^"}
 

@@ -1,0 +1,59 @@
+"""Parameters: their ranges, their values in a unit interval, and what they refuse."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vtbdrake.optimization import Choice, Parameter
+
+SPACE = [
+    Parameter("a", -2.0, 6.0),
+    Parameter("a", 0.01, 100.0, log=True),
+    Parameter("a", -3, 4, integer=True),
+    Parameter("a", 1, 1000, integer=True, log=True),
+    Choice("a", ["red", "green", 3, 2.5, False]),
+]
+
+
+@given(st.sampled_from(SPACE), st.floats(0.0, 1.0))
+def test_every_place_of_the_unit_interval_is_a_value_that_leads_back(dimension, u):
+    value = dimension.from_unit(u)
+    assert dimension.check(value) == value
+    again = dimension.from_unit(dimension.to_unit(value))
+    assert again == (value if not isinstance(value, float) else pytest.approx(value))
+
+
+def test_each_integer_and_each_option_has_an_equal_share():
+    places = (np.arange(8000) + 0.5) / 8000
+    for dimension, count in ((SPACE[2], 8), (Choice("a", list("abcdefgh")), 8)):
+        values, counts = np.unique([dimension.from_unit(u) for u in places], return_counts=True)
+        assert len(values) == count and (counts == 1000).all()
+
+
+def test_a_logarithmic_range_has_its_geometric_mean_in_the_middle():
+    assert SPACE[1].from_unit(0.5) == pytest.approx(1.0)
+    assert SPACE[1].to_unit(10.0) == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Parameter("a", 1.0, 1.0), r"lower < upper, but it is \[1\.0, 1\.0\]"),
+        (lambda: Parameter("a", 0.0, np.inf), "finite"),
+        (lambda: Parameter("a", 0.5, 2, integer=True), "ends in whole numbers"),
+        (lambda: Parameter("a", 0.0, 1.0, log=True), "begins above 0"),
+        (lambda: Choice("a", [1.0]), "at least two different options"),
+        (lambda: Choice("a", [1, True]), "at least two different options"),
+        (lambda: Choice("a", [1.0, np.zeros(2)]), "numbers, words or booleans"),
+        (lambda: SPACE[0].check("x"), r"takes a number in \[-2, 6\], not 'x'"),
+        (lambda: SPACE[0].check(7.0), r"a = 7 lies outside its range \[-2, 6\]"),
+        (lambda: SPACE[0].check(np.nan), "outside its range"),
+        (lambda: SPACE[2].check(0.5), "takes whole numbers, not 0.5"),
+        (lambda: SPACE[4].check("blue"), "is one of {'red', 'green', 3, 2.5, False}, not 'blue'"),
+        (lambda: SPACE[4].check(0), "not 0"),
+    ],
+)
+def test_what_is_no_value_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
