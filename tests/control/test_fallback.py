@@ -1,0 +1,84 @@
+"""What fallbacks command, and which of them fit which signal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Zero, chain, default_fallback
+from vtbdrake.testbed import Interface, Signal
+
+TORQUE = Signal("joint_torque", size=2, unit="N m", idle=0.0)
+LAMP = Signal("lamp", model_value="off", idle="off")
+INTERFACE = Interface(
+    sense=[Signal("joint_state", size=4, unit="rad"), Signal("picture", model_value="")], act=[TORQUE, LAMP]
+)
+
+
+def test_hold_keeps_the_last_command() -> None:
+    assert Hold().command(np.array([1.0, 2.0]), {}, 1e-3).tolist() == [1.0, 2.0]
+
+
+def test_zero_is_zero() -> None:
+    assert Zero().command(np.array([1.0, 2.0]), {}, 1e-3).tolist() == [0.0, 0.0]
+
+
+def test_brake_acts_against_the_measured_velocity() -> None:
+    brake = Brake("joint_state", gain=[2.0, 3.0], entries=slice(2, 4))
+    command = brake.command(np.zeros(2), {"joint_state": np.array([9.0, 9.0, 1.0, -0.5])}, 1e-3)
+    assert command.tolist() == [-2.0, 1.5]
+
+
+def test_controller_gets_what_a_fallback_gets() -> None:
+    controller = FallbackController(lambda last, sensed, dt: last + dt * sensed["joint_state"][:2], otherwise=Hold())
+    command = controller.command(np.array([1.0, 2.0]), {"joint_state": np.array([1.0, 2.0, 0.0, 0.0])}, 0.5)
+    assert command.tolist() == [1.5, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "fallback"), [("rad", Hold), ("m", Hold), ("rad/s", Zero), ("N m", Zero), ("N", Zero), ("A", Zero)]
+)
+def test_unit_tells_the_fallback(unit: str, fallback: type[Fallback]) -> None:
+    assert type(default_fallback(Signal("a", size=1, unit=unit))) is fallback
+
+
+def test_unit_that_does_not_tell_asks_for_a_fallback() -> None:
+    with pytest.raises(ValueError, match=r"'1' of actuator signal gripper .* fallback=\{'gripper': Hold\(\)\}"):
+        default_fallback(Signal("gripper", size=1))
+
+
+def test_chain_is_what_takes_over_in_turn() -> None:
+    brake = Brake("joint_state", gain=1.0, entries=slice(2, 4))
+    controller = FallbackController(lambda *_: None, otherwise=brake)
+    assert [type(f) for f in chain(controller, TORQUE, interface=INTERFACE)] == [FallbackController, Brake, Zero]
+
+
+def test_chain_that_bites_its_tail_ends() -> None:
+    controller = FallbackController(lambda *_: None, otherwise=Hold())
+    controller.otherwise = controller
+    assert chain(controller, TORQUE, interface=INTERFACE) == [controller]
+
+
+@pytest.mark.parametrize(
+    "brake",
+    [
+        Brake("nothing", gain=1.0),
+        Brake("picture", gain=1.0),
+        Brake("joint_state", gain=1.0),
+        Brake("joint_state", gain=[1.0, 2.0, 3.0], entries=slice(2, 4)),
+    ],
+)
+def test_brake_that_does_not_fit_is_refused(brake: Brake) -> None:
+    with pytest.raises(ValueError, match="the brake of joint_torque"):
+        chain(brake, TORQUE, interface=INTERFACE)
+
+
+def test_abstract_signal_has_no_zero_whoever_takes_over() -> None:
+    with pytest.raises(ValueError, match="no zero"):
+        chain(FallbackController(lambda *_: "off", otherwise=Zero()), LAMP, interface=INTERFACE)
+
+
+@pytest.mark.parametrize("gain", [-1.0, [1.0, -2.0], float("nan")])
+def test_brake_that_would_accelerate_is_refused(gain: object) -> None:
+    with pytest.raises(ValueError, match="accelerate"):
+        Brake("joint_state", gain=gain)

@@ -1,0 +1,384 @@
+"""Guards: a fault of any kind latches in its own cycle, and what goes out keeps all limits throughout."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vtbdrake.control.bridge import Reception
+from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Zero
+from vtbdrake.control.guard import Guards, Verdict
+from vtbdrake.testbed import Interface, Signal
+
+T = 1e-3
+RATE = 100.0
+
+VELOCITY = Signal("velocity", size=2, unit="rad/s", lower=-5.0, upper=5.0, max_age=0.02)
+TORQUE = Signal("torque", size=2, unit="N m", lower=-10.0, upper=10.0, rate=RATE, idle=0.0)
+POSITION = Signal("position", size=1, unit="rad", lower=-1.0, upper=1.0, rate=1.0, acceleration=50.0, idle=0.0)
+LAMP = Signal("lamp", model_value="off", idle="off")
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    with caplog.at_level(logging.CRITICAL, logger="vtbdrake.control.guard"):
+        yield
+
+
+class Loop:
+    """Cycles of guards with a sensor that is on time unless it is told to be silent."""
+
+    def __init__(self, *act: Signal, sense: Signal = VELOCITY, start: bool = True, **options: Any) -> None:
+        self.guards = Guards(Interface(sense=[sense], act=act), T, **options)
+        self.receptions = {sense.name: Reception(value=np.zeros(2), arrived=0.0, count=1)}
+        self.now = 0.0
+        self.silent = False
+        if start:
+            for signal in act:
+                if signal.is_vector:
+                    self.guards.start(signal.name, np.zeros(signal.size))
+
+    def cycle(self, commands: Mapping[str, Any], **options: Any) -> Verdict:
+        self.now += T
+        if not self.silent:
+            for reception in self.receptions.values():
+                reception.arrived, reception.count = self.now, reception.count + 1
+        return self.guards.check(self.now, self.receptions, commands, **options)
+
+    def reset(self) -> tuple[str, ...]:
+        return self.guards.reset(self.now, self.receptions)
+
+
+def kinds(verdict: Verdict) -> list[tuple[str | None, str]]:
+    return [(fault.signal, fault.kind) for fault in verdict.faults]
+
+
+def test_without_a_fault_the_limited_commands_go_out() -> None:
+    loop = Loop(TORQUE, POSITION)
+    verdict = loop.cycle({"torque": [0.05, 4.0], "position": [1e-6]})
+    assert verdict.ok and not verdict.faults
+    assert {name: c.tolist() for name, c in verdict.commands.items()} == {"torque": [0.05, 0.1], "position": [1e-6]}
+    assert loop.guards.commands["torque"].counts["rate"].count == 1
+
+
+FAULTS: list[tuple[dict[str, Any], dict[str, Any], tuple[str | None, str]]] = [
+    ({"torque": [0.1, nan]}, {}, ("torque", "not finite")),
+    ({"torque": [0.1, inf]}, {}, ("torque", "not finite")),
+    ({"torque": [0.1]}, {}, ("torque", "size")),
+    ({"torque": None}, {}, ("torque", "size")),
+    ({}, {"active": ["torque"]}, ("torque", "missing")),
+    ({}, {"error": ZeroDivisionError("at cycle 2")}, (None, "raised")),
+    ({"torque": [0.1, 0.1]}, {"missed": 11}, (None, "missed")),
+    ({"torque": [0.1, 0.1]}, {"not_ready": "its brakes are closed"}, (None, "not ready")),
+]
+
+
+@pytest.mark.parametrize(("commands", "options", "expected"), FAULTS)
+def test_fault_brings_the_fallback_in_the_same_cycle_and_latches(
+    commands: dict[str, Any], options: dict[str, Any], expected: tuple[str | None, str]
+) -> None:
+    loop = Loop(TORQUE)
+    for _ in range(5):
+        loop.cycle({"torque": [1.0, 1.0]})
+    verdict = loop.cycle(commands, **options)
+    assert not verdict.ok and kinds(verdict) == [expected]
+    assert verdict.commands["torque"] == pytest.approx([0.4, 0.4])
+    after = loop.cycle({"torque": [1.0, 1.0]})
+    assert not after.ok and not after.faults
+    assert after.commands["torque"] == pytest.approx([0.3, 0.3])
+    assert [(fault.signal, fault.kind) for fault in loop.guards.latched] == [expected]
+
+
+def test_missed_deadlines_up_to_the_limit_are_no_fault() -> None:
+    assert Loop(TORQUE).cycle({"torque": [0.0, 0.0]}, missed=10).ok
+
+
+def test_stale_sensor_brings_the_fallback_within_its_maximum_age_and_a_cycle() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.0, 0.0]})
+    last, loop.silent = loop.now, True
+    while (verdict := loop.cycle({"torque": [0.0, 0.0]})).ok:
+        assert loop.now < last + 1.0
+    assert kinds(verdict) == [("velocity", "stale")]
+    assert VELOCITY.max_age < loop.now - last <= VELOCITY.max_age + 1.001 * T
+
+
+def test_implausible_sensor_is_a_fault() -> None:
+    loop = Loop(TORQUE)
+    loop.receptions["velocity"].value = np.array([0.0, 6.0])
+    assert kinds(loop.cycle({"torque": [0.0, 0.0]})) == [("velocity", "implausible")]
+
+
+def test_sensor_that_jumps_is_a_fault_if_asked_for() -> None:
+    sensor = Signal("velocity", size=2, rate=100.0)
+    loop = Loop(TORQUE, sense=sensor, jump_tolerance={"velocity": 0.01})
+    assert loop.cycle({"torque": [0.0, 0.0]}).ok
+    loop.receptions["velocity"].value = np.array([0.0, 1.0])
+    assert kinds(loop.cycle({"torque": [0.0, 0.0]})) == [("velocity", "jump")]
+
+
+def test_sensor_that_is_not_on_real_is_not_watched() -> None:
+    loop = Loop(TORQUE)
+    assert loop.guards.check(5.0, {}, {"torque": [0.0, 0.0]}).ok
+
+
+def test_fault_of_one_signal_brings_the_fallbacks_of_all() -> None:
+    loop = Loop(TORQUE, POSITION)
+    loop.cycle({"torque": [1.0, 1.0], "position": [5e-5]})
+    verdict = loop.cycle({"torque": [1.0, 1.0], "position": [nan]})
+    assert verdict.commands["torque"] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert verdict.commands["position"] == pytest.approx([5e-5])
+
+
+def test_command_of_a_faulty_cycle_leaves_no_trace_in_the_limits() -> None:
+    loop = Loop(TORQUE, POSITION, fallback={"torque": Hold()})
+    loop.cycle({"torque": [0.1, 0.1], "position": [0.0]})
+    verdict = loop.cycle({"torque": [0.2, 0.2], "position": [nan]})
+    assert verdict.commands["torque"].tolist() == [0.1, 0.1]
+
+
+def test_reset_is_refused_while_the_cause_persists() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [nan, 0.0]})
+    assert loop.reset() == ("the command torque is not finite: [nan, 0.0]",)
+    assert not loop.cycle({"torque": [0.05, 0.0]}).ok
+    assert loop.reset() == ()
+    verdict = loop.cycle({"torque": [0.05, 0.0]})
+    assert verdict.ok and verdict.commands["torque"].tolist() == [0.05, 0.0]
+
+
+def test_reset_looks_at_the_sensors_anew() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.0, 0.0]}, not_ready="it is off")
+    loop.cycle({"torque": [0.0, 0.0]})
+    assert loop.guards.reset(loop.now + 1.0, loop.receptions) == (
+        "sensor signal velocity is stale: 1000.0 ms old, 20 allowed",
+    )
+    assert loop.guards.latched
+    assert loop.reset() == ()
+
+
+def test_reset_names_all_causes() -> None:
+    loop = Loop(TORQUE)
+    loop.silent = True
+    loop.receptions["velocity"].count = 0
+    loop.cycle({"torque": [0.0]}, missed=20, not_ready="it is off")
+    assert loop.reset() == (
+        "20 deadlines were missed in a row, 10 are allowed",
+        "the machine is not ready: it is off",
+        "the command torque has the shape (1,) instead of (2,)",
+        "sensor signal velocity has never arrived",
+    )
+
+
+def test_commands_after_a_reset_depart_from_the_fallback() -> None:
+    loop = Loop(TORQUE)
+    for _ in range(20):
+        loop.cycle({"torque": [2.0, 2.0]})
+    loop.cycle({}, error=RuntimeError("once"))
+    loop.cycle({"torque": [2.0, 2.0]})
+    assert loop.reset() == ()
+    assert loop.cycle({"torque": [2.0, 2.0]}).commands["torque"] == pytest.approx([1.9, 1.9])
+
+
+def test_dps_that_keeps_raising_keeps_the_signals_on_real_on_the_fallback() -> None:
+    loop = Loop(TORQUE)
+    for _ in range(3):
+        loop.cycle({"torque": [1.0, 1.0]})
+    sent = [loop.cycle({}, error=SystemExit(1)).commands["torque"][0] for _ in range(4)]
+    assert sent == pytest.approx([0.2, 0.1, 0.0, 0.0], abs=1e-12)
+    assert loop.reset() == ("the DPS raised SystemExit: 1",)
+
+
+def test_while_nothing_is_on_real_faults_are_told_but_nothing_goes_out_or_latches() -> None:
+    loop = Loop(TORQUE)
+    loop.receptions["velocity"].value = np.array([nan, 0.0])
+    verdict = loop.cycle({})
+    assert (verdict.commands, verdict.ok) == ({}, True)
+    assert kinds(verdict) == [("velocity", "implausible")]
+
+
+def test_latch_outlasts_a_switch_to_sim() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [nan, 0.0]})
+    assert loop.cycle({}).commands == {}
+    assert loop.guards.latched
+
+
+def test_limited_signal_that_was_not_started_is_not_sent() -> None:
+    loop = Loop(TORQUE, start=False)
+    assert loop.guards.needs_start("torque")
+    verdict = loop.cycle({"torque": [0.0, 0.0]})
+    assert kinds(verdict) == [("torque", "not started")] and verdict.commands == {}
+    loop.guards.start("torque", [0.0, 0.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    assert loop.reset() == ()
+    assert loop.cycle({"torque": [0.0, 0.0]}).ok
+
+
+def test_signal_that_comes_back_to_real_has_to_start_anew() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.cycle({})
+    assert kinds(loop.cycle({"torque": [0.0, 0.0]})) == [("torque", "not started")]
+
+
+def test_start_before_the_switch_holds_over_cycles_on_sim() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({})
+    assert loop.cycle({"torque": [0.0, 0.0]}).ok
+
+
+def test_brake_brakes_while_its_velocity_is_fresh_and_fades_to_zero_after() -> None:
+    loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
+    loop.receptions["velocity"].value = np.array([2.0, -2.0])
+    verdict = loop.cycle({"torque": [nan, nan]})
+    assert verdict.commands["torque"] == pytest.approx([-0.1, 0.1])
+    loop.silent = True
+    sent = [loop.cycle({"torque": [0.0, 0.0]}).commands["torque"][0] for _ in range(25)]
+    assert sent[:18] == pytest.approx([-0.1] * 18) and sent[-1] == 0.0
+    assert [fault.kind for fault in loop.guards.log] == ["not finite", "stale", "fallback"]
+
+
+def test_fallback_is_limited_like_any_command() -> None:
+    loop = Loop(POSITION, fallback={"position": FallbackController(lambda *_: [100.0], otherwise=Hold())})
+    loop.cycle({"position": [nan]})
+    sent = [loop.cycle({"position": [0.0]}).commands["position"].item() for _ in range(3000)]
+    assert max(np.diff(sent)) == pytest.approx(1.0 * T)
+    assert max(abs(np.diff(sent, 2))) <= 50.0 * T**2 * (1 + 1e-9)
+    assert sent[-1] == 1.0
+
+
+def nothing(*_: Any) -> Any:
+    raise LookupError("no plan")
+
+
+@pytest.mark.parametrize("function", [nothing, lambda *_: [nan, 0.0], lambda *_: None, lambda *_: [1.0]])
+def test_fallback_controller_that_fails_is_stood_in_for_and_logged_once(function: Any) -> None:
+    loop = Loop(TORQUE, fallback={"torque": FallbackController(function, otherwise=Zero())})
+    for _ in range(3):
+        loop.cycle({"torque": [1.0, 1.0]})
+    sent = [loop.cycle({}, error=RuntimeError("x")).commands["torque"][0] for _ in range(2)]
+    assert sent == pytest.approx([0.2, 0.1])
+    assert [fault.kind for fault in loop.guards.log] == ["raised", "fallback"]
+
+
+def test_last_command_stays_if_every_fallback_fails() -> None:
+    class Broken(Fallback):
+        def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+            raise SystemExit(1)
+
+    loop = Loop(TORQUE, fallback={"torque": Broken()})
+    loop.cycle({"torque": [0.1, 0.1]})
+    assert loop.cycle({"torque": [nan, nan]}).commands["torque"].tolist() == [0.1, 0.1]
+
+
+def test_fallback_learns_how_much_time_has_passed() -> None:
+    spans = []
+
+    def note(last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+        spans.append(dt)
+        return last_sent
+
+    loop = Loop(TORQUE, fallback={"torque": FallbackController(note, otherwise=Hold())})
+    loop.cycle({"torque": [nan, nan]})
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.now += 0.005
+    loop.cycle({"torque": [0.0, 0.0]})
+    assert spans == pytest.approx([T, T, 0.006])
+
+
+def test_fault_that_is_told_latches_and_gives_the_fallback_commands() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.1, 0.1]})
+    verdict = loop.guards.fault("interrupted", loop.now + T, loop.receptions)
+    assert not verdict.ok and kinds(verdict) == [(None, "told")]
+    assert verdict.commands["torque"].tolist() == [0.0, 0.0]
+    assert [str(fault) for fault in loop.guards.latched] == ["interrupted"]
+    assert loop.reset() == ()
+
+
+def test_log_has_each_fault_once_while_it_lasts_and_is_bounded() -> None:
+    loop = Loop(TORQUE, log_size=3)
+    for commands in ([nan, 0.0], [nan, 1.0], [0.0, 0.0], [nan, 0.0], [0.0], [nan, 0.0]):
+        loop.cycle({"torque": commands})
+    assert [(round(fault.time, 6), fault.kind) for fault in loop.guards.log] == [
+        (0.004, "not finite"),
+        (0.005, "size"),
+        (0.006, "not finite"),
+    ]
+
+
+def test_doubts_are_what_is_wrong_with_a_sensor_now() -> None:
+    loop = Loop(TORQUE)
+    assert loop.guards.doubts("velocity", 0.0, loop.receptions["velocity"]) == []
+    assert loop.guards.doubts("velocity", 0.0, Reception()) == ["sensor signal velocity has never arrived"]
+
+
+def test_abstract_actuator_signal_passes_and_is_held() -> None:
+    loop = Loop(LAMP, fallback={"lamp": Hold()})
+    assert loop.cycle({"lamp": "on"}).commands == {"lamp": "on"}
+    verdict = loop.cycle({"lamp": None})
+    assert not verdict.ok and verdict.commands == {"lamp": "on"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fallback": {"torqe": Zero()}}, "fallback is given for torqe, but the signals are torque"),
+        ({"jump_tolerance": {"speed": 1.0}}, "jump_tolerance is given for speed, but the signals are velocity"),
+        ({"max_missed": -1}, "max_missed"),
+        ({"fallback": {"torque": Brake("speed", gain=1.0)}}, "the brake of torque"),
+    ],
+)
+def test_guards_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Loop(TORQUE, **options)
+
+
+def test_signal_whose_unit_does_not_tell_needs_a_fallback() -> None:
+    with pytest.raises(ValueError, match="does not tell what is safe"):
+        Loop(LAMP)
+
+
+events = st.sampled_from(["go", "go", "go", "nan", "size", "raise", "silent", "loud", "missed", "reset", "wild"])
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(events, st.integers(1, 40)), max_size=25))
+def test_whatever_happens_what_goes_out_is_finite_and_within_all_limits(script: list[tuple[str, int]]) -> None:
+    loop = Loop(TORQUE, POSITION, fallback={"torque": Brake("velocity", gain=3.0)})
+    loop.receptions["velocity"].value = np.array([1.0, -4.0])
+    torque, position, speed = np.zeros(2), 0.0, 0.0
+    for event, times in script:
+        for _ in range(times):
+            commands: dict[str, Any] = {"torque": [9.0, -9.0], "position": [0.9]}
+            options: dict[str, Any] = {}
+            if event == "nan":
+                commands["position"] = [nan]
+            elif event == "size":
+                commands["torque"] = [0.0]
+            elif event == "wild":
+                commands = {"torque": [-1e300, 1e300], "position": [-1e9]}
+            elif event == "raise":
+                commands, options = {}, {"error": RuntimeError("x"), "active": ["torque", "position"]}
+            elif event == "missed":
+                options = {"missed": 99}
+            elif event == "reset":
+                loop.reset()
+            loop.silent = {"silent": True, "loud": False}.get(event, loop.silent)
+            sent = loop.cycle(commands, **options).commands
+            assert (abs(sent["torque"]) <= 10.0).all()
+            assert (abs(sent["torque"] - torque) <= RATE * T + 1e-12).all()
+            new = sent["position"].item()
+            assert abs(new) <= 1.0
+            assert abs(new - position) <= 1.0 * T + 1e-14
+            assert abs(new - position - speed) <= 50.0 * T**2 + 1e-14
+            torque, position, speed = sent["torque"], new, new - position
