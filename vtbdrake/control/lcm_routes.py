@@ -100,7 +100,7 @@ class Inlet:
         accepted = good
         for name, reception in self._receptions.items():
             if not good:
-                reason = self._ranges[name].check(values[name]) if name in values else "decode"
+                reason = self._ranges[name].check(values[name]) if name in values else "missing"
                 if reason:
                     reception.reject(reason)
                     continue

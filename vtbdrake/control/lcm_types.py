@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from drake import lcmt_iiwa_command, lcmt_iiwa_status
 
-from vtbdrake.control.lcm_fields import FieldMap, vector_map
+from vtbdrake.control.lcm_vectors import VectorMap, vector_map
 
 
-def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "IIWA_STATUS") -> FieldMap:
+def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "IIWA_STATUS") -> VectorMap:
     """The state of an arm that speaks the iiwa messages, as the arm sends it.
 
     Args:
@@ -27,7 +27,7 @@ def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "II
 
 def iiwa_command(
     fields: Mapping[str, str] | Sequence[str] = ("joint_position",), *, channel: str = "IIWA_COMMAND"
-) -> FieldMap:
+) -> VectorMap:
     """Commands to an arm that speaks the iiwa messages.
 
     Args:
