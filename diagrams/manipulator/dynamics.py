@@ -53,6 +53,19 @@ class ArmDynamics:
         columns = [casadi.vertcat(a, casadi.cross(a, p - o)) for a, o in zip(axes, origins, strict=True)]
         return TipMotion(R, p, casadi.densify(casadi.horzcat(*columns)))
 
+    def tip_bias(self, q: Expression, v: Expression) -> Expression:
+        """Jdot v (6): the tip's [angular; linear] acceleration while the joints turn uniformly, in the world."""
+        R = casadi.SX.eye(3)
+        omega, alpha, acceleration = (casadi.SX.zeros(3) for _ in range(3))
+        for k in range(JOINTS):
+            acceleration += _turned(omega, alpha, self.arm.offsets[k] * R[:, 2])
+            turn = v[k] * (R @ _sparse(np.array(self.arm.axes[k], dtype=float)))
+            alpha += casadi.cross(omega, turn)
+            omega += turn
+            R = R @ self._rotation(k, q[k])
+        acceleration += _turned(omega, alpha, self.arm.tip_offset * R[:, 2])
+        return casadi.vertcat(alpha, acceleration)
+
     def inverse_dynamics(
         self, q: Expression, v: Expression, a: Expression, *, gravity: float = GRAVITY, rotors: bool = True
     ) -> Expression:

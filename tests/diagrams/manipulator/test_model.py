@@ -50,6 +50,7 @@ def _own() -> casadi.Function:
         "R": tip.R,
         "p": tip.p,
         "J": tip.J,
+        "bias": dynamics.tip_bias(q, v),
         "momentum": p,
         "dL_dq": dL_dq,
     }
@@ -122,6 +123,15 @@ def test_own_kinematics_agree_with_drake(plant: MultibodyPlant, context: Context
     np.testing.assert_allclose(own("R", q, v, a), X_WT.rotation().matrix(), atol=1e-9)
     np.testing.assert_allclose(own("p", q, v, a), X_WT.translation(), atol=1e-9)
     np.testing.assert_allclose(own("J", q, v, a), J, atol=1e-9)
+
+
+@pytest.mark.parametrize(("q", "v", "a"), POSES)
+def test_own_bias_agrees_with_drake(plant: MultibodyPlant, context: Context, q, v, a) -> None:
+    plant.SetPositions(context, q)
+    plant.SetVelocities(context, v)
+    tip, world = plant.GetFrameByName("tip"), plant.world_frame()
+    expected = plant.CalcBiasSpatialAcceleration(context, JacobianWrtVariable.kV, tip, np.zeros(3), world, world)
+    np.testing.assert_allclose(own("bias", q, v, a), expected.get_coeffs(), atol=1e-8)
 
 
 @pytest.mark.parametrize("rotors", [True, False])

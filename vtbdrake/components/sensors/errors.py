@@ -117,9 +117,11 @@ class ErrorStage:
         """What the sensor shows when it measures ``y`` (with its white noise) at ``tick``."""
         n = self._n
         values = context.get_numeric_parameter(self._parameters).value()
+        walk = context.get_discrete_state(self._walk).value()
+        if not (self._longest or values.any() or walk.any()):
+            return y  # the quick way of a sensor without errors
         drift, q = values[n : 2 * n], values[2 * n : 3 * n]
         latency, dropout = round(float(values[3 * n])), float(values[3 * n + 1])
-        walk = context.get_discrete_state(self._walk).value()
         if drift.any():
             step = normal_noise(n, seed=seed, stream=stream, tick=tick, channel=_DRIFT_CHANNEL)
             walk = walk + self._root_period * drift * step

@@ -1,0 +1,253 @@
+"""The arm's data processing system: one function builds it for the testbed, its copies and the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import Adder, ConstantVectorSource, Multiplexer, Saturation
+
+from diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
+from diagrams.manipulator.dynamics import ArmDynamics, Expression, function
+from diagrams.manipulator.laws import LAWS, Declared
+from diagrams.manipulator.motions import HOME, parameters, reference
+from vtbdrake.components.casadi_system import CasadiSystem
+from vtbdrake.state import discrete_state
+
+# Name -> (initial value, unit).
+States = dict[str, tuple[object, str]]
+
+SENSOR_SIGNALS = {"joint_position": JOINTS, "joint_velocity": JOINTS, "joint_torque_measured": JOINTS, "wrench": 6}
+
+
+def make_dps(
+    law: str = "cartesian_impedance", *, period: float = 0.001, arm: Arm | None = None, compile: bool = False
+) -> Diagram:
+    """The DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
+
+    Input ports: ``joint_position`` (7, rad), ``joint_velocity`` (7, rad/s), ``joint_torque_measured`` (7, N m, on the
+    joints' output side), ``wrench`` (6, [torque; force] that the tool exerts on the sensor at the flange, in the
+    sensor's frame) and the command ``motion``, see `motions`. Output port: ``joint_torque`` (7, N m).
+
+    ``env`` and ``impl`` are sampled with ``period`` (s) and show their own state: no input feeds through. What is at
+    the input at one sample is in the torque from then on. The wrench is perceived first, and acts one period later.
+
+    Args:
+        law: a name of `LAWS`.
+        compile: evaluates machine code; needs a C compiler when it runs for the first time.
+
+    Raises:
+        ValueError: there is no such law.
+    """
+    if law not in LAWS:
+        raise ValueError(f"law is {law!r}, but must be one of {', '.join(LAWS)}.")
+    model = ArmDynamics(arm)
+    builder = DiagramBuilder()
+    sense = builder.AddNamedSystem("sense", _make_sense())
+    env = builder.AddNamedSystem("env", _make_env(model, period=period, compile=compile))
+    impl = builder.AddNamedSystem("impl", _make_impl(model, law, period=period, compile=compile))
+    act = builder.AddNamedSystem("act", _make_act(model.arm))
+    for signal in SENSOR_SIGNALS:
+        builder.ExportInput(sense.GetInputPort(signal), signal)
+    builder.ExportInput(impl.GetInputPort("wanted"), "motion")
+    builder.Connect(sense.get_output_port(), env.GetInputPort("measured"))
+    builder.Connect(sense.get_output_port(), impl.GetInputPort("measured"))
+    builder.Connect(env.GetOutputPort("contact_wrench"), impl.GetInputPort("contact_wrench"))
+    builder.Connect(impl.GetOutputPort("torque"), act.GetInputPort("torque"))
+    builder.ExportOutput(act.get_output_port(), "joint_torque")
+    dps = builder.Build()
+    dps.set_name("dps")
+    return dps
+
+
+def _make_sense() -> Diagram:
+    """The raw values and, beside them, ``offset``, which is added."""
+    builder = DiagramBuilder()
+    raw = builder.AddNamedSystem("raw", Multiplexer(list(SENSOR_SIGNALS.values())))
+    size = sum(SENSOR_SIGNALS.values())
+    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(size)))
+    measured = builder.AddNamedSystem("measured", Adder(2, size))
+    for k, signal in enumerate(SENSOR_SIGNALS):
+        builder.ExportInput(raw.get_input_port(k), signal)
+    builder.Connect(raw.get_output_port(), measured.get_input_port(0))
+    builder.Connect(offset.get_output_port(), measured.get_input_port(1))
+    builder.ExportOutput(measured.get_output_port(), "measured")
+    return builder.Build()
+
+
+def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
+    r"""The perceived environment: where the arm is, and what touches it.
+
+    ``contact_wrench`` F_T, [torque; force] that the environment exerts on the tip, in the world, follows the sensor's
+    wrench, less the tool's weight, by a first-order low-pass. (The tool's inertia is left in: 0.4 N at 1 m/s^2.)
+
+    ``external_torque`` r, of the environment on the joints, is that of a momentum observer,
+
+        r = k (p - s),   s' = tau + dL/dq + r,
+
+    with the links' momentum p = M v and the measured torques tau: r follows J' F by a low-pass of the rate k (De Luca,
+    Mattone, "Sensorless Robot Collision Detection and Hybrid Force/Motion Control", 2005). A robot that starts in
+    motion starts with a wrong r, which dies out at the same rate.
+    """
+    z = casadi.SX.sym("measured", sum(SENSOR_SIGNALS.values()))
+    q, v, tau, wrench_S = casadi.vertsplit(z, [0, *np.cumsum(list(SENSOR_SIGNALS.values())).tolist()])
+    gains: Declared = {
+        "tool_mass": (model.arm.tool_mass, "kg", (0.0, float("inf"))),
+        "tool_center": (model.arm.tool_inertia().get_com(), "m", (-1.0, 1.0)),
+        "wrench_time_constant": (0.002, "s", (0.0, 1.0)),
+        "observer_rate": (100.0, "1/s", (0.0, 1.0 / period)),
+    }
+    p = _symbols(gains)
+    state: States = {
+        "contact_wrench": (np.zeros(6), "N m, N"),
+        "joint_position": (model.arm.home, "rad"),
+        "joint_velocity": (np.zeros(JOINTS), "rad/s"),
+        "external_torque": (np.zeros(JOINTS), "N m"),
+        "momentum_integral": (np.zeros(JOINTS), "N m s"),
+    }
+    x = _symbols(state)
+
+    tip = model.tip(q)
+    weight = casadi.vertcat(0, 0, -p["tool_mass"] * GRAVITY)
+    force = tip.R @ wrench_S[3:] - weight
+    # About the sensor's origin, then about the tip.
+    torque = tip.R @ wrench_S[:3] - casadi.cross(tip.R @ p["tool_center"], weight)
+    torque -= casadi.cross(model.arm.tool_length * tip.R[:, 2], force)
+    gain = 1 - casadi.exp(-period / casadi.fmax(p["wrench_time_constant"], 1e-9))
+    felt = x["contact_wrench"] + gain * (casadi.vertcat(torque, force) - x["contact_wrench"])
+
+    momentum, dL_dq = model.momentum(q, v)
+    external = p["observer_rate"] * (momentum - x["momentum_integral"])
+    following = {
+        "contact_wrench": felt,
+        "joint_position": q,
+        "joint_velocity": v,
+        "external_torque": external,
+        "momentum_integral": x["momentum_integral"] + period * (tau + dL_dq + external),
+    }
+    return _system(
+        "env",
+        following,
+        state=state,
+        x=x,
+        gains=gains,
+        p=p,
+        inputs={"measured": z},
+        period=period,
+        compile=compile,
+    )
+
+
+def _make_impl(model: ArmDynamics, law: str, *, period: float, compile: bool) -> System:
+    """Motions and control law in one; ``torque`` changes no faster than ``torque_rate``."""
+    chosen = LAWS[law]
+    z = casadi.SX.sym("measured", sum(SENSOR_SIGNALS.values()))
+    q, v = z[:JOINTS], z[JOINTS : 2 * JOINTS]
+    wanted, wrench = casadi.SX.sym("wanted"), casadi.SX.sym("contact_wrench", 6)
+    gains: Declared = {
+        **chosen.parameters,
+        **parameters(model.arm),
+        "torque_rate": (model.arm.torque_rates, "N m/s", (0.0, float("inf"))),
+    }
+    p = _symbols(gains)
+    state: States = {
+        "torque": (gravity_torque(model), "N m"),
+        "motion": (HOME, "1"),
+        "clock": (0.0, "s"),
+        "start": (model.arm.home, "rad"),
+        "reference": (model.arm.home, "rad"),
+        **chosen.state,
+    }
+    x = _symbols(state)
+    r = reference(wanted, q, x, p, period=period)
+    torque, remembered = chosen.torque(model, q, v, wrench, r, x, p, period)
+    reach = period * p["torque_rate"]
+    torque = casadi.fmin(casadi.fmax(torque, x["torque"] - reach), x["torque"] + reach)
+    following = {"torque": torque, **r.state, **remembered}
+    inputs = {"measured": z, "contact_wrench": wrench, "wanted": wanted}
+    return _system(
+        "impl",
+        following,
+        state=state,
+        x=x,
+        gains=gains,
+        p=p,
+        inputs=inputs,
+        period=period,
+        compile=compile,
+    )
+
+
+def _make_act(arm: Arm) -> Diagram:
+    """The torque and, beside it, ``offset``, which is added; held between the limits of the joints."""
+    builder = DiagramBuilder()
+    limits = np.array(arm.torques)
+    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(JOINTS)))
+    calibrated = builder.AddNamedSystem("calibrated", Adder(2, JOINTS))
+    limited = builder.AddNamedSystem("limited", Saturation(-limits, limits))
+    builder.ExportInput(calibrated.get_input_port(0), "torque")
+    builder.Connect(offset.get_output_port(), calibrated.get_input_port(1))
+    builder.Connect(calibrated.get_output_port(), limited.get_input_port())
+    builder.ExportOutput(limited.get_output_port(), "torque")
+    return builder.Build()
+
+
+def gravity_torque(model: ArmDynamics) -> np.ndarray:
+    """What holds the arm at home (7, N m)."""
+    q = casadi.SX.sym("q", JOINTS)
+    zero = casadi.SX(JOINTS, 1)
+    hold = function("hold", {"q": q}, {"torque": model.inverse_dynamics(q, zero, zero)})
+    return hold(model.arm.home).full().ravel()
+
+
+def _symbols(declared: Mapping[str, tuple[object, ...]]) -> dict[str, Expression]:
+    return {name: casadi.SX.sym(name, np.size(values[0])) for name, values in declared.items()}
+
+
+def _system(
+    name: str,
+    following: dict[str, Expression],
+    *,
+    state: States,
+    x: dict[str, Expression],
+    gains: Declared,
+    p: dict[str, Expression],
+    inputs: dict[str, Expression],
+    period: float,
+    compile: bool,
+) -> System:
+    """The system x_next = following(x, p, inputs), whose first state is its output.
+
+    Every group of a Context that Python reads and writes costs more than the arm's dynamics: all other states lie in
+    one group, ``memory``, where their addresses still name them.
+    """
+    shown, *others = state
+    memory = casadi.SX.sym("memory", sum(x[other].numel() for other in others))
+    parts = casadi.vertsplit(memory, np.cumsum([0, *(x[other].numel() for other in others)]).tolist())
+    packed = [following[shown], casadi.vertcat(*(following[other] for other in others))]
+    packed = casadi.substitute(packed, [x[other] for other in others], parts)
+    update = function(
+        name,
+        {shown: x[shown], "memory": memory, **p, **inputs},
+        {f"{shown}_next": packed[0], "memory_next": packed[1]},
+    )
+    x0 = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, (value, _) in state.items()}
+    system = CasadiSystem(
+        update=update,
+        state={shown: x0[shown], "memory": np.concatenate([x0[other] for other in others])},
+        parameters={name: value for name, (value, _, _) in gains.items()},
+        period=period,
+        units={shown: state[shown][1], **{name: unit for name, (_, unit, _) in gains.items()}},
+        bounds={name: bounds for name, (_, _, bounds) in gains.items()},
+        compile=compile,
+    )
+    start, named = 0, []
+    for other in others:
+        size = x0[other].size
+        shape = (size,) if size > 1 else ()
+        named.append(discrete_state(other, 1, shape=shape, start=start, unit=state[other][1]))
+        start += size
+    system.variables = (*(e for e in system.variables if e.name != "memory"), *named)
+    return system

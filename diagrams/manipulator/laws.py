@@ -1,0 +1,203 @@
+r"""The control laws: joint impedance, Cartesian impedance and admittance.
+
+q, v are measured; q_r, v_r, a_r and, for the tip T, X_r, V_r, A_r are the reference; ID(q, v, a) = M a + C v + g is
+the arm's inverse dynamics; J is the tip's Jacobian, J+ its pseudo-inverse, N = 1 - J+ J; wrenches and velocities are
+[angular; linear], in the world. e is the pose error [sin(angle) axis; p_r - p].
+
+joint impedance (Hogan, "Impedance Control", 1985)
+
+    tau = K (q_r - q) + D (v_r - v) + ID(q, v, a_r)
+
+Cartesian impedance (Ott, "Cartesian Impedance Control of Redundant and Flexible-Joint Robots", 2008)
+
+    tau = J' (K e + D (V_r - J v)) + N (K_0 (q_r - q) + D_0 (v_r - v)) + ID(q, v, J+ (A_r - Jdot v))
+
+admittance: the wrench F that the environment exerts on the tip moves the reference by x, of mass, damper and spring
+
+    M_a x'' + D_a x' + K_a x = F
+
+and the arm follows it by its inverse dynamics (resolved acceleration: Luh, Walker, Paul, 1980), with F compensated
+
+    tau = ID(q, v, a) - J' F,   with a the sum of
+          J+ (A_r + x'' + D_p (V_r + x' - J v) + K_p (e + x) - Jdot v)   and   N (K_0 (q_r - q) + D_0 (v_r - v))
+
+J+ is of the least squares: N torques do not move the tip of an arm at rest, so that in statics the tip feels K e and
+nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import casadi
+
+from diagrams.manipulator.dynamics import ArmDynamics, Expression, TipMotion
+from diagrams.manipulator.motions import Reference
+
+# Name -> (value, unit, bounds).
+Declared = dict[str, tuple[object, str, tuple[float, float]]]
+_POSITIVE = (0.0, float("inf"))
+_NULL_SPACE: Declared = {
+    "posture_stiffness": (20.0, "1", _POSITIVE),
+    "posture_damping": (10.0, "1", _POSITIVE),
+}
+
+
+@dataclass(frozen=True)
+class Law:
+    """A control law.
+
+    Attributes:
+        parameters: value, unit and bounds of its gains.
+        state: initial value and unit of what it remembers beside the motion.
+        torque: (ArmDynamics, q, v, wrench, Reference, state, parameters, period) -> torque, next state. The state has
+            the joint ``reference`` of the last instant.
+    """
+
+    parameters: Declared
+    torque: Callable[..., tuple[Expression, dict[str, Expression]]]
+    state: dict[str, tuple[object, str]] = field(default_factory=dict)
+
+
+class _Projection:
+    """J+ and N, of the least squares with a trace of damping, so that they stay finite where J loses rank."""
+
+    def __init__(self, J: Expression) -> None:
+        self._J = J
+        self._root = casadi.chol(J @ J.T + 1e-8 * casadi.SX.eye(6))
+
+    def inverse(self, V: Expression) -> Expression:
+        """J+ V."""
+        return self._J.T @ self._solved(V)
+
+    def null(self, tau: Expression) -> Expression:
+        """N tau."""
+        return tau - self._J.T @ self._solved(self._J @ tau)
+
+    def _solved(self, b: Expression) -> Expression:
+        return casadi.solve(self._root, casadi.solve(self._root.T, b))
+
+
+def _pose_error(R: Expression, p: Expression, R_r: Expression, p_r: Expression) -> Expression:
+    turns = [casadi.cross(R[:, k], R_r[:, k]) for k in range(3)]
+    return casadi.vertcat((turns[0] + turns[1] + turns[2]) / 2, p_r - p)
+
+
+def _linear(value: Expression) -> Expression:
+    return casadi.vertcat(casadi.SX.zeros(3), value)
+
+
+def _joint_impedance(
+    model: ArmDynamics,
+    q: Expression,
+    v: Expression,
+    wrench: Expression,
+    r: Reference,
+    state: dict[str, Expression],
+    p: dict[str, Expression],
+    period: float,
+) -> tuple[Expression, dict[str, Expression]]:
+    # Cartesian motions become joint motions by closed-loop inverse kinematics, from where the reference is.
+    last = state["reference"]
+    start, tip = model.tip(r.q), model.tip(last)
+    least = _Projection(tip.J)
+    error = _pose_error(tip.R, tip.p, start.R, start.p + r.dp)
+    v_c = least.inverse(_linear(r.dv) + p["tracking_rate"] * error) + least.null(p["posture_rate"] * (r.q - last))
+    a_c = least.inverse(_linear(r.da) - model.tip_bias(last, v_c))
+    q_r = casadi.if_else(r.in_joints, r.q, last)
+    v_r = casadi.if_else(r.in_joints, r.v, v_c)
+    a_r = casadi.if_else(r.in_joints, r.a, a_c)
+    tau = p["stiffness"] * (q_r - q) + p["damping"] * (v_r - v) + model.inverse_dynamics(q, v, a_r)
+    following = casadi.if_else(r.in_joints, r.q, last + period * v_c)
+    return tau, {"reference": following}
+
+
+def _cartesian(
+    model: ArmDynamics, q: Expression, v: Expression, r: Reference
+) -> tuple[TipMotion, _Projection, Expression, Expression, Expression, Expression]:
+    """The tip, its projection and bias, and e, V_r - J v and A_r for the reference."""
+    tip, goal = model.tip(q), model.tip(r.q)
+    error = _pose_error(tip.R, tip.p, goal.R, goal.p + r.dp)
+    V_r = goal.J @ r.v + _linear(r.dv)
+    A_r = goal.J @ r.a + model.tip_bias(r.q, r.v) + _linear(r.da)
+    return tip, _Projection(tip.J), model.tip_bias(q, v), error, V_r - tip.J @ v, A_r
+
+
+def _posture(q: Expression, v: Expression, r: Reference, p: dict[str, Expression]) -> Expression:
+    return p["posture_stiffness"] * (r.q - q) + p["posture_damping"] * (r.v - v)
+
+
+def _cartesian_impedance(
+    model: ArmDynamics,
+    q: Expression,
+    v: Expression,
+    wrench: Expression,
+    r: Reference,
+    state: dict[str, Expression],
+    p: dict[str, Expression],
+    period: float,
+) -> tuple[Expression, dict[str, Expression]]:
+    tip, least, bias, error, speed_error, A_r = _cartesian(model, q, v, r)
+    tau = tip.J.T @ (p["stiffness"] * error + p["damping"] * speed_error) + least.null(_posture(q, v, r, p))
+    tau += model.inverse_dynamics(q, v, least.inverse(A_r - bias))
+    return tau, {"reference": r.q}
+
+
+def _admittance(
+    model: ArmDynamics,
+    q: Expression,
+    v: Expression,
+    wrench: Expression,
+    r: Reference,
+    state: dict[str, Expression],
+    p: dict[str, Expression],
+    period: float,
+) -> tuple[Expression, dict[str, Expression]]:
+    # The implicit midpoint rule, entry by entry: exact in statics, and of second order.
+    x, rate = state["offset"], state["offset_rate"]
+    M, D, K, h = p["inertia"], p["damping"], p["stiffness"], period
+    next_rate = ((M - h / 2 * D - h**2 / 4 * K) * rate + h * (wrench - K * x)) / (M + h / 2 * D + h**2 / 4 * K)
+    next_rate = (1 - r.following) * next_rate
+    next_x = (1 - r.following) * (x + h / 2 * (rate + next_rate))
+    yielding = (next_rate - rate) / h
+
+    tip, least, bias, error, speed_error, A_r = _cartesian(model, q, v, r)
+    pull = p["tracking_stiffness"] * (error + x) + p["tracking_damping"] * (speed_error + rate)
+    a = least.inverse(A_r + yielding + (1 - r.following) * pull - bias) + least.null(_posture(q, v, r, p))
+    tau = model.inverse_dynamics(q, v, a) - (1 - r.following) * tip.J.T @ wrench
+    return tau, {"reference": r.q, "offset": next_x, "offset_rate": next_rate}
+
+
+_SIX = "N m/rad, N/m"
+LAWS = {
+    "joint_impedance": Law(
+        {
+            "stiffness": ((800.0, 800.0, 600.0, 600.0, 300.0, 150.0, 100.0), "N m/rad", _POSITIVE),
+            "damping": ((60.0, 60.0, 40.0, 40.0, 20.0, 8.0, 6.0), "N m s/rad", _POSITIVE),
+            "tracking_rate": (20.0, "1/s", _POSITIVE),
+            "posture_rate": (1.0, "1/s", _POSITIVE),
+        },
+        _joint_impedance,
+    ),
+    "cartesian_impedance": Law(
+        {
+            "stiffness": ((100.0, 100.0, 100.0, 1500.0, 1500.0, 1500.0), _SIX, _POSITIVE),
+            "damping": ((8.0, 8.0, 8.0, 150.0, 150.0, 150.0), "N m s/rad, N s/m", _POSITIVE),
+            **_NULL_SPACE,
+        },
+        _cartesian_impedance,
+    ),
+    "admittance": Law(
+        {
+            "inertia": ((0.5, 0.5, 0.5, 8.0, 8.0, 8.0), "kg m^2, kg", _POSITIVE),
+            "damping": ((15.0, 15.0, 15.0, 160.0, 160.0, 160.0), "N m s/rad, N s/m", _POSITIVE),
+            "stiffness": ((50.0, 50.0, 50.0, 500.0, 500.0, 500.0), _SIX, (0.0, float("inf"))),
+            "tracking_stiffness": (900.0, "1/s^2", _POSITIVE),
+            "tracking_damping": (60.0, "1/s", _POSITIVE),
+            **_NULL_SPACE,
+        },
+        _admittance,
+        {"offset": ((0.0,) * 6, "rad, m"), "offset_rate": ((0.0,) * 6, "rad/s, m/s")},
+    ),
+}

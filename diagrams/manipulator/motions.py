@@ -1,0 +1,141 @@
+r"""The predefined motions, as references for the control laws.
+
+    0 follow   the reference is where the arm is: it can be led by hand
+    1 home     in joint space to the home pose, and waits there
+    2 swing    in joint space to another pose and back
+    3 press    the tip moves straight ahead, waits, and comes back
+    4 circle   the tip moves on a circle across the tool's axis
+
+All start and end at rest, where the one before ended: whatever the command, the reference is continuous with its first
+and second derivative. A command is obeyed when the motion under way has ended (motions repeat); `follow` at once, and
+what comes after `follow` is always `home`.
+
+Everything moves by the minimum-jerk profile P(x) = 10 x^3 - 15 x^4 + 6 x^5 (Flash, Hogan, "The Coordination of Arm
+Movements", 1985).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import casadi
+
+from diagrams.manipulator.arm import Arm
+from diagrams.manipulator.dynamics import Expression
+
+MOTIONS = ("follow", "home", "swing", "press", "circle")
+FOLLOW, HOME, SWING, PRESS, CIRCLE = range(len(MOTIONS))
+
+
+def parameters(arm: Arm) -> dict[str, tuple[object, str, tuple[float, float]]]:
+    """Value, unit and bounds of what the motions depend on."""
+    return {
+        "home": (arm.home, "rad", (-pi, pi)),
+        "home_duration": (3.0, "s", (0.1, 60.0)),
+        "swing": ((0.6, 0.3, -0.4, 0.4, 0.5, -0.3, 0.6), "rad", (-pi, pi)),
+        "swing_duration": (5.0, "s", (0.1, 60.0)),
+        "press_depth": (0.10, "m", (-0.5, 0.5)),
+        "press_duration": (6.0, "s", (0.1, 60.0)),
+        "circle_radius": (0.10, "m", (0.0, 0.5)),
+        "circle_duration": (4.0, "s", (0.1, 60.0)),
+    }
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a law is to follow at this instant, and what the motion remembers.
+
+    Attributes:
+        in_joints: 1 while the motion is given in joint space.
+        q, v, a: joint reference (7); where the motion is Cartesian, where it started, at rest.
+        dp, dv, da: displacement of the tip (3) from its place at ``q``, in the world; 0 while the motion is in joint
+            space.
+        following: 1 during `follow`.
+        state: the next values of ``motion``, ``clock`` and ``start``.
+    """
+
+    in_joints: Expression
+    q: Expression
+    v: Expression
+    a: Expression
+    dp: Expression
+    dv: Expression
+    da: Expression
+    following: Expression
+    state: dict[str, Expression]
+
+
+def reference(
+    wanted: Expression, q: Expression, state: dict[str, Expression], p: dict[str, Expression], *, period: float
+) -> Reference:
+    """
+    Args:
+        wanted: the commanded motion.
+        q: the measured joint positions.
+        state: ``motion`` under way, its ``clock`` (s), the joint positions ``start`` where it began, and the laws'
+            ``reference`` (7) at the last instant.
+        p: `parameters`.
+    """
+    before = state["motion"]
+    follow = wanted < FOLLOW + 0.5
+    released = before < FOLLOW + 0.5
+    away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-9
+    durations = [0, away * p["home_duration"], p["swing_duration"], p["press_duration"], p["circle_duration"]]
+    # The clock is a sum of periods.
+    begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) - period / 2)
+    motion = casadi.if_else(begins, casadi.if_else(released, HOME, casadi.floor(wanted + 0.5)), before)
+    motion = casadi.if_else(follow, FOLLOW, motion)
+    clock = casadi.if_else(casadi.logic_or(begins, follow), 0, state["clock"])
+    at = casadi.if_else(casadi.logic_or(follow, released), q, state["reference"])
+    start = casadi.if_else(casadi.logic_or(begins, follow), at, state["start"])
+
+    home = _flank(clock / p["home_duration"], p["home_duration"])
+    swing = _there_and_back(clock, p["swing_duration"], rise=1 / 2)
+    press = _there_and_back(clock, p["press_duration"], rise=1 / 3)
+    turn = _flank(clock / p["circle_duration"], p["circle_duration"])
+    angle, rate, acceleration = (2 * pi * value for value in turn)
+    c, s = casadi.cos(angle), casadi.sin(angle)
+    circle = (
+        (s, 1 - c),
+        (c * rate, s * rate),
+        (c * acceleration - s * rate**2, s * acceleration + c * rate**2),
+    )
+    is_home, is_swing = _is(motion, HOME), _is(motion, SWING)
+    is_press, is_circle = _is(motion, PRESS), _is(motion, CIRCLE)
+    joint = [is_home * (p["home"] - start) * home[k] + is_swing * p["swing"] * swing[k] for k in range(3)]
+    tip = [
+        casadi.vertcat(
+            is_press * p["press_depth"] * press[k], *(is_circle * p["circle_radius"] * value for value in circle[k])
+        )
+        for k in range(3)
+    ]
+    following = {"motion": motion, "clock": clock + period, "start": start}
+    in_joints = 1 - is_press - is_circle
+    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, FOLLOW), following)
+
+
+def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression, Expression]:
+    """P(x) and its first two derivatives by time, x = t / duration being held in [0, 1]."""
+    x = casadi.fmin(casadi.fmax(x, 0), 1)
+    return (
+        x**3 * (10 + x * (6 * x - 15)),
+        30 * x**2 * (1 - x) ** 2 / duration,
+        60 * x * (1 - x) * (1 - 2 * x) / duration**2,
+    )
+
+
+def _there_and_back(t: Expression, duration: Expression, *, rise: float) -> tuple[Expression, Expression, Expression]:
+    """0 to 1 in ``rise * duration``, and back to 0 in the same time at the end."""
+    back = t > duration / 2
+    side = casadi.if_else(back, duration - t, t)
+    value, speed, acceleration = _flank(side / (rise * duration), rise * duration)
+    return value, casadi.if_else(back, -speed, speed), acceleration
+
+
+def _choose(index: Expression, values: list[Expression]) -> Expression:
+    return sum((_is(index, k) * value for k, value in enumerate(values)), casadi.SX(0))
+
+
+def _is(index: Expression, k: int) -> Expression:
+    return casadi.fabs(index - k) < 0.5

@@ -1,0 +1,178 @@
+"""The manipulator testbed: a seven-joint arm under torque control, in free space and against a compliant wall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.systems.framework import Diagram
+
+from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
+from diagrams.manipulator.dps import gravity_torque, make_dps
+from diagrams.manipulator.dynamics import ArmDynamics
+from diagrams.manipulator.laws import LAWS
+from diagrams.manipulator.motions import HOME, MOTIONS
+from diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
+from vtbdrake.components.actuators import JointDrives
+from vtbdrake.components.sensors import (
+    ErrorModel,
+    ForceTorqueSensor,
+    JointEncoders,
+    JointTachometers,
+    JointTorqueSensors,
+    SampledSensor,
+    connect_to_plant,
+)
+from vtbdrake.testbed import (
+    Interface,
+    PlantFields,
+    Scenario,
+    ScenarioError,
+    Signal,
+    VirtualTestbedBuilder,
+)
+
+LARGEST_DELAY = 50
+"""Of the drives' commands, in periods."""
+
+
+def _plant() -> PlantFields:
+    # Unsampled: reaction forces follow from the state, so that copies of it continue with the same readings.
+    return PlantFields(time_step=0.001, contact_model="point", use_sampled_output_ports=False)
+
+
+@dataclass
+class ManipulatorScenario(Scenario):
+    """A torque-controlled arm; the command ``u.motion`` chooses what it does, the gains are ``dps.impl.*``."""
+
+    # Discrete: reaction forces and contact of the same step.
+    plant: PlantFields = field(default_factory=_plant)
+    # joint_impedance, cartesian_impedance or admittance.
+    law: str = "cartesian_impedance"
+    # Of sensors, DPS and drives, in seconds.
+    period: float = 0.001
+    # True has the DPS's arithmetic compiled; needs a C compiler when it runs for the first time.
+    compile: bool = False
+    # False is free space.
+    wall: bool = False
+    # Of the wall's face from the world's origin, along x, in m; sim.env.wall.mount.pose moves it.
+    wall_distance: float = 0.825
+    # Of the wall's face, in N/m.
+    wall_stiffness: float = 10e3
+    # Of the wall, after Hunt and Crossley, in s/m.
+    wall_dissipation: float = 5.0
+    # Static and dynamic, of ball and wall.
+    wall_friction: float = 0.1
+    # Errors of the sensors, exact by default; latency in periods.
+    position_errors: ErrorModel = field(default_factory=ErrorModel)
+    velocity_errors: ErrorModel = field(default_factory=ErrorModel)
+    torque_errors: ErrorModel = field(default_factory=ErrorModel)
+    wrench_errors: ErrorModel = field(default_factory=ErrorModel)
+
+    def validate(self) -> None:
+        super().validate()
+        checks = {
+            "law": (self.law in LAWS, f"one of {', '.join(LAWS)}"),
+            "period": (self.period > 0.0, "positive, in s"),
+            "plant.time_step": (self.plant.time_step > 0.0, "positive, in s: the testbed is discrete"),
+            "wall_stiffness": (self.wall_stiffness > 0.0, "positive, in N/m"),
+            "wall_dissipation": (self.wall_dissipation >= 0.0, "not negative"),
+            "wall_friction": (self.wall_friction >= 0.0, "not negative"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                owner, _, item = f"self.{name}".rpartition(".")
+                value = self.plant.time_step if owner.endswith("plant") else getattr(self, item)
+                raise ScenarioError(f"ManipulatorScenario.{name} must be {expected}, not {value!r}")
+        for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors"):
+            try:
+                getattr(self, name).check(f"ManipulatorScenario.{name}")
+            except ValueError as error:
+                raise ScenarioError(str(error)) from None
+
+    def interface(self) -> Interface:
+        arm = Arm()
+        age = 10 * self.period
+        margin = np.radians(5.0)  # joints run into their stops a little
+        return Interface(
+            sense=[
+                Signal(
+                    "joint_position",
+                    size=JOINTS,
+                    unit="rad",
+                    lower=arm.lower - margin,
+                    upper=arm.upper + margin,
+                    max_age=age,
+                ),
+                Signal("joint_velocity", size=JOINTS, unit="rad/s", lower=-10.0, upper=10.0, max_age=age),
+                Signal("joint_torque_measured", size=JOINTS, unit="N m", lower=-1e3, upper=1e3, max_age=age),
+                Signal("wrench", size=6, unit="N m, N", lower=-2e3, upper=2e3, max_age=age),
+            ],
+            act=[
+                Signal(
+                    "joint_torque",
+                    size=JOINTS,
+                    unit="N m",
+                    lower=-np.array(arm.torques),
+                    upper=arm.torques,
+                    rate=arm.torque_rates,
+                    idle=0.0,
+                )
+            ],
+            commands=[Signal("motion", size=1, lower=0.0, upper=len(MOTIONS) - 1.0, default=HOME)],
+        )
+
+    def make_dps(self) -> Diagram:
+        return make_dps(self.law, period=self.period, compile=self.compile)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        arm = Arm()
+        plant, scene_graph = builder.add_plant(self.plant)
+        instance = add_arm(plant, arm)
+        if self.wall:
+            add_wall(
+                plant,
+                distance=self.wall_distance,
+                stiffness=self.wall_stiffness,
+                dissipation=self.wall_dissipation,
+                friction=self.wall_friction,
+            )
+        plant.Finalize()
+        set_ball_material(plant, scene_graph, instance, self.wall_friction)
+
+        joints = [plant.GetJointByName(name, instance) for name in JOINT_NAMES]
+        flange = plant.GetJointByName("flange", instance)
+        T = self.period
+        sensors: dict[str, SampledSensor] = {
+            "joint_position": JointEncoders(plant, joints, period=T, errors=self.position_errors),
+            "joint_velocity": JointTachometers(plant, joints, period=T, errors=self.velocity_errors),
+            "joint_torque_measured": JointTorqueSensors(plant, joints, period=T, errors=self.torque_errors),
+            "wrench": ForceTorqueSensor(plant, flange, period=T, errors=self.wrench_errors),
+        }
+        for signal, sensor in sensors.items():
+            builder.add("sense", signal, sensor)
+            connect_to_plant(builder.builder, sensor, plant)
+            builder.sim_sensor(signal, sensor.get_output_port())
+
+        drives = JointDrives(
+            plant,
+            joints,
+            period=T,
+            limit=arm.torques,
+            rate=arm.torque_rates,
+            time_constant=arm.current_time_constant,
+            viscous=arm.viscous_friction,
+            coulomb=arm.coulomb_friction,
+            max_delay=LARGEST_DELAY,
+            initial=gravity_torque(ArmDynamics(arm)),
+        )
+        builder.add("act", "drives", drives)
+        builder.builder.Connect(plant.get_state_output_port(), drives.GetInputPort("state"))
+        builder.builder.Connect(drives.get_output_port(), plant.get_actuation_input_port(instance))
+        builder.sim_actuator("joint_torque", drives.GetInputPort("command"))
+
+        push = builder.add("env", "push", Push(plant, "tip"))
+        builder.builder.Connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
+        for k, name in enumerate(JOINT_NAMES):
+            builder.believe(f"sim.sys.arm.{name}.position", of=[f"dps.env.joint_position[{k}]"])
+            builder.believe(f"sim.sys.arm.{name}.velocity", of=[f"dps.env.joint_velocity[{k}]"])

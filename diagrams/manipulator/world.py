@@ -1,0 +1,97 @@
+"""The simulated arm and what it touches: what a MultibodyPlant needs beside the SDF."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, RoleAssign, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, SpatialInertia
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericParameterIndex
+
+from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
+from diagrams.manipulator.model import ARM_SDF
+from vtbdrake.state import parameter
+
+BALL_STIFFNESS = 1e8
+"""Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""
+
+WALL_THICKNESS = 0.1
+
+
+def add_arm(plant: MultibodyPlant, arm: Arm) -> ModelInstanceIndex:
+    """Adds the arm, standing on the world's origin, at home."""
+    (instance,) = Parser(plant).AddModels(str(ARM_SDF))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
+    for name, angle in zip(JOINT_NAMES, arm.home, strict=True):
+        plant.GetJointByName(name, instance).set_default_angle(angle)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -GRAVITY])
+    return instance
+
+
+def add_wall(plant: MultibodyPlant, *, distance: float, stiffness: float, dissipation: float, friction: float) -> None:
+    """Adds model instance ``wall``: a slab across the world's x, on the frame ``mount``, which the Context can move.
+
+    Args:
+        distance: of its face from the world's origin (m).
+        stiffness: of its face (N/m): a ball that has sunk in by x feels stiffness x, in Drake's point contact.
+        dissipation: of Hunt and Crossley (s/m).
+        friction: static and dynamic, with the ball.
+    """
+    wall = plant.AddModelInstance("wall")
+    X_WM = RigidTransform([distance, 0.0, 0.5])
+    mount = plant.AddFrame(FixedOffsetFrame("mount", plant.world_frame(), X_WM, wall))
+    slab = Box(WALL_THICKNESS, 1.0, 1.0)
+    body = plant.AddRigidBody("slab", wall, SpatialInertia.SolidBoxWithMass(10.0, *slab.size()))
+    plant.WeldFrames(mount, body.body_frame())
+    X_MG = RigidTransform([WALL_THICKNESS / 2, 0.0, 0.0])
+    material = ProximityProperties()
+    AddContactMaterial(dissipation, stiffness, CoulombFriction(friction, friction), material)
+    plant.RegisterCollisionGeometry(body, X_MG, slab, "face", material)
+    plant.RegisterVisualGeometry(body, X_MG, slab, "slab", np.array([0.45, 0.55, 0.65, 0.6]))
+
+
+def set_ball_material(plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, friction: float) -> None:
+    """Makes the ball at the tip stiff, before contexts are made."""
+    material = ProximityProperties()
+    AddContactMaterial(0.0, BALL_STIFFNESS, CoulombFriction(friction, friction), material)
+    for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName("tool", arm)):
+        scene_graph.AssignRole(plant.get_source_id(), geometry, material, RoleAssign.kReplace)
+
+
+class Push(LeafSystem):
+    """A wrench on a frame of a body, that stays until it is changed.
+
+    .. pydrake_system::
+
+        name: Push
+        output_ports:
+        - spatial_force
+
+    The parameter ``wrench``, [torque (N m); force (N)] in the world, acts at the origin of the frame.
+    """
+
+    def __init__(self, plant: MultibodyPlant, frame: str) -> None:
+        super().__init__()
+        pushed = plant.GetFrameByName(frame)
+        self._body = pushed.body().index()
+        self._p_BoBq_B = pushed.GetFixedPoseInBodyFrame().translation()
+        wrench = int(self.DeclareNumericParameter(BasicVector(np.zeros(6))))
+        self.variables = (parameter("wrench", wrench, shape=(6,), unit="N m, N"),)
+        self.DeclareAbstractOutputPort(
+            "spatial_force",
+            lambda: Value([ExternallyAppliedSpatialForce()]),
+            self._calc,
+            prerequisites_of_calc={self.numeric_parameter_ticket(NumericParameterIndex(wrench))},
+        )
+
+    def _calc(self, context: Context, output: Value) -> None:  # type: ignore[valid-type]
+        force = ExternallyAppliedSpatialForce()
+        force.body_index = self._body
+        force.p_BoBq_B = self._p_BoBq_B
+        values = context.get_numeric_parameter(0).value()
+        force.F_Bq_W = SpatialForce(tau=values[:3], f=values[3:])
+        output.set_value([force])  # type: ignore[attr-defined]
