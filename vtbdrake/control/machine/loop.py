@@ -1,0 +1,264 @@
+"""Runs a machine on an LCM bus: against a clock, or in lock-step with its controller."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import threading
+import time
+from math import inf
+from typing import Any
+
+from vtbdrake.control.clock import Clock, WallClock
+from vtbdrake.control.lcm_link import LcmLink
+from vtbdrake.control.machine.faults import FaultError, fault_from_dict
+from vtbdrake.control.machine.machine import Machine
+from vtbdrake.control.statistics import Histogram, LoopStatistics
+
+_log = logging.getLogger(__name__)
+
+DIED = 70
+"""Exit code of a machine that was told to die."""
+
+_BURST = 200  # messages to take in at a time
+_SLICE = 0.005  # s to wait for commands before looking at requests
+_REPEAT = 0.2  # s after which the first state is told again, in lock-step, to those who came late
+_CATCH_UP = 0.05  # s
+
+
+class MachineLoop:
+    """A machine and its connection to the bus.
+
+    Requests come on the config's ``control_channel``, or by ``control``, as JSON: a fault, as `Fault.to_dict` gives it
+    (``{"fault": "drop", "fraction": 0.5}``), or ``{"request": NAME}``:
+
+    * ``status``: nothing else;
+    * ``normal``: ends all faults;
+    * ``statistics``: the answer has the statistics, too;
+    * ``reset statistics``;
+    * ``die``: the process ends at once, without a farewell.
+
+    By ``control`` every request is one line and gets one line: the status, or ``{"error": ...}``. On the bus, the
+    status goes to ``status_channel``: every ``status_period``, after each request, and when the brake falls in or is
+    released.
+
+    Attributes:
+        statistics: of its cycles; ``step`` is the simulation.
+        state_to_command: from telling a state to the next command's arrival, in seconds.
+        lost: seconds of the clock that the simulation could not keep up with.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        url: str,
+        *,
+        clock: Clock | None = None,
+        control: socket.socket | None = None,
+        connect_timeout: float = 2.0,
+    ) -> None:
+        """
+        Args:
+            url: of the bus.
+            clock: the wall's by default.
+            control: a connected stream; the loop stops when its other end closes.
+
+        Raises:
+            BridgeError: there is no bus at ``url``.
+        """
+        self.machine = machine
+        self.statistics = LoopStatistics(machine.config.period)
+        self.state_to_command = Histogram()
+        self.lost = 0.0
+        self._clock = clock or WallClock()
+        self._control = control
+        self._lines = b""
+        if control is not None:
+            control.setblocking(False)
+        self._stop = threading.Event()
+        self._last: list[tuple[str, bytes]] = []
+        self._braking = False
+        self._arrived: set[str] = set()
+        self._told = inf
+        self._next_status = 0
+        handlers = {channel: self._receive for channel in machine.channels}
+        handlers[machine.config.control_channel] = self._hear
+        self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
+        self._link.open()
+
+    def stop(self) -> None:
+        """Ends `run` after the present cycle; also from a signal handler."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Gives the connection back."""
+        self._link.close()
+
+    def run(self, *, lock_step: bool = False, cycles: float = inf) -> None:
+        """
+        Args:
+            lock_step: a cycle begins when one message has arrived on every command channel, instead of with the clock.
+            cycles: after how many it ends.
+
+        Raises:
+            RuntimeError: the simulation failed.
+        """
+        end = self.machine.cycle + cycles
+        begin = self._clock.now() - self.machine.time
+        self._tell()
+        while not self._stop.is_set() and self.machine.cycle < end:
+            if lock_step:
+                self._await_commands()
+                woke = deadline = self._clock.now()
+                steps = 1
+            else:
+                deadline = begin + self.machine.time + self.machine.config.period
+                woke = self._await(deadline)
+                begin, steps = self._behind(begin, woke)
+            if self._stop.is_set():
+                break
+            for _ in range(int(min(steps, end - self.machine.cycle))):
+                self.machine.advance()
+            stepped = self._clock.now()
+            self._tell()
+            self._serve()
+            self.statistics.record(lateness=woke - deadline, step=stepped - woke, cycle=self._clock.now() - woke)
+            self.statistics.miss(steps - 1)
+
+    # -- when a cycle begins
+
+    def _await(self, deadline: float) -> float:
+        """Takes in what arrives until the deadline."""
+        if isinstance(self._clock, WallClock):
+            while (left := deadline - self._clock.now()) > 0.0 and not self._stop.is_set():
+                self._link.take(left, _BURST)
+        woke = self._clock.wait_until(deadline)
+        self._link.take(0.0, _BURST)
+        return woke
+
+    def _behind(self, begin: float, now: float) -> tuple[float, int]:
+        """Where the clock's zero is, and how many cycles are due: a body does not stop while nobody looks at it."""
+        period = self.machine.config.period
+        due = int((now - begin) / period + 1e-6) - self.machine.cycle
+        steps = max(1, min(due, int(_CATCH_UP / period)))
+        lost = max(0, due - steps) * period
+        self.lost += lost
+        return begin + lost, steps
+
+    def _await_commands(self) -> None:
+        """One message on every command channel."""
+        channels = set(self.machine.channels)
+        repeat = time.monotonic() + _REPEAT
+        connections = self._link.reconnections
+        while not self._arrived >= channels and not self._stop.is_set():
+            # One at a time: what is ahead of its cycle waits on the line.
+            if not self._link.take(_SLICE, 1):
+                self._serve()
+            # Nobody heard it who was not there, and without an answer nothing would go on.
+            alone = self.machine.cycle == 0 and time.monotonic() >= repeat
+            if alone or self._link.reconnections > connections:
+                repeat = time.monotonic() + _REPEAT
+                connections = self._link.reconnections
+                self._publish(self._last)
+        self._arrived.clear()
+
+    def _receive(self, channel: str, data: bytes) -> None:
+        if self._told < inf:
+            self.state_to_command.record(time.monotonic() - self._told)
+            self._told = inf
+        self._arrived.add(channel)
+        self.machine.receive(channel, data)
+
+    # -- what it tells
+
+    def _tell(self) -> None:
+        self._last = self.machine.messages()
+        self._publish(self._last)
+        self._told = time.monotonic()
+        braking = self.machine.braking
+        if self.machine.cycle >= self._next_status or braking != self._braking:
+            self._braking = braking
+            self._tell_status()
+
+    def _publish(self, messages: list[tuple[str, bytes]]) -> None:
+        for channel, data in messages:
+            self._link.publish(channel, data)
+
+    def _tell_status(self) -> None:
+        config = self.machine.config
+        self._next_status = self.machine.cycle + max(1, round(config.status_period / config.period))
+        self._link.publish(config.status_channel, json.dumps(self.machine.status().to_dict()).encode())
+
+    # -- requests
+
+    def _hear(self, channel: str, data: bytes) -> None:
+        self._answer(data)
+        self._tell_status()
+
+    def _serve(self) -> None:
+        if self._control is None:
+            return
+        try:
+            received = self._control.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            received = b""
+        if not received:
+            _log.info("the one who started the machine is gone")
+            self._stop.set()
+            return
+        *lines, self._lines = (self._lines + received).split(b"\n")
+        for line in lines:
+            try:
+                # Who asks waits for the answer, so that there is room for it.
+                self._control.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+            except OSError as error:
+                _log.warning("an answer could not be given: %s", error)
+                self._stop.set()
+
+    def _answer(self, text: bytes) -> dict[str, Any]:
+        try:
+            more = self._do(_parsed(text))
+        except FaultError as error:
+            _log.warning("request refused: %s", error)
+            return {"error": str(error)}
+        return {**self.machine.status().to_dict(), **more}
+
+    def _do(self, request: dict[str, Any]) -> dict[str, Any]:
+        if "fault" in request:
+            self.machine.begin(fault_from_dict(request))
+            return {}
+        name = request.get("request")
+        if name == "die":
+            os._exit(DIED)
+        if name == "normal":
+            self.machine.normal()
+        elif name == "reset statistics":
+            self.statistics = LoopStatistics(self.machine.config.period)
+            self.state_to_command = Histogram()
+            self.lost = 0.0
+        elif name == "statistics":
+            return {
+                "statistics": self.statistics.to_dict(),
+                "state_to_command": self.state_to_command.to_dict(),
+                "lost": self.lost,
+            }
+        elif name != "status":
+            raise FaultError(
+                "a request is a fault, or one of status, normal, statistics, reset statistics, die; it cannot be "
+                f"{request!r}"
+            )
+        return {}
+
+
+def _parsed(text: bytes) -> dict[str, Any]:
+    try:
+        request = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FaultError(f"a request is JSON, which this is not: {error}") from None
+    if not isinstance(request, dict):
+        raise FaultError(f"a request is a JSON object, not {request!r}")
+    return request
