@@ -20,6 +20,7 @@ BENCHMARKS: Registry = {
     "parallel_efficiency_python": "benchmarks.parallel:parallel_efficiency_python",
     "cluster_projection": "benchmarks.cluster:cluster_projection",
     "casadi_system": "benchmarks.casadi_system:casadi_system",
+    "hub_round_trip_p50": "benchmarks.hub:hub_round_trip_p50",
     "study_overhead_threads": "benchmarks.study:study_overhead_threads",
     "study_overhead_processes": "benchmarks.study:study_overhead_processes",
     "study_against_optuna": "benchmarks.study:study_against_optuna",

@@ -60,8 +60,10 @@ def test_unsubscribing_ends_one_subscription(hub) -> None:
     client.publish("A")
     client.sync()
     assert client.received == [("A", b"")]
-    client.bus.unsubscribe(client.subscriptions["A"])
+    client.publish("A")
+    client.wait(lambda: len(client.received) == 2)
     before = hub.statistics().delivered
+    client.bus.unsubscribe(client.subscriptions["A"])
     client.publish("A")
     client.sync()
     assert hub.statistics().delivered == before + 1

@@ -18,8 +18,7 @@ to all clients that subscribed to its channel, the publisher included.
      the former owner thaws, it is any other client: rule 2.
   4. When the owner's connection closes, there is no owner: rule 1.
 
-  Requests are decided after all that had arrived with them has been read, so that an owner does not lose its channel
-  because the hub itself was held up.
+  A time in which the hub itself was held up does not count against a lease.
 * **Status.** The hub publishes its `Statistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within
   10 ms when the owner of a channel changes or something is refused. Clients have the names of their sockets,
   ``127.0.0.1:41234``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.

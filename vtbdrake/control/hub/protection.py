@@ -63,6 +63,10 @@ class ProtectedChannel:
         self.owner = None
         return True
 
+    def excuse(self, seconds: float) -> None:
+        """A time in which nobody could have renewed a lease: it does not count."""
+        self._renewed += seconds
+
     def statistics(self, now: float) -> ChannelStatistics:
         owner = self.owner
         return ChannelStatistics(

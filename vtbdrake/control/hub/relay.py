@@ -39,14 +39,12 @@ class Relay:
     Attributes:
         lost: clients whose connection failed when something was sent, and how; to be cleared by who has seen to it.
         behind: clients that have begun to queue; likewise.
-        requests: for protected channels, to be decided when all that came with them has been handled.
         news: whether an owner changed or something was refused since the last status.
     """
 
     def __init__(self, config: HubConfig) -> None:
         self.lost: list[tuple[Connection, OSError]] = []
         self.behind: list[Connection] = []
-        self.requests: list[tuple[Connection, str]] = []
         self.news = False
         self._clients: list[Connection] = []
         self._routes: dict[bytes, _Route] = {}
@@ -90,7 +88,7 @@ class Relay:
         statistics = self._statistics
         route = self._routes.get(channel) or self._find_route(channel)
         if route.reserved:
-            self._receive_request(client, route.channel)
+            self._answer(client, route.channel, now)
         elif route.protection is not None and not self._admit(client, route.protection, now):
             statistics.refused += 1
         else:
@@ -134,23 +132,21 @@ class Relay:
         self.news |= not admitted or protection.owner is not owner
         return admitted
 
-    def _receive_request(self, client: Connection, channel: str) -> None:
-        wanted = channel.removeprefix(tcpq.TAKE_PREFIX)
-        if wanted in self._protected:
-            self.requests.append((client, wanted))
-            return
-        self._statistics.refused += 1
+    def _answer(self, client: Connection, channel: str, now: float) -> None:
+        """Grants or refuses a request for a channel."""
         self.news = True
-        _log.warning("refused: %s publishes on %s; the hub protects %s", client.name, channel, list(self._protected))
+        protected = self._protected.get(channel.removeprefix(tcpq.TAKE_PREFIX))
+        if protected is None:
+            _log.warning(
+                "refused: %s publishes on %s; the hub protects %s", client.name, channel, list(self._protected)
+            )
+        if protected is None or not protected.take(client, now):
+            self._statistics.refused += 1
 
-    def decide(self, now: float) -> None:
-        """Grants or refuses the requests."""
-        for client, channel in self.requests:
-            if not client.closed:
-                granted = self._protected[channel].take(client, now)
-                self._statistics.refused += not granted
-                self.news = True
-        self.requests.clear()
+    def excuse(self, seconds: float) -> None:
+        """A time in which nothing was handled ends here."""
+        for protected in self._protected.values():
+            protected.excuse(seconds)
 
     def publish_status(self, now: float) -> None:
         """Tells those who want to know."""

@@ -94,7 +94,8 @@ class HubServer:
         self._scratch = memoryview(bytearray(SLICE))
         self._running = True
         self._now = time.monotonic()
-        self._tick = min(config.status_period, config.patience / 4.0)
+        # A quarter: how much of a time may pass unnoticed.
+        self._tick = min(config.status_period, config.patience / 4.0, config.lease / 4.0)
         self._checked = self._reported = self._now
         self._paused: float | None = None
 
@@ -106,6 +107,9 @@ class HubServer:
             while self._running:
                 events = self._epoll.poll(max(0.0, due - self._now))
                 self._now = time.monotonic()
+                if self._now > due:
+                    # The hub was held up. What its clients sent meanwhile has not been read.
+                    relay.excuse(self._now - due)
                 for fileno, event in events:
                     client = self._clients.get(fileno)
                     if client is not None:
@@ -114,8 +118,6 @@ class HubServer:
                         self._others[fileno]()
                     if relay.behind or relay.lost:
                         self._follow_up()
-                if relay.requests:
-                    relay.decide(self._now)
                 if relay.news or self._now >= due:
                     self._keep_house()
                     self._follow_up()

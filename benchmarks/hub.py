@@ -1,0 +1,112 @@
+"""What a message costs on its way through the hub."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import lcm
+import numpy as np
+
+from benchmarks.measure import LOWER, Benchmark
+from vtbdrake.control.hub import Hub
+
+ROOT = Path(__file__).resolve().parents[1]
+
+GOAL = 100e-6
+TIMEOUT_MS = 10_000
+SIZE = 200  # bytes, about those of a robot's state
+
+# Another process that sends back what it gets.
+_ECHO = """
+import lcm, sys
+bus = lcm.LCM(sys.argv[1])
+bus.subscribe("PING", lambda _, data: bus.publish("PONG", data))
+bus.publish("PONG", b"")
+while True:
+    bus.handle()
+"""
+
+
+def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: int = 8) -> list[Benchmark]:
+    """The median time from a client's publication to its arrival at the same client, an unmodified `lcm.LCM`, through
+    the hub and through a naive one, in turns; and, printed only, that to another client and back: twice through the
+    hub."""
+    times: dict[str, list[float]] = {"hub": [], "naive": [], "echo": []}
+    with Hub(port=0) as hub, _naive_hub() as naive_url, contextlib.ExitStack() as stack:
+        ours, naive, pinger = lcm.LCM(hub.url), lcm.LCM(naive_url), lcm.LCM(hub.url)
+        for bus, channel in ((ours, "SELF"), (naive, "SELF"), (pinger, "PONG")):
+            bus.subscribe(channel, lambda *_: None)
+        stack.enter_context(_echo(hub.url))
+        _await(pinger)
+        for _ in range(rounds):
+            times["hub"] += _round_trips(ours, "SELF", messages // rounds)
+            times["naive"] += _round_trips(naive, "SELF", naive_messages // rounds)
+            times["echo"] += _round_trips(pinger, "PING", messages // rounds)
+    p50 = {name: float(np.median(values)) for name, values in times.items()}
+    against = "a naive hub, without TCP_NODELAY and TCP_QUICKACK"
+    return [
+        Benchmark(
+            name="hub_round_trip_p50",
+            value=p50["hub"],
+            unit="s",
+            goal=GOAL,
+            better=LOWER,
+            against=f"{against}: {1e3 * p50['naive']:.3g} ms",
+            note="; ".join(f"{name}: {_percentiles(values)}" for name, values in times.items()),
+        ),
+        Benchmark(
+            name="hub_echo_round_trip_p50",
+            value=p50["echo"],
+            unit="s",
+            goal=None,
+            better=LOWER,
+            against="twice through the hub, by way of another process",
+        ),
+    ]
+
+
+def _round_trips(bus: lcm.LCM, channel: str, messages: int) -> list[float]:
+    """Seconds from a publication to what comes back, one message after another."""
+    data = bytes(SIZE)
+    times = []
+    for _ in range(messages):
+        begin = time.perf_counter()
+        bus.publish(channel, data)
+        bus.handle()
+        times.append(time.perf_counter() - begin)
+    return times
+
+
+def _await(bus: lcm.LCM) -> None:
+    if not bus.handle_timeout(TIMEOUT_MS):
+        raise TimeoutError(f"no message came back within {TIMEOUT_MS} ms")
+
+
+def _percentiles(times: list[float]) -> str:
+    p50, p90, p99 = 1e6 * np.percentile(times, [50, 90, 99])
+    return f"p50 {p50:.0f}, p90 {p90:.0f}, p99 {p99:.0f} us (n = {len(times)})"
+
+
+@contextlib.contextmanager
+def _naive_hub() -> Iterator[str]:
+    command = [sys.executable, "-m", "benchmarks.naive_hub"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
+def _echo(url: str) -> Iterator[None]:
+    with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
+        try:
+            yield
+        finally:
+            process.kill()
