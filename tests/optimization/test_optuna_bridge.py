@@ -286,7 +286,7 @@ def test_options_that_optuna_would_confuse_are_kept_apart(url):
     space = [X, Choice("c", [1, "1"])]
     study = recorded(space, [point((0.5, c), float(k)) for k, c in enumerate([1, "1"])], qualities={"h": "maximize"})
     exported = study.to_optuna(url, "choices")
-    assert [t.params["c"] for t in exported.trials] == ["1", "'1'"]
+    assert [t.params["c"] for t in exported.trials] == [1, "1"]
     assert study.import_optuna(url, "choices") == 0
     empty = recorded(space, [], qualities={"h": "maximize"})
     assert empty.import_optuna(url, "choices") == 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from math import ceil, inf, nan
 
 import numpy as np
@@ -51,10 +51,10 @@ class Judge:
         """One evaluation per point, in their order."""
         distinct = list(dict.fromkeys(points))
         if self._racing:
-            self._race(distinct)
+            evaluations = self._race(distinct)
         else:
             self._complete([(point, condition) for point in distinct for condition in self._conditions])
-        evaluations = {point: self.evaluation(point) for point in distinct}
+            evaluations = {point: self.evaluation(point) for point in distinct}
         for point, evaluation in evaluations.items():
             self._remember(point, evaluation)
         return [evaluations[point] for point in points]
@@ -64,15 +64,32 @@ class Judge:
         if missing:
             self._run(missing)
 
-    def _race(self, points: Sequence[Point]) -> None:
+    def _race(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
+        """In each round, only the conditions of the rounds so far count: an interrupted study may know more."""
+        if self._incumbent is None and len(points) > 1:
+            self._find_incumbent(points)
         order = self._order()
+        evaluations: dict[Point, Evaluation] = {}
         alive = list(points)
         done = 0
         while alive and done < len(order):
             share = ceil(_ROUND / len(alive))
             self._complete([(point, condition) for point in alive for condition in order[done : done + share]])
             done += share
-            alive = [point for point in alive if not self._lost(self.evaluation(point))]
+            evaluations |= {point: self.evaluation(point, order[:done]) for point in alive}
+            alive = [point for point in alive if not self._lost(evaluations[point])]
+        return evaluations
+
+    def _find_incumbent(self, points: Sequence[Point]) -> None:
+        """The point that does best in the first condition meets the others too, so that the rest can be held against
+        it."""
+        first = list(self._conditions)[:1]
+        self._complete([(point, condition) for point in points for condition in first])
+        leads = [evaluation for point in points if (evaluation := self.evaluation(point, first)).feasible]
+        if leads:
+            leader = max(leads, key=lambda evaluation: evaluation.values[0]).point
+            self._complete([(leader, condition) for condition in self._conditions])
+            self._remember(leader, self.evaluation(leader))
 
     def _order(self) -> list[int]:
         """The conditions, those first in which the best point fares worst: they tell most."""
@@ -85,11 +102,16 @@ class Judge:
         """Whether a point, judged by a bound from above, cannot become the best."""
         if evaluation.failed:
             return True
-        return self._incumbent is not None and (not evaluation.feasible or evaluation.values[0] <= self._best)
+        if self._incumbent is None or evaluation.point == self._incumbent:
+            return False
+        return not evaluation.feasible or evaluation.values[0] <= self._best
 
-    def evaluation(self, point: Point) -> Evaluation:
-        """What the known outcomes of a point say; conditions that it has not seen count as the best that could be."""
-        outcomes = [self._known.get((point, condition)) for condition in self._conditions]
+    def evaluation(self, point: Point, conditions: Collection[int] | None = None) -> Evaluation:
+        """What the known outcomes of a point say, or those under some conditions; what it has not seen counts as the
+        best that could be.
+        """
+        counted = self._conditions if conditions is None else conditions
+        outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
         seen = [outcome for outcome in outcomes if outcome is not None]
         exact = len(seen) == len(outcomes)
         constraints = len(self._problem.constraints)

@@ -16,7 +16,8 @@ from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import StudyError, encode
+from vtbdrake.optimization.study_file import encode
+from vtbdrake.optimization.study_lock import StudyError
 
 if TYPE_CHECKING:
     import optuna
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial
 
-    from vtbdrake.optimization.study import Study
+    from vtbdrake.optimization.study_record import StudyRecord
 
 # What makes a study the one that it is: of the same ones it may be exported again.
 _IDENTITY = ("problem", "solver", "seed", "options")
@@ -32,7 +33,7 @@ _IDENTITY = ("problem", "solver", "seed", "options")
 _FEWEST = 10
 
 
-def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.Study:
+def to_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> optuna.Study:
     """Writes a study into Optuna's storage. See `Study.to_optuna`.
 
     Raises:
@@ -48,7 +49,7 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
         there = Counter(_key(t.user_attrs["batch"], t.params) for t in _ours(exported))
         new = []
         for trial in trials:
-            params = {p.address: _to_optuna(p, trial.parameters[p.address]) for p in study.parameters}
+            params = dict(trial.parameters)
             key = _key(trial.batch, params)
             if there[key]:
                 there[key] -= 1
@@ -62,7 +63,7 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
     return exported
 
 
-def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> list[Point]:
+def points_from_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> list[Point]:
     """The points of a study in Optuna's storage that ``study`` has not judged. See `Study.import_optuna`.
 
     Raises:
@@ -85,7 +86,7 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
     return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
 
 
-def importances(study: Study) -> tuple[dict[str, float], ...]:
+def importances(study: StudyRecord) -> tuple[dict[str, float], ...]:
     """How much each parameter decides about whether a point is among the best tenth: for each quality, by address.
 
     The shares sum to 1, the largest comes first. They come from the points that have a value, by Optuna's PED-ANOVA:
@@ -140,7 +141,7 @@ def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseS
     return opened
 
 
-def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> optuna.Study:
+def _exported(optuna: Any, storage: BaseStorage, study: StudyRecord, name: str) -> optuna.Study:
     """The study in the storage, made if it is not there."""
     record = json.loads(json.dumps(study.record))
     if name in optuna.get_all_study_names(storage):
@@ -167,7 +168,7 @@ def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
     return batch, json.dumps(params, sort_keys=True)
 
 
-def _rows(trial: Trial, study: Study) -> Iterable[Row]:
+def _rows(trial: Trial, study: StudyRecord) -> Iterable[Row]:
     point = tuple(trial.parameters.values())
     return ((point, condition) for condition in range(len(study.record["problem"]["conditions"])))
 
@@ -228,27 +229,11 @@ def _plain(numbers: Iterable[float]) -> list[float | None]:
 def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
     if not isinstance(parameter, Choice):
         return distribution(parameter, optuna)
-    options = [_to_optuna(parameter, option) for option in parameter.options]
-    found: BaseDistribution = optuna.distributions.CategoricalDistribution(options)
+    found: BaseDistribution = optuna.distributions.CategoricalDistribution(parameter.options)
     return found
 
 
-def _ambiguous(choice: Choice) -> bool:
-    """Whether Optuna would take two options for one: 1 and True are equal to it."""
-    return len(set(choice.options)) < len(choice.options)
-
-
-def _to_optuna(parameter: Dimension, value: Any) -> Any:
-    return repr(value) if isinstance(parameter, Choice) and _ambiguous(parameter) else value
-
-
-def _from_optuna(parameter: Dimension, value: Any) -> Any:
-    if isinstance(parameter, Choice) and _ambiguous(parameter):
-        return {repr(option): option for option in parameter.options}.get(value, value)
-    return value
-
-
-def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
+def _point(study: StudyRecord, trial: FrozenTrial, name: str) -> Point | None:
     """The point of a trial; None of one whose parameters are not all drawn yet."""
     params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
     addresses = [parameter.address for parameter in study.parameters]
@@ -261,4 +246,4 @@ def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
         )
     if missing:
         return None
-    return tuple(p.check(_from_optuna(p, params[p.address])) for p in study.parameters)
+    return tuple(p.check(params[p.address]) for p in study.parameters)

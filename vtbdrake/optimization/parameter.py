@@ -133,7 +133,7 @@ class Choice:
         options: at least two different values.
 
     Raises:
-        ValueError: there are fewer than two options, or two are equal.
+        ValueError: there are fewer than two options, or two are equal, as 1 and True are.
     """
 
     address: str
@@ -145,7 +145,7 @@ class Choice:
         for option in self.options:
             if not isinstance(option, bool | int | float | str):
                 raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")
-        if len({(type(option) is bool, option) for option in self.options}) < max(2, len(self.options)):
+        if len(set(self.options)) < max(2, len(self.options)):
             raise ValueError(f"{address} needs at least two different options, not {list(self.options)}")
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import sqlite3
@@ -15,6 +14,7 @@ from typing import Any
 
 from vtbdrake.optimization.outcome import Outcome
 from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study_lock import StudyError, claim
 
 VERSION = 1
 _APPLICATION = 0x56544253  # "VTBS"
@@ -33,10 +33,6 @@ _TABLES = (
     "CREATE TABLE sessions (number INTEGER PRIMARY KEY, started TEXT DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ')), "
     "ended TEXT, reason TEXT, versions TEXT, revision TEXT)",
 )
-
-
-class StudyError(ValueError):
-    """A study file that is no study, is damaged, of another version or of another problem, or is in use."""
 
 
 # (batch, position, point, values, violations, exact, origin, method)
@@ -152,7 +148,7 @@ class StudyFile:
         Raises:
             StudyError: another process has it.
         """
-        with _claim(self.path):
+        with claim(self.path):
             with self._transaction():
                 row = self._db.execute(
                     "INSERT INTO sessions (versions, revision) VALUES (?, ?)", (json.dumps(dict(versions)), revision)
@@ -188,11 +184,14 @@ class StudyFile:
     def add(self, point: Point, condition: int, outcome: Outcome) -> None:
         """Records a finished rollout, whole or not at all; one that is there already stays."""
         columns = (outcome.h, outcome.value, json.dumps(outcome.measures), outcome.t_star, outcome.end)
-        self._write(
-            "INSERT OR IGNORE INTO rollouts (point, condition, h, value, measures, t_star, end, message, wall_time) "
-            "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (encode(point), condition, *columns, outcome.message, outcome.wall_time),
-        )
+        # One statement is a transaction by itself.
+        with self._lock:
+            self._db.execute(
+                "INSERT OR IGNORE INTO rollouts "
+                "(point, condition, h, value, measures, t_star, end, message, wall_time) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (encode(point), condition, *columns, outcome.message, outcome.wall_time),
+            )
 
     def outcomes(self) -> dict[tuple[Point, int], Outcome]:
         """All finished rollouts."""
@@ -274,38 +273,6 @@ class StudyFile:
     def waiting(self) -> int:
         """How many points wait in the queue."""
         return int(self._read("SELECT count(*) FROM given WHERE batch IS NULL")[0][0])
-
-
-@contextmanager
-def _claim(path: Path | None) -> Iterator[None]:
-    """Holds the lock of a study; the system gives it up when the process dies, however it dies.
-
-    It is a file of its own: to close any handle of the study itself would give up SQLite's locks on it.
-    """
-    if path is None:
-        yield
-        return
-    lock = path.with_name(path.name + "-lock")
-    while True:
-        handle = os.open(lock, os.O_CREAT | os.O_RDWR)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(handle)
-            raise StudyError(
-                f"the study {path} is being run by another process: wait for it, or give points to it with `add`"
-            ) from error
-        try:
-            if os.path.samestat(os.fstat(handle), os.stat(lock)):
-                break
-        except FileNotFoundError:
-            pass
-        os.close(handle)  # The one who had it has removed it meanwhile.
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-        os.close(handle)
 
 
 def encode(point: Point) -> str:

@@ -13,7 +13,7 @@ from vtbdrake.optimization.gradient import Gradients
 from vtbdrake.optimization.judge import Judge
 from vtbdrake.optimization.outcome import Outcome, Row
 from vtbdrake.optimization.problem import Problem
-from vtbdrake.optimization.solvers.solver import Evaluation, Solver
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver
 from vtbdrake.optimization.study_file import StudyFile, TrialRow
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.many import watched
@@ -53,25 +53,26 @@ class StudyRun:
         self._bar: tqdm | None = None  # type: ignore[type-arg]
         self._limit: float = inf
         self._deadline = inf
+        self._target: float | None = None
         self._best = -inf
 
     def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
         """Runs; returns why it ended, in a word and in a sentence."""
         self._limit = inf if rollouts is None else rollouts
         self._deadline = inf if seconds is None else time.monotonic() + seconds
+        if target is not None:
+            self._target = -target if self._problem.objectives[0].minimize else target
         shown = self._progress and watched()
         name = f"study ({self._solver.name})"
         with tqdm(total=rollouts, initial=len(self._known), desc=name, unit="rollout", disable=not shown) as self._bar:
             try:
-                return self._batches(target)
+                return self._batches()
             finally:
                 self._solver.close()
 
-    def _batches(self, target: float | None) -> tuple[str, str]:
+    def _batches(self) -> tuple[str, str]:
         batch, silent = self._resume(), 0
         while True:
-            if target is not None and self._reached(target):
-                return TARGET, f"the target of {target:g} is reached"
             if silent >= _WITHOUT_NEWS:
                 return SOLVER, f"{self._solver.name} asks only for points that are known"
             before = len(self._known)
@@ -83,6 +84,7 @@ class StudyRun:
                 return SOLVER, self._solvers_end()
             points = [*asked, *given]
             try:
+                self._refuse_success(points)
                 evaluations = self._judge.judge(points)
             except BaseException as error:
                 self._record(
@@ -128,6 +130,7 @@ class StudyRun:
                 self._file.add(*now[index], outcome)
                 assert self._bar is not None
                 self._bar.update()
+                self._refuse_success([now[index][0]])
                 self._refuse_lateness()
         finally:
             if points:
@@ -143,6 +146,16 @@ class StudyRun:
         if len(self._slopes) > known and filled.gradient is not None:
             self._file.add_gradient(evaluation.point, filled.gradient)
         return filled
+
+    def _refuse_success(self, points: Sequence[Point]) -> None:
+        """Ends the run as soon as a point is good enough."""
+        if self._target is None:
+            return
+        for point in points:
+            evaluation = self._judge.evaluation(point)
+            if evaluation.exact and evaluation.feasible and evaluation.values[0] >= self._target:
+                (value,) = self._judge.in_the_users_terms(evaluation)
+                raise _SpentError(TARGET, f"the target is reached: {value:g}")
 
     def _refuse_lateness(self) -> None:
         if time.monotonic() >= self._deadline:
@@ -165,9 +178,6 @@ class StudyRun:
             if ended or evaluation.exact
         ]
         self._file.save_trials(rows, told=batch + 1 if ended else None)
-
-    def _reached(self, target: float) -> bool:
-        return self._best >= (-target if self._problem.objectives[0].minimize else target)
 
     def _show(self, evaluations: Sequence[Evaluation]) -> None:
         for evaluation in evaluations:

@@ -55,7 +55,8 @@ class _Worker:
         if self.task != task:
             self.connection.send_bytes(b"T" + task)
             self.task = task
-        self.connection.send_bytes(b"R" + pickle.dumps((index, dict(parameters))))
+        kind = b"R" if time_limit == float("inf") else b"L"
+        self.connection.send_bytes(kind + pickle.dumps((index, dict(parameters))))
 
     def begin(self) -> None:
         """The worker has its testbed and begins its rollout: from here the time counts."""
@@ -105,27 +106,35 @@ class ProcessExecutor(Executor):
         blob = self._blobs.get(task).content
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
+        error: BaseException | None = None
         while len(self._workers) < min(self._count, len(points)):
             self._workers.append(_Worker(self._kept))
         try:
+            self._hand_out(blob, waiting, points)
             while waiting or any(worker.job is not None for worker in self._workers):
-                self._hand_out(blob, waiting, points)
+                finished: list[tuple[int, RolloutResult]] = []
                 for worker, reply in self._replies():
                     index = worker.job
                     assert index is not None
                     worker.job = None
                     if isinstance(reply, RolloutResult):
-                        yield index, reply
+                        finished.append((index, reply))
                     elif isinstance(reply, str):
                         self._replace(worker)
                         if index in losses:
-                            yield index, failed(points[index], f"{losses[index]}; then {reply}")
+                            finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
                         else:
                             _log.warning("rollout %d is tried again: %s", index, reply)
                             losses[index] = reply
                             waiting.append(index)
                     else:
-                        raise reply
+                        error = error or reply
+                if error is None:
+                    # Workers go on while the caller looks at what is finished.
+                    self._hand_out(blob, waiting, points)
+                yield from finished
+                if error is not None:
+                    raise error
         finally:
             # After an error or an interruption, what still works works for nothing.
             for worker in [worker for worker in self._workers if worker.job is not None]:

@@ -17,8 +17,8 @@ from vtbdrake.rollout.testbeds import Runners, Testbeds
 def serve(connection: Connection, runners: Runners) -> None:
     """Answers until the other end closes, which it also does by dying.
 
-    A task (T) has no answer. A rollout (R) has two: None when it begins, then (its index, its result or an exception);
-    where no testbed can be had for it, only the second.
+    A task (T) has no answer. A rollout (R) has one: (its index, its result or an exception). One of limited time (L)
+    has None before it, when it begins, unless no testbed can be had for it.
     """
     load: Callable[[], RolloutTask] | None = None
     while True:
@@ -31,13 +31,16 @@ def serve(connection: Connection, runners: Runners) -> None:
                 continue
             index, point = pickle.loads(content)
             assert load is not None, "a worker got a rollout before its task"
-            connection.send_bytes(answer(index, partial(_rollout, runners, load, point, connection)))
+            begin = partial(connection.send_bytes, pickle.dumps(None)) if kind == b"L" else None
+            connection.send_bytes(answer(index, partial(_rollout, runners, load, point, begin)))
         except (EOFError, OSError):
             return
 
 
-def _rollout(runners: Runners, load: Callable[[], RolloutTask], point: Any, connection: Connection) -> RolloutResult:
-    return runners.run(load(), point, begin=partial(connection.send_bytes, pickle.dumps(None)))
+def _rollout(
+    runners: Runners, load: Callable[[], RolloutTask], point: Any, begin: Callable[[], Any] | None
+) -> RolloutResult:
+    return runners.run(load(), point, begin=begin)
 
 
 def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
