@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from drake import lcmt_force_torque
 from pydrake.systems.framework import Diagram
 
 from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
@@ -23,6 +24,9 @@ from vtbdrake.components.sensors import (
     SampledSensor,
     connect_to_plant,
 )
+from vtbdrake.control.lcm_types import iiwa_command, iiwa_status
+from vtbdrake.control.lcm_vectors import vector_map
+from vtbdrake.control.protocol import Protocol
 from vtbdrake.testbed import (
     Interface,
     PlantFields,
@@ -120,6 +124,24 @@ class ManipulatorScenario(Scenario):
                 )
             ],
             commands=[Signal("motion", size=1, lower=0.0, upper=len(MOTIONS) - 1.0, default=HOME)],
+        )
+
+    def protocol(self) -> Protocol:
+        """What the arm speaks: the iiwa messages, and the wrench at its flange beside them."""
+        return Protocol(
+            sense=[
+                iiwa_status(
+                    {
+                        "joint_position": "joint_position_measured",
+                        "joint_velocity": "joint_velocity_estimated",
+                        "joint_torque_measured": "joint_torque_measured",
+                    }
+                ),
+                vector_map(
+                    "WRENCH", lcmt_force_torque, {"wrench": ("tx", "ty", "tz", "fx", "fy", "fz")}, stamp="timestamp"
+                ),
+            ],
+            act=[iiwa_command(["joint_torque"])],
         )
 
     def make_dps(self) -> Diagram:
