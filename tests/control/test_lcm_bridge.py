@@ -8,10 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import lcm
 import numpy as np
@@ -22,6 +25,9 @@ from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.hub import STATUS_CHANNEL, Hub
 from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.lcm_connections import TcpqConnection
+from vtbdrake.control.lcm_maps import LcmMap
+from vtbdrake.control.lcm_vectors import vector_map
+from vtbdrake.testbed import Interface, Signal
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0  # s, for what depends on another process
@@ -208,7 +214,19 @@ def test_killed_hub_is_noticed_by_publishing_too() -> None:
         assert not arm.connected
 
 
-def test_closed_bridge_seeks_no_bus_and_opens_again(hub: Hub) -> None:
+def test_bridge_that_is_closed_while_it_seeks_a_bus_stops_seeking() -> None:
+    with Hub(port=0) as hub:
+        arm = bridge(hub.url)
+        arm.open()
+        others = set(threading.enumerate())
+    arm.poll()
+    (search,) = set(threading.enumerate()) - others
+    arm.close()
+    search.join(PATIENCE)
+    assert not search.is_alive()
+
+
+def test_closed_bridge_opens_again(hub: Hub) -> None:
     arm = bridge(hub.url)
     for _ in range(2):
         arm.open()
@@ -238,6 +256,30 @@ sys.stdin.read()
         finally:
             frozen.kill()
             frozen.communicate()
+
+
+def test_frozen_hub_is_not_lost_and_not_waited_for(hub: Hub, user_types: ModuleType) -> None:
+    def encode(values: Mapping[str, Any], utime: int) -> Any:
+        message = user_types.mixed_t()
+        message.utime, message.m, message.blob = utime, 200_000, bytes(200_000)
+        return message
+
+    blob = LcmMap(channel="BLOB", type=user_types.mixed_t, signals=["jaw"], encode=encode)
+    jaw = Interface(sense=[], act=[Signal("jaw", size=1, idle=0.0)])
+    with closing(LcmBridge(jaw, hub.url, sense=[], act=[blob])) as arm:
+        arm.open()
+        os.kill(hub.pid, signal.SIGSTOP)
+        try:
+            while not arm.sent["jaw"].withheld and arm.sent["jaw"].count < 1000:
+                arm.publish({"jaw": [0.0]})
+            assert arm.sent["jaw"].withheld == {"no bus": 1}
+            assert arm.connected
+        finally:
+            os.kill(hub.pid, signal.SIGCONT)
+        peer = Peer(hub.url)
+        count = arm.sent["jaw"].count
+        assert wait(arm, lambda: arm.publish({"jaw": [0.0]}) or arm.sent["jaw"].count > count)
+        assert user_types.mixed_t.decode(peer.hear(1)[-1][1]).m == 200_000
 
 
 def test_burst_is_taken_in_by_portions(hub: Hub) -> None:
@@ -326,3 +368,20 @@ def test_frozen_owner_of_a_protected_channel_is_succeeded_only_on_request() -> N
 def test_only_a_hub_can_be_asked_for_channels() -> None:
     with pytest.raises(ValueError, match="only a hub protects channels"):
         bridge("memq://").take_over()
+
+
+def test_commands_u_come_over_lcm_too(hub: Hub, user_types: ModuleType) -> None:
+    goal = Interface(
+        sense=[], act=[], commands=[Signal("goal", size=3, lower=-1.0, upper=1.0), Signal("local", size=1)]
+    )
+    map = vector_map("GOAL", user_types.point_t, {"goal": ("x", "y", "z")}, stamp="")
+    with closing(LcmBridge(goal, hub.url, sense=[], act=[], commands=[map])) as arm:
+        arm.open()
+        peer = Peer(hub.url)
+        for x in (0.5, 2.0):
+            message = user_types.point_t()
+            message.x, message.y = x, 0.25
+            peer.lcm.publish("GOAL", message.encode())
+        assert wait(arm, lambda: arm.commanded["goal"].rejected == {"limits": 1})
+        np.testing.assert_array_equal(arm.commanded["goal"].value, [0.5, 0.25, 0.0])
+        assert list(arm.commanded) == ["goal"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -121,7 +122,7 @@ def set_fields(**fields: Any) -> Callable[[lcmt_image], None]:
         (set_fields(pixel_format=lcmt_image.PIXEL_FORMAT_BGRA), "type"),
         (set_fields(compression_method=lcmt_image.COMPRESSION_METHOD_JPEG), "compression"),
         (set_fields(compression_method=lcmt_image.COMPRESSION_METHOD_ZLIB), "compression"),
-        (lambda message: compress(message, bytes(10_000_000)), "size"),
+        (lambda message: compress(message, bytes(1_000)), "size"),
     ],
 )
 def test_image_that_is_not_what_the_signal_says_is_rejected(change: Callable[[lcmt_image], None], reason: str) -> None:
@@ -129,6 +130,18 @@ def test_image_that_is_not_what_the_signal_says_is_rejected(change: Callable[[lc
     change(message)
     reception = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
     assert (reception.count, reception.rejected) == (0, {reason: 1})
+
+
+def test_few_bytes_that_stand_for_many_are_not_unpacked() -> None:
+    message = message_of(noise(ImageRgba8U))
+    compress(message, bytes(50_000_000))
+    data = message.encode()
+    tracemalloc.start()
+    try:
+        take(image_map(CHANNEL, "camera"), [camera()], data)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_camera_that_is_not_in_a_message_is_missing() -> None:
@@ -183,6 +196,8 @@ def test_points_that_see_nothing_stay_infinite() -> None:
         (set_fields(point_step=8, row_step=400), "size"),
         (lambda message: set_fields(name="w")(message.fields[0]), "missing"),
         (lambda message: set_fields(byte_offset=2**31 - 1)(message.fields[0]), "size"),
+        (lambda message: set_fields(byte_offset=-4)(message.fields[0]), "size"),
+        (lambda message: set_fields(name="y")(message.fields[0]), "type"),
         (lambda message: set_fields(datatype=77)(message.fields[0]), "missing"),
         (lambda message: set_fields(datatype=7)(message.fields[3]), "type"),
     ],

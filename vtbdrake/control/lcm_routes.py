@@ -134,7 +134,7 @@ class Transmission:
         count: how many commands left.
         withheld: how many did not, by the reason: ``size``, ``not finite``, ``limits``, ``incomplete`` (its message
             cannot go without another signal), ``companion`` (another signal of its message was at fault), ``encode``,
-            ``no bus``.
+            ``no bus`` (it is lost, or takes nothing at present).
     """
 
     count: int = 0
