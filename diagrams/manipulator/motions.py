@@ -80,13 +80,13 @@ def reference(
     before = state["motion"]
     follow = wanted < FOLLOW + 0.5
     released = before < FOLLOW + 0.5
-    away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-9
+    away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-6
     durations = [0, away * p["home_duration"], p["swing_duration"], p["press_duration"], p["circle_duration"]]
-    # The clock is a sum of periods.
-    begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) - period / 2)
+    # The last instant of a motion, at which it has arrived, is the first of the next one.
+    begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) + period / 2)
     motion = casadi.if_else(begins, casadi.if_else(released, HOME, casadi.floor(wanted + 0.5)), before)
     motion = casadi.if_else(follow, FOLLOW, motion)
-    clock = casadi.if_else(casadi.logic_or(begins, follow), 0, state["clock"])
+    clock = casadi.if_else(casadi.logic_or(follow, released), 0, casadi.if_else(begins, period, state["clock"]))
     at = casadi.if_else(casadi.logic_or(follow, released), q, state["reference"])
     start = casadi.if_else(casadi.logic_or(begins, follow), at, state["start"])
 
