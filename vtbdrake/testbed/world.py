@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.state import Variable, collect
@@ -57,6 +58,7 @@ class WorldAlone(AddressedDiagram):
             ),
         )
         self.plant = parts.plant
+        self._actuators = {s.name: (s, diagram.GetInputPort(f"act.{s.name}")) for s in parts.interface.act}
 
     def default_context(self) -> Context:
         """A new context: s0 from defaults, every actuator with its idle command."""
@@ -67,10 +69,9 @@ class WorldAlone(AddressedDiagram):
 
     def command(self, context: Context, name: str, value: Any) -> None:
         """Gives the simulated actuator ``name`` a command, which lasts until the next one."""
-        signal = next(signal for signal in self.interface.act if signal.name == name)
-        port = self.diagram.GetInputPort(f"act.{name}")
+        signal, port = self._actuators[name]
         if signal.is_vector:
-            port.FixValue(context, signal.vector(value))
+            port.FixValue(context, value if np.shape(value) == (signal.size,) else signal.vector(value))
         else:
             wrapped = signal.abstract_value()
             wrapped.set_value(value)

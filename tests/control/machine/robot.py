@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import lcm
 import numpy as np
@@ -93,12 +95,19 @@ def state(data: bytes) -> np.ndarray:
 
 
 class Listener:
-    """Whoever is on the bus, by means of liblcm: hears what the machine says, and commands it."""
+    """Whoever is on the bus, by means of liblcm: hears what the machine says, and commands it.
+
+    Attributes:
+        heard: states of the machine, as bytes.
+        statuses: how the machine is, as it says.
+    """
 
     def __init__(self, url: str) -> None:
         self._lcm = lcm.LCM(url)
         self.heard: list[bytes] = []
+        self.statuses: list[dict[str, Any]] = []
         self._lcm.subscribe(STATUS, lambda _, data: self.heard.append(data))
+        self._lcm.subscribe("VTB_MACHINE_STATUS", lambda _, data: self.statuses.append(json.loads(data)))
 
     def wait(self, condition: Callable[[list[bytes]], bool]) -> list[bytes]:
         """What has been heard, when the condition is fulfilled."""
@@ -111,8 +120,11 @@ class Listener:
         count = len(self.heard)
         return self.wait(lambda heard: len(heard) > count)[count]
 
-    def listen(self, channel: str, handler: Callable[[str, bytes], None]) -> None:
-        self._lcm.subscribe(channel, handler)
+    def until_cycle(self, cycle: int) -> list[bytes]:
+        """What is heard until the machine has done so many cycles; its own status, which comes after it, says so."""
+        self._lcm.publish("VTB_MACHINE", b'{"request": "status"}')
+        self.wait(lambda heard: bool(self.statuses) and self.statuses[-1]["cycle"] == cycle)
+        return list(self.heard)
 
     def command(self, value: float, utime: int) -> None:
         self._lcm.publish(COMMAND, torque(value, utime))
