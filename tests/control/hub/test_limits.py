@@ -1,6 +1,7 @@
 """Slow, silent and too many clients: none costs the others anything."""
 
 import contextlib
+import resource
 from pathlib import Path
 
 from tests.control.hub.clients import Client, is_disconnected, raw_client, receive, record, wait_until
@@ -90,3 +91,18 @@ def test_one_client_too_many_is_turned_away() -> None:
         clients[0].publish("A")
         clients[1].wait(lambda: bool(clients[1].received))
         assert hub.statistics().disconnected == {"too many": 1}
+
+
+def test_without_file_descriptors_the_hub_goes_on_and_lets_the_next_client_in_when_there_are(hub) -> None:
+    client = Client(hub.url, "A")
+    allowed = resource.prlimit(hub.pid, resource.RLIMIT_NOFILE)
+    used = {int(fileno.name) for fileno in Path(f"/proc/{hub.pid}/fd").iterdir()}
+    lowest_free = min(set(range(len(used) + 1)) - used)
+    resource.prlimit(hub.pid, resource.RLIMIT_NOFILE, (lowest_free, allowed[1]))
+    with raw_client(hub.url) as waiting:
+        client.publish("A", b"as before")
+        client.wait(lambda: bool(client.received))
+        assert hub.statistics().clients == 1
+        resource.prlimit(hub.pid, resource.RLIMIT_NOFILE, allowed)
+        assert receive(waiting, 8)[:4] == b"\x28\x76\x17\xfa"
+    assert client.received == [("A", b"as before")]

@@ -125,3 +125,12 @@ def test_it_runs_in_a_thread_for_clients_of_other_processes() -> None:
     assert server.statistics().messages == 1
     server.stop()
     server.close()
+
+
+def test_real_time_scheduling_is_asked_for_and_not_insisted_on() -> None:
+    attempt = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))"
+    granted = subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode == 0
+    with Hub(port=0, priority=3) as hub:
+        Client(hub.url)
+        assert os.sched_getscheduler(hub.pid) == (os.SCHED_FIFO if granted else os.SCHED_OTHER)
+        assert os.sched_getparam(hub.pid).sched_priority == (3 if granted else 0)
