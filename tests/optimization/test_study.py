@@ -395,7 +395,7 @@ def test_given_points_are_checked_at_once(tmp_path):
     study = pendulum_problem().study(tmp_path / "a.db")
     with pytest.raises(ValueError, match=r"outside its range \[-1\.5, 1\.5\]"):
         study.add([2.0, 0.0])
-    with pytest.raises(ValueError, match="a point has 2 entries, not 1"):
+    with pytest.raises(ValueError, match="a point has 2 entries, but the one given has shape"):
         study.add(2.0)
     with pytest.raises(ValueError, match="wrong about nonsense"):
         study.add({THETA: 0.0, RATE: 0.0, "nonsense": 1.0})

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vtbdrake.rollout.testbeds import FIELD
 from vtbdrake.state import Variable, Variables
@@ -198,6 +199,25 @@ class Choice:
 
 
 Dimension = Parameter | Choice
+
+
+def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[str, Any]) -> tuple[Any, ...]:
+    """A point s^0, given as values in the order of the parameters or by address.
+
+    Raises:
+        ValueError: it has another number of entries, sets what is not varied, or one lies outside its range.
+    """
+    addresses = [parameter.address for parameter in parameters]
+    if isinstance(point, Mapping):
+        unknown = set(point) ^ set(addresses)
+        if unknown:
+            raise ValueError(f"a point sets each parameter once; this one is wrong about {', '.join(sorted(unknown))}")
+        point = [point[address] for address in addresses]
+    shape = np.shape(point) or (1,)
+    if shape != (len(addresses),):
+        raise ValueError(f"a point has {len(addresses)} entries, but the one given has shape {shape}")
+    entries = list(point) if isinstance(point, list | tuple) else np.atleast_1d(np.asarray(point)).tolist()
+    return tuple(parameter.check(value) for parameter, value in zip(parameters, entries, strict=True))
 
 
 def _scalar(address: str, variables: Variables) -> Variable:

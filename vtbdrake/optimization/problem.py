@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.optimization.boundary import Boundary
 from vtbdrake.optimization.motion import Motion, ProblemRollout
-from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, grid
@@ -131,17 +131,7 @@ class Problem:
         Raises:
             ValueError: it has another number of entries, or one lies outside its range.
         """
-        addresses = [parameter.address for parameter in self.parameters]
-        if isinstance(point, Mapping):
-            unknown = set(point) ^ set(addresses)
-            if unknown:
-                raise ValueError(f"a point sets each parameter once; this one is wrong about {', '.join(unknown)}")
-            point = [point[address] for address in addresses]
-        shape = np.shape(point) or (1,)
-        if shape != (len(addresses),):
-            raise ValueError(f"a point has {len(addresses)} entries, but the one given has shape {shape}")
-        entries = list(point) if isinstance(point, list | tuple) else np.atleast_1d(np.asarray(point)).tolist()
-        return tuple(parameter.check(value) for parameter, value in zip(self.parameters, entries, strict=True))
+        return checked_point(self.parameters, point)
 
     def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
         """What `point` sets in s0, as address -> value; and what the condition sets, if one is named.

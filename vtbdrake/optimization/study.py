@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Executor as FuturesExecutor
 from math import ceil
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.optimization.identity import describe, differences, revision, versions
+from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
 from vtbdrake.optimization.solvers.solver import Solver
 from vtbdrake.optimization.study_file import StudyFile
@@ -165,19 +166,7 @@ class Study(StudyRecord):
         Raises:
             ValueError: a point has other entries than the study, or one lies outside its range.
         """
-        space = self.parameters
-        checked = []
-        for point in points:
-            if isinstance(point, Mapping):
-                unknown = set(point) ^ {dimension.address for dimension in space}
-                if unknown:
-                    raise ValueError(f"a point sets each parameter once; this one is wrong about {', '.join(unknown)}")
-                point = [point[dimension.address] for dimension in space]
-            entries = list(point) if isinstance(point, Sequence) and not isinstance(point, str) else [point]
-            if len(entries) != len(space):
-                raise ValueError(f"a point has {len(space)} entries, not {len(entries)}")
-            checked.append(tuple(d.check(value) for d, value in zip(space, entries, strict=True)))
-        self._file.give(checked)
+        self._file.give([checked_point(self.parameters, point) for point in points])
 
     def import_optuna(self, storage: str | BaseStorage, name: str) -> int:
         """Gives the points of a study in Optuna's storage, as `add` does: evaluated by whomever, or only enqueued.
