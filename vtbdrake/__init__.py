@@ -7,10 +7,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vtbdrake.control.guard import Guards
+    from vtbdrake.control.hub import Hub
+    from vtbdrake.control.lcm_bridge import LcmBridge
+    from vtbdrake.control.machine import MachineProcess
+    from vtbdrake.control.protocol import Protocol
+    from vtbdrake.control.runtime import Runtime
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import (
+        DpsAlone,
         Interface,
         PlantFields,
         Scenario,
@@ -26,13 +33,20 @@ __all__ = [
     "CVaR",
     "Choice",
     "Constraint",
+    "DpsAlone",
+    "Guards",
+    "Hub",
     "Interface",
+    "LcmBridge",
+    "MachineProcess",
     "Parameter",
     "PlantFields",
     "Problem",
+    "Protocol",
     "Quality",
     "Quantile",
     "RolloutResult",
+    "Runtime",
     "Scenario",
     "Signal",
     "SimulatorFields",
@@ -44,11 +58,18 @@ __all__ = [
     "load_scenario",
 ]
 
-_LAYERS = {
+_HOMES = {
+    "control.guard": ("Guards",),
+    "control.hub": ("Hub",),
+    "control.lcm_bridge": ("LcmBridge",),
+    "control.machine": ("MachineProcess",),
+    "control.protocol": ("Protocol",),
+    "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
     "rollout": ("Constraint", "Quality", "RolloutResult"),
     "state": ("Snapshot",),
     "testbed": (
+        "DpsAlone",
         "Interface",
         "PlantFields",
         "Scenario",
@@ -59,7 +80,7 @@ _LAYERS = {
         "load_scenario",
     ),
 }
-_HOME = {name: layer for layer, names in _LAYERS.items() for name in names}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
