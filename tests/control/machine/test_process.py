@@ -332,6 +332,22 @@ def test_machine_outlives_its_hub() -> None:
         process.close()
 
 
+def test_machine_in_lock_step_tells_its_state_to_those_who_come_late() -> None:
+    with Hub(port=0) as first:
+        port = int(first.url.rpartition(":")[2])
+        process = MachineProcess(RobotScenario(), first.url, lock_step=True)
+        process.start()
+        late = Listener(first.url)
+        assert utime(late.next()) == 0
+        late.command(0.0, 1)
+        process.until(lambda status: status.cycle == 1)
+    try:
+        with Hub(port=port) as second:
+            assert utime(Listener(second.url).next()) == 1000
+    finally:
+        process.close()
+
+
 # -- what does not start
 
 

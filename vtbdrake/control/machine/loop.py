@@ -24,7 +24,7 @@ DIED = 70
 
 _BURST = 200  # messages to take in at a time
 _SLICE = 0.005  # s to wait for commands before looking at requests
-_REPEAT = 0.2  # s after which the first state is told again, in lock-step, to those who came late
+_REPEAT = 0.2  # s after which a state is told again, in lock-step on a bus where nobody has commanded yet
 _CATCH_UP = 0.05  # s
 
 
@@ -46,7 +46,8 @@ class MachineLoop:
 
     Attributes:
         statistics: of its cycles; ``step`` is the simulation.
-        state_to_command: from telling a state to the next command's arrival, in seconds.
+        state_to_command: from telling a state to the next command's arrival, in seconds; of states that are not
+            answered before the next one, the oldest counts.
         lost: seconds of the clock that the simulation could not keep up with.
     """
 
@@ -81,6 +82,8 @@ class MachineLoop:
         self._last: list[tuple[str, bytes]] = []
         self._braking = False
         self._arrived: set[str] = set()
+        self._alone = True
+        self._reconnections = 0
         self._told = inf
         self._next_status = 0
         handlers = {channel: self._receive for channel in machine.channels}
@@ -151,18 +154,18 @@ class MachineLoop:
         """One message on every command channel."""
         channels = set(self.machine.channels)
         repeat = time.monotonic() + _REPEAT
-        connections = self._link.reconnections
         while not self._arrived >= channels and not self._stop.is_set():
             # One at a time: what is ahead of its cycle waits on the line.
             if not self._link.take(_SLICE, 1):
                 self._serve()
-            # Nobody heard it who was not there, and without an answer nothing would go on.
-            alone = self.machine.cycle == 0 and time.monotonic() >= repeat
-            if alone or self._link.reconnections > connections:
+            # Who comes to a new bus after the state was told would wait for it, and the machine for him.
+            self._alone |= self._link.reconnections > self._reconnections
+            if self._alone and time.monotonic() >= repeat:
                 repeat = time.monotonic() + _REPEAT
-                connections = self._link.reconnections
+                self._reconnections = self._link.reconnections
                 self._publish(self._last)
         self._arrived.clear()
+        self._alone = False
 
     def _receive(self, channel: str, data: bytes) -> None:
         if self._told < inf:
@@ -175,8 +178,10 @@ class MachineLoop:
 
     def _tell(self) -> None:
         self._last = self.machine.messages()
+        # Before they leave: where the controller preempts this process, its answer is there before `_publish` returns.
+        # A state without an answer counts until one comes.
+        self._told = min(self._told, time.monotonic())
         self._publish(self._last)
-        self._told = time.monotonic()
         braking = self.machine.braking
         if self.machine.cycle >= self._next_status or braking != self._braking:
             self._braking = braking
