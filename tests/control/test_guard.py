@@ -288,11 +288,13 @@ def test_fallback_learns_how_much_time_has_passed() -> None:
         return last_sent
 
     loop = Loop(TORQUE, fallback={"torque": FallbackController(note, otherwise=Hold())})
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.now += 0.002
     loop.cycle({"torque": [nan, nan]})
     loop.cycle({"torque": [0.0, 0.0]})
     loop.now += 0.005
     loop.cycle({"torque": [0.0, 0.0]})
-    assert spans == pytest.approx([T, T, 0.006])
+    assert spans == pytest.approx([0.003, T, 0.006])
 
 
 def test_fault_that_is_told_latches_and_gives_the_fallback_commands() -> None:

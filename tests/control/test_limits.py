@@ -86,7 +86,7 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
 
 @settings(deadline=None)
 @given(
-    acceleration=st.floats(1.0, 1e4),
+    acceleration=st.floats(50.0, 1e4),
     upper=st.floats(0.01, 0.5),
     waits=st.integers(0, 60),
 )
@@ -99,6 +99,26 @@ def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int
         expected = min(rate * T, step + a, longest_step(upper - position, a))
         assert sent - position == pytest.approx(expected, rel=1e-9, abs=1e-12)
         position, step = sent, sent - position
+
+
+@settings(deadline=None, max_examples=30)
+@given(acceleration=st.floats(100.0, 1e4), upper=st.floats(0.01, 0.2), excess=st.floats(1e-6, 0.02))
+def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
+    acceleration: float, upper: float, excess: float
+) -> None:
+    a, rate = acceleration * T**2, 5.0
+    one = guard(rate=rate, acceleration=acceleration, upper=upper)
+    position, step = 0.0, 0.0
+    for _ in range(100):
+        most = min(rate * T, step + a, longest_step(upper - position, a))
+        sent = one.limit([position + most * (1.0 + excess)]).item()
+        assert sent - position == pytest.approx(most, rel=1e-9, abs=1e-12)
+        position, step = sent, sent - position
+
+
+def test_command_at_the_last_place_to_stop_passes_without_rounding() -> None:
+    one = guard(-1.0, acceleration=1.0 / T**2, upper=0.0)
+    assert one.limit([-1e-300]).item() == -1e-300
 
 
 @settings(deadline=None)

@@ -91,6 +91,13 @@ def test_longer_silence_allows_a_larger_change() -> None:
     assert kind(watchdog, 0.5, received(np.full(2, 0.49), 0.5, 2)) is None
 
 
+def test_jump_is_a_fault_until_the_next_sample() -> None:
+    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.0)
+    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    jumped = received(np.ones(2), 0.01, 2)
+    assert [kind(watchdog, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
+
+
 def test_sample_that_is_not_new_is_no_jump() -> None:
     watchdog, reception = Watchdog(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
     for now in (0.0, 0.001, 0.002):
