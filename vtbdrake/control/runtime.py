@@ -200,6 +200,7 @@ class Runtime:
         self._serve()
         self.feed()
         active = [] if self._idle else self._ports.active()
+        fed = self.clock.now()
         error, commands = self._step(active)
         stepped = self.clock.now()
         verdict = self.guards.check(
@@ -213,7 +214,7 @@ class Runtime:
         )
         if verdict.commands:
             self.bridge.publish(verdict.commands)
-        self.statistics.record(lateness=lateness, step=stepped - now, cycle=self.clock.now() - begin)
+        self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         done = Cycle(self.cycles, self.time, now, commands, verdict)
         self.cycles += 1
         for watcher in list(self._watchers):
