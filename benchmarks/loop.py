@@ -1,0 +1,233 @@
+"""How quick and how punctual the full loop is: machine process, hub, controller, hub, machine process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import lcm
+import numpy as np
+from drake import lcmt_iiwa_status
+
+from benchmarks.bare_loop import bare_loop
+from benchmarks.drake_loop import DrakeLoop
+from benchmarks.loop_rig import PERIOD, PRIORITY, WARM_UP, loop_rig
+from benchmarks.measure import HIGHER, LOWER, Benchmark
+from diagrams.manipulator.arm import JOINTS
+from vtbdrake.control.clock import WallClock
+from vtbdrake.control.statistics import Histogram
+from vtbdrake.testbed import DpsAlone
+
+PACE = "joint_position"  # comes with the first of the machine's messages
+PER = 10_000  # cycles, for which misses are counted
+TIMEOUT_MS = 5_000
+
+_ECHO = """
+import lcm, sys
+bus = lcm.LCM(sys.argv[1])
+bus.subscribe("PING", lambda _, data: bus.publish("PONG", data))
+bus.publish("PONG", b"")
+while True:
+    bus.handle()
+"""
+
+
+def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
+    """The time from the machine's telling of its state to the arrival of a command, as the machine sees it, with the
+    stripped DPS in lock-step with the states; in turns with a plain echo at the same rate through the same hub: a
+    message of the state's size to another process, which does nothing but send it back. The machine runs throughout.
+    """
+    states, echoes = Histogram(), []
+    answered, told = 0, 0
+    with loop_rig() as rig, _echo(rig.hub.url) as bus:
+        runtime = rig.runtime(DpsAlone(rig.scenario), pace=PACE)
+        granted = rig.granted()
+        for _ in range(rounds):
+            rig.run(runtime, cycles // rounds)
+            found = rig.machine.statistics()
+            states.merge(found.state_to_command)
+            answered += found.state_to_command.count
+            told += found.loop.cycles
+            echoes += _echoed(bus, cycles // rounds)
+    note = (
+        f"{_percentiles(states)}; {answered} answers to {told} states; echo: {_percentiles(_histogram(echoes))}; "
+        f"{granted}"
+    )
+    echo = dict(zip((50, 99), np.percentile(echoes, (50, 99)), strict=True))
+    return [
+        Benchmark(
+            name=f"loop_state_to_command_p{percent}",
+            value=states.percentile(percent),
+            unit="s",
+            goal=goal,
+            better=LOWER,
+            against=f"a plain LCM echo through the same hub: {1e3 * echo[percent]:.3g} ms",
+            note=note if percent == 50 else "",
+        )
+        for percent, goal in ((50, 0.4e-3), (99, 1e-3))
+    ]
+
+
+def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
+    """Missed deadlines of our loop, n, and of a bare one in C at the same priority, m, in turns, while hub and machine
+    run: (n + 1) / (m + 1), both for 10,000 cycles.
+
+    The 1 stands for the miss that may just not have been seen, and keeps the ratio finite; two loops without any miss
+    come out at 1. By the rule of both, a deadline is missed if it passes before the cycle of an earlier one has ended.
+    For ours that is wake-up, step and all the rest; the C loop only wakes up.
+    """
+    ours, bare = 0, 0
+    late: dict[str, list[float]] = {"ours": [], "C": []}
+    with bare_loop() as c, loop_rig() as rig:
+        runtime = rig.runtime(DpsAlone(rig.scenario))
+        for _ in range(rounds):
+            ours += rig.run(runtime, cycles // rounds)
+            late["ours"] += runtime.lateness
+            run = c.run(priority=PRIORITY, period=PERIOD, cycles=cycles // rounds)
+            bare += run.missed
+            late["C"] += run.lateness.tolist()
+        granted = rig.granted() + f", C {'SCHED_FIFO ' + str(run.priority) if run.priority else 'without SCHED_FIFO'}"
+    of, to = (missed * PER / cycles for missed in (ours, bare))
+    return Benchmark(
+        name="loop_misses",
+        value=(of + 1.0) / (to + 1.0),
+        unit="1",
+        goal=2.0,
+        better=LOWER,
+        against=f"a bare C loop at the same priority; missed in {PER} cycles: {of:g} to {to:g}",
+        note="from the deadline to the end: "
+        + "; ".join(f"{name} {_percentiles(_histogram(values))}" for name, values in late.items())
+        + f"; {granted}",
+    )
+
+
+def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
+    """The time that a cycle takes (messages in, checks, guards, statistics, messages out) less that of the DPS's step
+    (`Simulator.AdvanceTo` and its output), in the full loop, with the stripped DPS; and, printed only, the time of a
+    step of the full testbed with both switches on real against that of the stripped DPS, in turns."""
+    overheads: list[float] = []
+    with loop_rig() as rig:
+        alone, full = rig.runtime(DpsAlone(rig.scenario)), rig.runtime(rig.scenario.build())
+        for _ in range(rounds):
+            rig.run(alone, cycles // rounds)
+            overheads += alone.overheads
+            rig.run(full, cycles // rounds)
+        granted = rig.granted()
+    steps = {name: runtime.statistics.histograms["step"] for name, runtime in (("alone", alone), ("full", full))}
+    p50 = {name: histogram.percentile(50.0) for name, histogram in steps.items()}
+    step = f"DPS: {_percentiles(steps['alone'])}"
+    return [
+        Benchmark(
+            name="cycle_overhead",
+            value=float(np.median(overheads)),
+            unit="s",
+            goal=60e-6,
+            better=LOWER,
+            against=f"the DPS's own step: {1e6 * p50['alone']:.0f} us",
+            note=f"beyond the step: {_percentiles(_histogram(overheads))}; {granted}",
+        ),
+        Benchmark(
+            name="strip_step_time",
+            value=p50["full"] / p50["alone"],
+            unit="1",
+            goal=None,
+            better=HIGHER,
+            against="a step of the DPS alone; the full testbed's in the same loop over it",
+            note=f"{step}; testbed: {_percentiles(steps['full'])}",
+        ),
+    ]
+
+
+def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
+    """What a user of Drake would build otherwise, `LcmSubscriberSystem`, the same DPS and `LcmPublisherSystem` with
+    ``set_target_realtime_rate(1.0)``, against ours, in turns, in the same thread: the time from a deadline to the end
+    of its cycle at the 99th percentile, and the misses, counted as in `loop_misses`. Printed only.
+
+    Drake misses no deadline in its own eyes, since it catches up with all; here, each whole period that a cycle ends
+    after its deadline counts.
+    """
+    ours, theirs, our_misses = [], [], 0
+    with loop_rig() as rig:
+        runtime = rig.runtime(DpsAlone(rig.scenario))
+        other = DrakeLoop(rig.scenario, rig.hub.url, period=PERIOD)
+        for _ in range(rounds):
+            our_misses += rig.run(runtime, cycles // rounds)
+            ours += runtime.lateness
+            theirs += other.run(cycles // rounds, warm_up=WARM_UP).tolist()
+        granted = rig.granted()
+    of, to = (float(np.percentile(late, 99)) for late in (theirs, ours))
+    their_misses = sum(late >= PERIOD for late in theirs)
+    against = "ours; Drake's LCM systems with set_target_realtime_rate(1.0) over it"
+    return [
+        Benchmark(
+            name="loop_against_drake",
+            value=of / to,
+            unit="1",
+            goal=None,
+            better=HIGHER,
+            against=f"{against}, p99 from the deadline to the end",
+            note=f"ours: {_percentiles(_histogram(ours))}; Drake: {_percentiles(_histogram(theirs))}; {granted}",
+        ),
+        Benchmark(
+            name="loop_against_drake_misses",
+            value=(their_misses * PER / cycles + 1.0) / (our_misses * PER / cycles + 1.0),
+            unit="1",
+            goal=None,
+            better=HIGHER,
+            against=f"{against}, misses (+ 1)",
+            note=f"in {cycles} cycles: ours {our_misses}, Drake {their_misses}",
+        ),
+    ]
+
+
+@contextmanager
+def _echo(url: str) -> Iterator[lcm.LCM]:
+    """A client that hears the echo of what it says."""
+    bus = lcm.LCM(url)
+    bus.subscribe("PONG", lambda *_: None)
+    with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
+        try:
+            _await(bus)
+            with suppress(PermissionError):  # Then nobody has it; `Rig.granted` tells.
+                os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+            yield bus
+        finally:
+            process.kill()
+
+
+def _echoed(bus: lcm.LCM, messages: int) -> list[float]:
+    """Seconds from a message's departure to its return, one each period."""
+    clock, times = WallClock(), []
+    status = lcmt_iiwa_status()
+    status.num_joints = JOINTS
+    for name in status.__slots__[2:]:
+        setattr(status, name, [0.0] * JOINTS)
+    data = status.encode()
+    deadline = clock.now()
+    for _ in range(messages):
+        deadline = max(deadline + PERIOD, clock.wait_until(deadline))
+        begin = clock.now()
+        bus.publish("PING", data)
+        _await(bus)
+        times.append(clock.now() - begin)
+    return times
+
+
+def _await(bus: lcm.LCM) -> None:
+    if not bus.handle_timeout(TIMEOUT_MS):
+        raise TimeoutError(f"no message came back within {TIMEOUT_MS} ms")
+
+
+def _histogram(times: list[float]) -> Histogram:
+    histogram = Histogram()
+    for seconds in times:
+        histogram.record(seconds)
+    return histogram
+
+
+def _percentiles(times: Histogram) -> str:
+    p50, p90, p99 = (1e6 * times.percentile(percent) for percent in (50.0, 90.0, 99.0))
+    return f"p50 {p50:.0f}, p90 {p90:.0f}, p99 {p99:.0f} us (n = {times.count})"

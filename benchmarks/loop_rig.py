@@ -1,0 +1,124 @@
+"""The full loop as it is measured: hub, machine and controller, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Any
+
+from diagrams.manipulator import ManipulatorScenario
+from vtbdrake.control.bridge import Bridge
+from vtbdrake.control.guard import Guards
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.realtime import RealTime
+from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+
+HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 80, 75, 70
+"""Of SCHED_FIFO; the second is the controller's, the bare C loop's and the echo's."""
+
+PERIOD = 1e-3  # s
+WARM_UP = 200  # cycles before each round that do not count
+PATIENCE = 1.0  # s that a sensor signal may be old
+# From how far away (N m) the command may depart: the guards' rate limit takes it from there.
+CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
+
+
+class TimedRuntime(Runtime):
+    """Keeps what each cycle took, all of it, watched from outside.
+
+    Attributes:
+        overheads: of each cycle, from its call to its return, less the DPS's step, in seconds.
+        lateness: from each cycle's deadline to its end, in seconds.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.overheads: list[float] = []
+        self.lateness: list[float] = []
+
+    def cycle(self, *, lateness: float = 0.0) -> Cycle:
+        steps = self.statistics.histograms["step"]
+        before, begin = steps.total, self.clock.now()
+        done = super().cycle(lateness=lateness)
+        took = self.clock.now() - begin
+        self.overheads.append(took - (steps.total - before))
+        self.lateness.append(lateness + took)
+        return done
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A machine that runs, and the bridge to it. Several runtimes share the bridge and take turns."""
+
+    scenario: Scenario
+    hub: Hub
+    machine: MachineProcess
+    bridge: Bridge
+    real_time: RealTime
+
+    def runtime(self, target: VirtualTestbed | DpsAlone, *, pace: str | None = None) -> TimedRuntime:
+        """One that commands the machine already."""
+        self.drain()
+        # How long the system holds up the loop is to be measured: it must not end the measurement.
+        patient = [replace(signal, max_age=PATIENCE) for signal in target.interface.sense]
+        guards = Guards(replace(target.interface, sense=patient), PERIOD, max_missed=inf)
+        runtime = TimedRuntime(target, self.bridge, period=PERIOD, pace=pace, continuity=CONTINUITY, guards=guards)
+        runtime.run(cycles=WARM_UP)
+        runtime.switch("real")
+        return runtime
+
+    def run(self, runtime: TimedRuntime, cycles: int) -> int:
+        """One round of it; says how many deadlines were missed. A round before it, which does not count, puts an end
+        to what the others left behind.
+
+        Raises:
+            RuntimeError: the guards have latched: what was measured is not the DPS's control of the machine.
+        """
+        self.drain()
+        runtime.run(cycles=WARM_UP)
+        self.machine.reset_statistics()
+        runtime.overheads.clear()
+        runtime.lateness.clear()
+        missed = runtime.missed
+        runtime.run(cycles=cycles)
+        if runtime.guards.latched:
+            raise RuntimeError(f"the loop ended in a safe stop: {runtime.guards.latched[0]}")
+        return runtime.missed - missed
+
+    def drain(self) -> None:
+        """Takes in what came while somebody else had his turn."""
+        while self.bridge.poll():
+            pass
+
+    def granted(self) -> str:
+        """Who runs at which priority, to be read."""
+        pids = {"hub": self.hub.pid, "machine": self.machine.pid, "controller": 0}
+        refused = [grant.request for grant in self.real_time.grants if not grant.granted]
+        priorities = ", ".join(f"{name} {_priority(pid)}" for name, pid in pids.items())
+        return f"{priorities}" + (f"; refused: {', '.join(refused)}" if refused else "")
+
+
+def _priority(pid: int) -> str:
+    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+    return f"SCHED_FIFO {os.sched_getparam(pid).sched_priority}" if policy == os.SCHED_FIFO else "without SCHED_FIFO"
+
+
+@contextmanager
+def loop_rig() -> Iterator[Rig]:
+    """Hub and machine run within; this thread is a real-time one, as far as the system grants it."""
+    scenario = ManipulatorScenario()
+    with Hub(port=0, priority=HUB_PRIORITY) as hub:
+        bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
+        with MachineProcess(scenario, hub.url, priority=MACHINE_PRIORITY, period=PERIOD) as machine:
+            bridge.open()
+            try:
+                with RealTime(priority=PRIORITY) as real_time:
+                    yield Rig(scenario, hub, machine, bridge, real_time)
+            finally:
+                bridge.close()
