@@ -13,7 +13,7 @@ from vtbdrake.cli.text import number
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.machine import Machine, MachineConfig
 from vtbdrake.control.machine.config import BRAKES
-from vtbdrake.control.machine.process import epoch, serve
+from vtbdrake.control.machine.serve import epoch, serve
 from vtbdrake.testbed import Scenario
 
 _DEFAULT = MachineConfig()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import socket
@@ -12,28 +11,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
-from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.machine.config import MachineConfig
 from vtbdrake.control.machine.faults import Fault
-from vtbdrake.control.machine.loop import MachineLoop
-from vtbdrake.control.machine.machine import Machine, MachineStatus
-from vtbdrake.control.realtime import RealTime
+from vtbdrake.control.machine.machine import MachineStatus
 from vtbdrake.control.statistics import Histogram, LoopStatistics
-from vtbdrake.testbed import Scenario, load_scenario
-
-_log = logging.getLogger(__name__)
+from vtbdrake.testbed import Scenario
 
 _START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 10.0
-_FAILED = 1
 
 
 class MachineError(RuntimeError):
@@ -101,7 +92,7 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.machine.process import main; main()"
+        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.machine.serve import main; main()"
         control, theirs = socket.socketpair()
         self._control = control
         try:
@@ -271,67 +262,3 @@ def _plain(config: MachineConfig) -> dict[str, Any]:
     plain = asdict(config)
     plain["values"] = {address: np.asarray(value).tolist() for address, value in config.values.items()}
     return plain
-
-
-def serve(
-    machine: Machine,
-    url: str,
-    *,
-    lock_step: bool = False,
-    cycles: float = inf,
-    priority: int = 0,
-    control: socket.socket | None = None,
-    ready: Callable[[], None] = lambda: None,
-) -> MachineLoop:
-    """Runs a machine in the main thread of a process that does nothing else, until SIGTERM, or SIGINT if not ignored.
-
-    Args:
-        ready: called when it is connected.
-
-    Raises:
-        BridgeError: there is no bus at ``url``.
-        RuntimeError: the simulation failed.
-    """
-    loop = MachineLoop(machine, url, control=control)
-    signal.signal(signal.SIGTERM, lambda *_: loop.stop())
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda *_: loop.stop())
-    ready()
-    real_time = RealTime(priority=priority) if priority else nullcontext()
-    try:
-        with real_time:
-            if isinstance(real_time, RealTime):
-                _log.info("%s", real_time)
-            loop.run(lock_step=lock_step, cycles=cycles)
-    finally:
-        loop.close()
-    return loop
-
-
-def epoch(*, lock_step: bool) -> int:
-    """What a machine tells as the time of its cycle 0, in microseconds: the time of day; 0 in lock-step, where the
-    same commands are to give the same messages."""
-    return 0 if lock_step else time.time_ns() // 1000
-
-
-def main() -> None:
-    """The process of a `MachineProcess`."""
-    control = socket.socket(fileno=int(sys.argv[1]))
-    order = json.loads(sys.argv[2])
-    logging.basicConfig(format="machine: %(message)s")
-    # Ctrl-C reaches the whole group of processes; the one that started the machine decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        scenario = load_scenario(order["scenario"])
-        machine = Machine(scenario, MachineConfig(**order["config"]), epoch=epoch(lock_step=order["lock_step"]))
-        serve(
-            machine,
-            order["url"],
-            lock_step=order["lock_step"],
-            cycles=inf if order["cycles"] is None else order["cycles"],
-            priority=order["priority"],
-            control=control,
-        )
-    except (ValueError, BridgeError) as error:
-        control.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
-        raise SystemExit(_FAILED) from error
