@@ -78,16 +78,22 @@ def test_signal_handler_runs_and_the_wait_goes_on() -> None:
     assert handled and handled[0] < deadline
 
 
+def sleeps(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] == "S"
+
+
 def test_ctrl_c_ends_the_wait() -> None:
     code = (
-        "import time; from vtbdrake.control.clock import WallClock; c = WallClock()\n"
-        "print('waits', flush=True)\n"
-        "try: c.wait_until(c.now() + 60.0)\n"
+        "from vtbdrake.control.clock import WallClock; c = WallClock()\n"
+        "try: print('waits', flush=True); c.wait_until(c.now() + 60.0)\n"
         "except KeyboardInterrupt: print('interrupted')"
     )
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout.readline() == "waits\n"
+            give_up = time.monotonic() + 30.0
+            while not sleeps(process.pid) and time.monotonic() < give_up:
+                pass
             process.send_signal(signal.SIGINT)
             rest, _ = process.communicate(timeout=30.0)
         finally:
