@@ -11,10 +11,11 @@ ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check answers bench clean stale
+.PHONY: help setup demo demo-control test check answers bench clean stale
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
+	@echo "make demo-control                  an arm, from the simulation to the machine, at 1 kHz; the machine killed, and back"
 	@echo "make test [ARGS='-k name']         the tests"
 	@echo "make check                         ruff and mypy"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
@@ -28,6 +29,9 @@ setup: $(STAMP)
 
 demo: $(STAMP)
 	$(RUN) -m diagrams.space_climber.demo
+
+demo-control: $(STAMP)
+	$(RUN) -m diagrams.manipulator.demo
 
 test: $(STAMP)
 	$(RUN) -m pytest $(ARGS)

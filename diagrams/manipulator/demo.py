@@ -1,0 +1,251 @@
+"""``make demo-control``: an arm in simulation, in the shadow of the machine, on it; the machine killed, and back."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from contextlib import suppress
+
+import numpy as np
+
+from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
+from diagrams.manipulator.safety import arm_guards
+from diagrams.manipulator.trials import CONTINUITY, DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
+from vtbdrake.cli.text import table
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.lcm_bridge import LcmBridge
+from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.realtime import RealTime
+from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.testbed import DpsAlone
+
+LAWS = ("cartesian_impedance", "admittance")
+
+# The machine is not what the DPS was made with: masses, friction and the like are off by up to this.
+PERTURB, SEED = 0.05, 7
+
+# Deadlines missed in a row after which the arm floats in place; the machine brakes by itself after 100.
+MAX_MISSED = 50
+
+HUB_PRIORITY, LOOP_PRIORITY, MACHINE_PRIORITY = 80, 75, 70
+
+# When the press is looked at, in seconds from its begin.
+INSTANTS = (0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6)
+
+
+class Attendant:
+    """Resets the guards as soon as they let it, and takes down why they had latched; a watcher of the loop."""
+
+    def __init__(self) -> None:
+        self.loop: Runtime | None = None
+        self.reasons: list[str] = []
+        self._latched = False
+
+    def __call__(self, cycle: Cycle) -> None:
+        if self.loop is None:
+            return
+        latched = self.loop.guards.latched
+        if latched and not self._latched:
+            self.reasons.append(latched[0].reason)
+        self._latched = bool(latched)
+        if latched:
+            with suppress(SwitchRefusedError):
+                self.loop.reset()
+
+
+class Demo:
+    """One law, from the simulation to the machine."""
+
+    def __init__(self, law: str, hub: Hub) -> None:
+        self.law = law
+        self.scenario = trial_scenario(law)
+        self.testbed = self.scenario.build()
+        self.along_x = LawAlongX.of(self.testbed)
+        self.machine = MachineProcess(self.scenario, hub.url, priority=MACHINE_PRIORITY, perturb=PERTURB, seed=SEED)
+        self.bridge: LcmBridge = protocol_of(self.scenario).bridge(self.scenario.interface(), hub.url)
+        self.attendant = Attendant()
+
+    def run(self, *, death: bool) -> None:
+        """Everything, with ``death`` and recovery of the machine or without."""
+        print(f"\n== {self.law}\n")
+        self.bridge.open()
+        try:
+            simulated, loop = self._simulate()
+            with self.machine, RealTime(priority=LOOP_PRIORITY) as rights:
+                if death:
+                    print("\n".join(f"  {line}" for line in str(rights).splitlines()))
+                loop = self._strip(self._shadow(loop))
+                real = self._on_the_machine(loop)
+                self._report(simulated, real)
+                self._report_timing(loop)
+                if death:
+                    self._die_and_recover(loop)
+        finally:
+            self.bridge.close()
+
+    # -- the stages
+
+    def _simulate(self) -> tuple[Track, Runtime]:
+        context = self.testbed.default_context()
+        self.testbed.write(context, DURATIONS)
+        loop = Runtime(self.testbed, self.bridge, context=context, clock=SimulatedClock())
+        begin = time.perf_counter()
+        track = run_trial(loop)
+        print(f"sim     {loop.time:.1f} s of motions, simulated in {time.perf_counter() - begin:.1f} s")
+        return track, loop
+
+    def _shadow(self, simulated: Runtime) -> Runtime:
+        loop = Runtime(self.testbed, self.bridge, context=simulated.context, continuity=CONTINUITY)
+        self._switch(loop, "shadow")
+        loop.run(seconds=1.0)
+        command = loop.command("joint_torque")
+        print(f"shadow  the DPS feels the machine and commands the simulated arm; it would command {_torque(command)}")
+        print(f"        sent to the machine so far: {self.bridge.sent['joint_torque'].count} commands")
+        return loop
+
+    def _strip(self, shadowed: Runtime) -> Runtime:
+        alone = DpsAlone(self.scenario)
+        loop = Runtime(
+            alone,
+            self.bridge,
+            context=alone.continue_from(self.testbed, shadowed.context),
+            continuity=CONTINUITY,
+            guards=arm_guards(self.scenario, max_missed=MAX_MISSED),
+            watchers=(self.attendant,),
+        )
+        self._switch(loop, "real")
+        return loop
+
+    def _switch(self, loop: Runtime, mode: str) -> None:
+        """Tried again where something was late just now."""
+        for _ in range(100):
+            self.bridge.poll(0.1)
+            preparation = loop.prepare(mode)
+            if not preparation.reasons:
+                break
+        loop.perform(preparation)
+
+    def _on_the_machine(self, loop: Runtime) -> Track:
+        self.attendant.loop = loop
+        track = run_trial(loop)
+        self.attendant.loop = None
+        print(f"real    the DPS alone commanded the machine (perturbed by up to {PERTURB:.0%}), {loop.cycles} cycles")
+        self._tell_latches()
+        return track
+
+    def _die_and_recover(self, loop: Runtime) -> None:
+        print("\nThe machine is killed in the middle of a circle:")
+        loop.target.write(loop.context, {"u.motion": float(CIRCLE)})
+        loop.run(seconds=2.2)
+        _release(loop)
+        killed = time.monotonic()
+        os.kill(self.machine.pid, signal.SIGKILL)
+        loop.run(until=lambda: bool(loop.guards.latched), seconds=5.0)
+        fault = loop.guards.latched[0]
+        print(f"  {1e3 * (fault.time - killed):.1f} ms later the guards latch: {fault.reason}")
+        loop.run(seconds=0.5)
+        print(f"  the loop goes on, and sends what carries the arm where it was last: {_torque(_last_sent(loop))}")
+        with suppress(SwitchRefusedError):
+            loop.reset()
+        print(f"  a reset is {'refused' if loop.guards.latched else 'GRANTED'} as long as nothing is sensed")
+        birth = threading.Thread(target=self.machine.start)
+        birth.start()
+        # The reference is where the arm is, wherever the machine will be.
+        loop.target.write(loop.context, {"u.motion": float(FOLLOW)})
+        loop.run(until=lambda: not birth.is_alive() and not _doubts(loop), seconds=60.0)
+        birth.join()
+        loop.run(seconds=0.1)
+        print("  the machine is started again: its sensors are fresh, the arm floats")
+        _release(loop)
+        self.attendant.reasons.clear()
+        self.attendant.loop = loop
+        errors = run_trial(loop, (CIRCLE,)).errors((CIRCLE,))
+        print(
+            f"  reset; the next circle is tracked to {1e3 * rms(errors):.2f} mm (RMS), {1e3 * errors.max():.2f} at most"
+        )
+        self._tell_latches()
+
+    # -- what came out
+
+    def _tell_latches(self) -> None:
+        """What was missed, if anything."""
+        reasons = self.attendant.reasons
+        if reasons:
+            print(
+                f"        latches of the guards, each reset as soon as they let it: {len(reasons)}; the first because"
+            )
+            print(f"        {reasons[0]}")
+
+    def _report(self, simulated: Track, real: Track) -> None:
+        rows = []
+        for motion in FREE:
+            both = [track.errors((motion,)) for track in (simulated, real)]
+            cells = [f"{1e3 * value:.2f}" for errors in both for value in (rms(errors), errors.max())]
+            rows.append((MOTIONS[motion], *cells))
+        header = ("tracking error of the tip (mm)", "sim RMS", "sim max", "machine RMS", "machine max")
+        print("\n" + table(header, rows) + "\n")
+        contacts = [track.contact(self.along_x, self.scenario) for track in (simulated, real)]
+        rows = []
+        for t in INSTANTS:
+            (predicted, in_sim), (_, on_machine) = (contact.at(t) for contact in contacts)
+            rows.append((f"{t:.1f} s", f"{predicted:.1f}", f"{in_sim:.1f}", f"{on_machine:.1f}"))
+        apart = [f"{rms(contact.felt - contact.predicted):.1f}" for contact in contacts]
+        rows.append(("RMS from the law", "", *apart))
+        print(table(("force on the wall (N)", "law and wall", "sim", "machine"), rows) + "\n")
+
+    def _report_timing(self, loop: Runtime) -> None:
+        machine = self.machine.statistics()
+        answer = machine.state_to_command
+        print(loop.statistics)
+        print(
+            f"state to command, as the machine sees it: p50 {1e6 * answer.percentile(50.0):.0f} us, p99 "
+            f"{1e6 * answer.percentile(99.0):.0f} us; the machine itself missed {machine.loop.misses} deadlines and "
+            f"lost {1e3 * machine.lost:.0f} ms"
+        )
+
+
+def _release(loop: Runtime) -> None:
+    """Resets the guards, as soon as nothing speaks against it."""
+    for _ in range(1000):
+        if not loop.guards.latched:
+            return
+        with suppress(SwitchRefusedError):
+            loop.reset()
+        loop.run(cycles=1)
+    loop.reset()
+
+
+def _doubts(loop: Runtime) -> list[str]:
+    return [
+        reason
+        for name, seen in loop.bridge.sensed.items()
+        for reason in loop.guards.doubts(name, loop.clock.now(), seen)
+    ]
+
+
+def _last_sent(loop: Runtime) -> np.ndarray:
+    return np.array(loop.guards.commands["joint_torque"].last_sent)
+
+
+def _torque(values: np.ndarray) -> str:
+    return "[" + " ".join(f"{value:.1f}" for value in values) + "] N m"
+
+
+def main() -> None:
+    logging.disable(logging.ERROR)  # What the guards would log is told here.
+    begin = time.perf_counter()
+    print("A seven-joint arm, developed in simulation, then run at 1 kHz against a process that plays the machine.")
+    with Hub(port=0, protect=["IIWA_COMMAND"], priority=HUB_PRIORITY) as hub:
+        for law in LAWS:
+            Demo(law, hub).run(death=law == LAWS[0])
+    print(f"\n{time.perf_counter() - begin:.0f} s in all.")
+
+
+if __name__ == "__main__":
+    main()

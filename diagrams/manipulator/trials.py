@@ -1,0 +1,233 @@
+"""Trials of the arm: a program of motions, and how well they were done, in simulation and on a machine alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from diagrams.manipulator.arm import JOINTS, Arm
+from diagrams.manipulator.dynamics import ArmDynamics, Expression, function
+from diagrams.manipulator.motions import CIRCLE, HOME, MOTIONS, PRESS, SWING, parameters, reference
+from diagrams.manipulator.scenario import ManipulatorScenario
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed.addressed import AddressedDiagram
+
+# How the arm in a trial is: the wall is where the press meets it, and the swing does not.
+WALL_DISTANCE = 0.835
+DURATIONS = {
+    "dps.impl.home_duration": 1.0,
+    "dps.impl.swing_duration": 3.0,
+    "dps.impl.circle_duration": 2.5,
+    "dps.impl.press_duration": 3.0,
+}
+PROGRAM = (SWING, CIRCLE, PRESS)
+FREE = (SWING, CIRCLE)
+
+_STEP = 1e-4  # s, of the prediction's integration
+
+# The switch to real is refused where the command is further than this from the measured torque (N m).
+CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
+
+
+def trial_scenario(law: str) -> ManipulatorScenario:
+    """The arm before the wall."""
+    return ManipulatorScenario(law=law, wall=True, wall_distance=WALL_DISTANCE)
+
+
+class Trial:
+    """Has a DPS do motions one after another, and then go home; asked after every cycle whether it is done, it takes
+    down what happens.
+
+    Args:
+        runtime: whose DPS it is; its context is written to.
+        motions: what to do.
+        every: how many cycles lie between two samples.
+    """
+
+    def __init__(self, runtime: Runtime, motions: Sequence[int] = PROGRAM, *, every: int = 5) -> None:
+        self._runtime = runtime
+        self._target: AddressedDiagram = runtime.target
+        self._context = runtime.context
+        self._left = [*motions, HOME]
+        self._every = every
+        self._motion = self._target.reader("dps.impl.motion")
+        self._readers = {name: self._target.reader(f"dps.{name}") for name in _RECORDED}
+        self._samples: dict[str, list[Any]] = {name: [] for name in _RECORDED}
+        self.parameters = {name: self._target.read(self._context, f"dps.impl.{name}") for name in parameters(Arm())}
+        self._command(self._left[0])
+
+    def __call__(self) -> bool:
+        """`Runtime.run`'s ``until``."""
+        motion = int(self._motion(self._context))
+        if self._left and motion == self._left[0]:
+            del self._left[0]
+            if self._left:
+                self._command(self._left[0])
+        if self._runtime.cycles % self._every == 0:
+            for name, reader in self._readers.items():
+                self._samples[name].append(np.array(reader(self._context)))
+        return self.done
+
+    def _command(self, motion: int) -> None:
+        self._target.write(self._context, {"u.motion": float(motion)})
+
+    @property
+    def done(self) -> bool:
+        """Whether the arm is on its way home."""
+        return not self._left
+
+    def track(self) -> Track:
+        """How well it went so far."""
+        return Track.of({name: np.array(values) for name, values in self._samples.items()}, self.parameters)
+
+
+_RECORDED = ("env.joint_position", "env.contact_wrench", "impl.motion", "impl.clock", "impl.start")
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where the tip was to be and where it was, sample by sample.
+
+    Attributes:
+        motion: the motion under way, shape (n,).
+        clock: since its begin, in s, (n,).
+        wanted: the reference of the tip, (n, 3), in m, in the world.
+        tip: where it was, by the measured joint positions, (n, 3).
+        force: that the environment exerts on the tip, as the DPS perceives it, (n, 3), in N.
+    """
+
+    motion: NDArray[np.float64]
+    clock: NDArray[np.float64]
+    wanted: NDArray[np.float64]
+    tip: NDArray[np.float64]
+    force: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, samples: dict[str, NDArray[np.float64]], values: dict[str, Any], *, period: float = 0.001) -> Track:
+        """From the DPS's variables; the reference is that of the update at which the position was measured."""
+        clock = samples["impl.clock"] - period
+        positions = _positions(values, period)
+        columns = [samples["impl.motion"], clock, samples["impl.start"], samples["env.joint_position"]]
+        both = [positions(*row) for row in zip(*columns, strict=True)]
+        wanted, tip = (np.array([pair[k].full().ravel() for pair in both]).reshape(-1, 3) for k in range(2))
+        return cls(samples["impl.motion"], clock, wanted, tip, samples["env.contact_wrench"].reshape(-1, 6)[:, 3:])
+
+    def errors(self, motions: Sequence[int] = FREE) -> NDArray[np.float64]:
+        """Distances of the tip from its reference during some motions, in m."""
+        during = np.isin(self.motion, motions)
+        found: NDArray[np.float64] = np.linalg.norm(self.tip[during] - self.wanted[during], axis=1)
+        return found
+
+    def contact(self, law: LawAlongX, scenario: ManipulatorScenario) -> Contact:
+        """The force during the press, beside what the law and the wall predict."""
+        during = self.motion == PRESS
+        clock, wanted = self.clock[during], self.wanted[during, 0]
+        return Contact(clock, law.force(clock, wanted, scenario), -self.force[during, 0])
+
+
+@dataclass(frozen=True)
+class LawAlongX:
+    """What a Cartesian law makes of the arm along the world's x: M x'' + D x' + K x = F, x away from the reference.
+
+    Attributes:
+        inertia: M, in kg; 0 for the impedance law, which leaves the arm its own: it predicts statics.
+        damping: D, in N s/m.
+        stiffness: K, in N/m.
+    """
+
+    inertia: float
+    damping: float
+    stiffness: float
+
+    @classmethod
+    def of(cls, target: AddressedDiagram) -> LawAlongX:
+        """With the gains that a target has by default."""
+        context, known = target.default_context(), target.variables()
+        values = {
+            name: float(target.read(context, f"dps.impl.{name}")[3]) if f"dps.impl.{name}" in known else 0.0
+            for name in ("inertia", "damping", "stiffness")
+        }
+        return cls(**values)
+
+    def force(
+        self, clock: NDArray[np.float64], wanted: NDArray[np.float64], scenario: ManipulatorScenario
+    ) -> NDArray[np.float64]:
+        """On the wall, while the reference of the tip moves as wanted (n,), in m.
+
+        Without inertia that of two springs in series; else of the mass against the wall, which pushes back by Hunt and
+        Crossley's k d (1 + c d').
+        """
+        beyond = wanted - (scenario.wall_distance - Arm().ball_radius)
+        k, c = scenario.wall_stiffness, scenario.wall_dissipation
+        if self.inertia == 0.0:
+            series: NDArray[np.float64] = self.stiffness * k / (self.stiffness + k) * np.maximum(beyond, 0.0)
+            return series
+        fine = np.arange(clock[0], clock[-1], _STEP)
+        depths = np.interp(fine, clock, beyond).tolist()
+        speeds = np.interp(fine, clock, np.gradient(beyond, clock)).tolist()
+        x = rate = 0.0
+        forces = []
+        for depth, speed in zip(depths, speeds, strict=True):
+            push = max(0.0, k * max(0.0, depth + x) * (1.0 + c * (speed + rate)))
+            rate -= _STEP * (push + self.stiffness * x + self.damping * rate) / self.inertia
+            x += _STEP * rate
+            forces.append(push)
+        return np.interp(clock, fine, forces)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A press against the wall.
+
+    Attributes:
+        clock: since the begin of the motion, in s, (n,).
+        predicted, felt: force on the wall, in N, (n,).
+    """
+
+    clock: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    felt: NDArray[np.float64]
+
+    def at(self, clock: float) -> tuple[float, float]:
+        """Predicted and felt force at an instant."""
+        k = int(np.abs(self.clock - clock).argmin())
+        return float(self.predicted[k]), float(self.felt[k])
+
+
+def rms(values: NDArray[np.float64]) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def run_trial(runtime: Runtime, motions: Sequence[int] = PROGRAM, *, limit: float = 60.0) -> Track:
+    """Has the loop's DPS do the motions, until it is on its way home.
+
+    Raises:
+        TimeoutError: it is not after so many seconds' worth of cycles.
+    """
+    trial = Trial(runtime, motions)
+    runtime.run(until=trial, cycles=round(limit / runtime.period))
+    if not trial.done:
+        raise TimeoutError(f"the motions {', '.join(MOTIONS[motion] for motion in motions)} took longer than {limit} s")
+    return trial.track()
+
+
+def _positions(values: dict[str, Any], period: float) -> Any:
+    """(motion, clock, start, q) -> the tip's reference and the tip."""
+    model = ArmDynamics()
+    symbols: dict[str, Expression] = {
+        "motion": casadi.SX.sym("motion"),
+        "clock": casadi.SX.sym("clock"),
+        "start": casadi.SX.sym("start", JOINTS),
+        "q": casadi.SX.sym("q", JOINTS),
+    }
+    state = {**{name: symbols[name] for name in ("motion", "clock", "start")}, "reference": symbols["start"]}
+    given = {name: casadi.SX(np.atleast_1d(value)) for name, value in values.items()}
+    r = reference(symbols["motion"], symbols["q"], state, given, period=period)
+    wanted, tip = model.tip(r.q).p + r.dp, model.tip(symbols["q"]).p
+    return function("positions", symbols, {"wanted": wanted, "tip": tip})
