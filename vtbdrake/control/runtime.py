@@ -7,9 +7,8 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from math import floor, inf
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydrake.systems.framework import Context
 
@@ -25,8 +24,7 @@ from vtbdrake.testbed.switch import REAL
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Cycle:
+class Cycle(NamedTuple):
     """What happened in one cycle, for those who watch: a recorder, a plot.
 
     Attributes:
@@ -117,6 +115,7 @@ class Runtime:
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
         self._watched: Mapping[str, Reception] = {}
+        self._active: list[str] = []
         self.look()
 
     @property
@@ -147,6 +146,7 @@ class Runtime:
             until: asked after every cycle.
         """
         self._stop.clear()
+        self.look()
         begin = self.clock.now()
         deadline, done = begin, 0
         try:
@@ -185,12 +185,12 @@ class Runtime:
         if self._pace is not None:
             return self.clock.now()
         behind = floor((self.clock.now() - deadline) / self.period)
-        if behind >= 1:
-            # The one that is due just now can still be kept.
-            self.missed += behind
-            self.statistics.miss(behind)
-        self._missed_in_a_row = self._missed_in_a_row + behind if behind >= 1 else 0
-        return deadline + (max(behind, 0) + 1) * self.period
+        # The one that is due just now can still be kept.
+        behind = max(behind, 0)
+        self.missed += behind
+        self.statistics.miss(behind)
+        self._missed_in_a_row = self._missed_in_a_row + behind if behind else 0
+        return deadline + (behind + 1) * self.period
 
     def cycle(self, *, lateness: float = 0.0) -> Cycle:
         """One cycle, now."""
@@ -199,7 +199,7 @@ class Runtime:
         now = self.clock.now()
         self._serve()
         self.feed()
-        active = [] if self._idle else self._ports.active()
+        active = self._active
         fed = self.clock.now()
         error, commands = self._step(active)
         stepped = self.clock.now()
@@ -217,7 +217,7 @@ class Runtime:
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         done = Cycle(self.cycles, self.time, now, commands, verdict)
         self.cycles += 1
-        for watcher in list(self._watchers):
+        for watcher in self._watchers[:]:
             try:
                 watcher(done)
             except Exception:
@@ -244,8 +244,10 @@ class Runtime:
         self.look()
 
     def look(self) -> None:
-        """Looks which sensor signals are on real; they are watched."""
+        """Looks which signals are on real: sensor signals are watched, actuator signals commanded. To be called after a
+        switch was thrown by other means than `perform`, unless `run` or a `request` did."""
         sensed = self.bridge.sensed
+        self._active = [] if self._idle else self._ports.active()
         if isinstance(self.target, DpsAlone):
             self._watched = {} if self._idle else sensed
         else:
@@ -269,7 +271,7 @@ class Runtime:
     def _send_fallback(self, reason: str) -> None:
         verdict = self.guards.fault(reason, self.clock.now(), self._watched)
         if verdict.commands and not self._idle:
-            self.bridge.publish({name: verdict.commands[name] for name in self._ports.active()})
+            self.bridge.publish({name: verdict.commands[name] for name in self._active})
 
     # -- switches
 
@@ -303,12 +305,15 @@ class Runtime:
         return future
 
     def _serve(self) -> None:
+        if not self._requests:
+            return
         while self._requests:
             action, future = self._requests.popleft()
             try:
                 future.set_result(action())
             except Exception as error:
                 future.set_exception(error)
+        self.look()
 
     def reset(self) -> None:
         """Releases the latch of the guards; the DPS's commands go out again from the next cycle on.
