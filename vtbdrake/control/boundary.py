@@ -25,19 +25,21 @@ class RealPorts:
         self._inputs = {s.name: (s, diagram.GetInputPort(f"real.sense.{s.name}")) for s in interface.sense}
         self._outputs = {s.name: (s, diagram.GetOutputPort(f"real.act.{s.name}")) for s in interface.act}
         self._active = diagram.GetOutputPort("real.act.active") if interface.act else None
-        self._fixed: dict[str, Any] = {}
+        self._fixed: dict[str, tuple[bool, Any]] = {}
 
     def feed(self, name: str, value: Any) -> None:
         """Gives a sensor signal its newest value."""
-        if name in self._fixed:
-            data = self._fixed[name].GetMutableData()
-            if self._inputs[name][0].is_vector:
-                data.get_mutable_value().SetFromVector(value)
-            else:
-                data.set_value(value)
+        if name not in self._fixed:
+            signal, port = self._inputs[name]
+            fixed = port.FixValue(self._context, value if signal.is_vector else _wrapped(signal, value))
+            self._fixed[name] = (signal.is_vector, fixed)
             return
-        signal, port = self._inputs[name]
-        self._fixed[name] = port.FixValue(self._context, value if signal.is_vector else _wrapped(signal, value))
+        is_vector, fixed = self._fixed[name]
+        data = fixed.GetMutableData()
+        if is_vector:
+            data.get_mutable_value().SetFromVector(value)
+        else:
+            data.set_value(value)
 
     def active(self) -> list[str]:
         """The actuator signals that are on real; it asks the switches and not the DPS."""
