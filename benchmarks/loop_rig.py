@@ -10,6 +10,7 @@ from math import inf
 from typing import Any
 
 from diagrams.manipulator import ManipulatorScenario
+from diagrams.manipulator.arm import JOINTS
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.hub import Hub
@@ -25,6 +26,8 @@ HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 80, 75, 70
 PERIOD = 1e-3  # s
 WARM_UP = 200  # cycles before each round that do not count
 PATIENCE = 1.0  # s that a sensor signal may be old
+# Of the machine's joints, in N m s/rad: with so much of it, no stall of the loop lets it come to any harm.
+FRICTION = {"sim.act.drives.viscous": [40.0] * JOINTS}
 # From how far away (N m) the command may depart: the guards' rate limit takes it from there.
 CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
 
@@ -115,7 +118,8 @@ def loop_rig() -> Iterator[Rig]:
     scenario = ManipulatorScenario()
     with Hub(port=0, priority=HUB_PRIORITY) as hub:
         bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
-        with MachineProcess(scenario, hub.url, priority=MACHINE_PRIORITY, period=PERIOD) as machine:
+        machine_process = MachineProcess(scenario, hub.url, priority=MACHINE_PRIORITY, period=PERIOD, values=FRICTION)
+        with machine_process as machine:
             bridge.open()
             try:
                 with RealTime(priority=PRIORITY) as real_time:
