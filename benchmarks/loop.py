@@ -39,6 +39,10 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
     """The time from the machine's telling of its state to the arrival of a command, as the machine sees it, with the
     stripped DPS in lock-step with the states; in turns with a plain echo at the same rate through the same hub: a
     message of the state's size to another process, which does nothing but send it back. The machine runs throughout.
+
+    Raises:
+        RuntimeError: the answers come more than a period late, so that the machine takes them for those to the next
+            states: it would see less time than the controller needs.
     """
     states, echoes = Histogram(), []
     answered, told = 0, 0
@@ -52,6 +56,12 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
             answered += found.state_to_command.count
             told += found.loop.cycles
             echoes += _echoed(bus, cycles // rounds)
+    needed = runtime.statistics.histograms["cycle"].percentile(50.0)
+    if states.percentile(50.0) < needed:
+        raise RuntimeError(
+            f"the machine sees an answer after {1e6 * states.percentile(50.0):.0f} us, but it takes the controller "
+            f"{1e6 * needed:.0f} us: answers come more than a period late; measure where less else runs"
+        )
     note = (
         f"{_percentiles(states)}; {answered} answers to {told} states; echo: {_percentiles(_histogram(echoes))}; "
         f"{granted}"

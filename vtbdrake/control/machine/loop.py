@@ -47,7 +47,8 @@ class MachineLoop:
     Attributes:
         statistics: of its cycles; ``step`` is the simulation.
         state_to_command: from telling a state to the next command's arrival, in seconds; of states that are not
-            answered before the next one, the oldest counts.
+            answered before the next one, the oldest counts. A command does not say which state it answers: where all
+            answers come more than a period late, they are taken for those to the next state.
         lost: seconds of the clock that the simulation could not keep up with.
     """
 
@@ -125,6 +126,9 @@ class MachineLoop:
             for _ in range(int(min(steps, end - self.machine.cycle))):
                 self.machine.advance()
             stepped = self._clock.now()
+            if not lock_step:
+                # What came during the simulation answers the state before.
+                self._link.take(0.0, _BURST)
             self._tell()
             self._serve()
             self.statistics.record(lateness=woke - deadline, step=stepped - woke, cycle=self._clock.now() - woke)
