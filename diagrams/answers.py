@@ -20,6 +20,7 @@ from vtbdrake.cli.text import number, table
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
     "O4": "diagrams.space_climber.answers:payload",
+    "C1": "diagrams.manipulator.answers:control",
 }
 
 FILE = "answers.json"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from math import inf
 from typing import Any
 
 import casadi
@@ -52,7 +54,15 @@ class FloatInPlace:
         return torque
 
 
-def arm_guards(scenario: ManipulatorScenario, **options: Any) -> Guards:
-    """Guards that let the arm float in place after a fault; ``options`` are those of `Guards`."""
+def arm_guards(scenario: ManipulatorScenario, *, aging: bool = True, **options: Any) -> Guards:
+    """Guards that let the arm float in place after a fault.
+
+    Args:
+        aging: False where time stands still between two messages, in lock-step: sensor signals may be of any age.
+        options: those of `Guards`.
+    """
+    interface = scenario.interface()
+    if not aging:
+        interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
     fallback: Fallback = FallbackController(FloatInPlace(), otherwise=Zero())
-    return Guards(scenario.interface(), scenario.period, fallback={"joint_torque": fallback}, **options)
+    return Guards(interface, scenario.period, fallback={"joint_torque": fallback}, **options)

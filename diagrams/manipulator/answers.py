@@ -1,0 +1,162 @@
+"""The row C1 of the table of answers."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context
+
+from diagrams.answers import Answer
+from diagrams.manipulator.safety import arm_guards
+from diagrams.manipulator.scenario import ManipulatorScenario
+from diagrams.manipulator.trials import CONTINUITY, DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
+from vtbdrake.control.bridge import Bridge
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
+
+LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
+
+# The machine's masses, friction and the like are not those of the simulation.
+PERTURB, SEED = 0.05, 7
+
+# How well the tip is to follow its reference, RMS, in m; and how much worse on the machine than in simulation.
+TOLERANCE, RATIO = 0.005, 2.0
+
+# Cycles for which the whole testbed commands the machine, in the short version.
+COMPARED = 3000
+
+# Nothing but the machine's next message begins a cycle: it is waited for so many seconds.
+PATIENCE = 60.0
+
+
+@dataclass
+class Trials:
+    """Of one law: the same motions in simulation, and on the machine by the DPS alone.
+
+    Attributes:
+        compared: cycles in which the whole testbed commanded a machine of its own.
+        identical: whether the DPS alone commanded the same in these, bit for bit.
+        latched: why the guards did not let the DPS command all the time; empty if they did.
+    """
+
+    simulated: Track
+    real: Track
+    compared: int
+    identical: bool
+    latched: str
+
+
+def control(full: bool) -> Answer:
+    """How well does the arm do its motions, on the machine and in the simulation that they were developed in?
+
+    In lock-step with the machine's process: however busy this computer is, the answer is the same. The short version
+    compares testbed and stripped DPS for the first `COMPARED` cycles, the long one for all.
+    """
+    trials = {name: _trials(law, full) for name, law in LAWS.items()}
+    errors = {name: (rms(trial.simulated.errors()), rms(trial.real.errors())) for name, trial in trials.items()}
+    followed = all(real <= min(TOLERANCE, RATIO * simulated) for simulated, real in errors.values())
+    commanded = all(trial.identical and not trial.latched for trial in trials.values())
+    cycles = sum(trial.compared for trial in trials.values())
+    same = "identical" if all(trial.identical for trial in trials.values()) else "DIFFERENT"
+    latched = "; ".join(trial.latched for trial in trials.values() if trial.latched)
+    return Answer(
+        id="C1",
+        question="How well does an arm follow its motions when the switches of its testbed are thrown to the machine?",
+        answer=", ".join(f"{name} {1e3 * real:.2f} mm" for name, (_, real) in errors.items()),
+        unit="(RMS of the tip, machine)",
+        interval=None,
+        paper="done with a real arm, 1 ms; no figures",
+        holds=followed and commanded,
+        note=(
+            "in simulation "
+            + ", ".join(f"{name} {1e3 * simulated:.2f} mm" for name, (simulated, _) in errors.items())
+            + f"; the machine is perturbed by up to {PERTURB:.0%}. Commands of testbed and DPS alone: {same} in "
+            + f"{cycles} cycles. "
+            + (f"The guards latched: {latched}." if latched else "The guards never latched.")
+        ),
+    )
+
+
+def _trials(law: str, full: bool) -> Trials:
+    scenario = trial_scenario(law)
+    testbed, alone = scenario.build(), DpsAlone(scenario)
+    context = testbed.default_context()
+    testbed.write(context, DURATIONS)
+    with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
+        bridge = _bridge(scenario, hub)
+        simulation = Runtime(testbed, bridge, context=context, clock=SimulatedClock())
+        simulated = run_trial(simulation)
+        bridge.close()
+        stripped = alone.continue_from(testbed, simulation.context)
+        with _Real(scenario, hub, testbed, simulation.context) as whole:
+            whole.loop.run(until=Trial(whole.loop, PROGRAM), cycles=None if full else COMPARED)
+        with _Real(scenario, hub, alone, stripped) as real:
+            track = run_trial(real.loop)
+    compared = min(len(whole.commands), len(real.commands))
+    return Trials(
+        simulated,
+        track,
+        compared,
+        np.array_equal(whole.commands[:compared], real.commands[:compared]),
+        "; ".join(fault.reason for fault in (*whole.loop.guards.latched, *real.loop.guards.latched)),
+    )
+
+
+def _bridge(scenario: ManipulatorScenario, hub: Hub) -> Bridge:
+    bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
+    bridge.open()
+    return bridge
+
+
+class _Real:
+    """A machine, and a loop in lock-step with it whose switches are on real.
+
+    Attributes:
+        loop: the machine waits for its next command.
+        commands: all that was sent.
+    """
+
+    def __init__(
+        self, scenario: ManipulatorScenario, hub: Hub, target: VirtualTestbed | DpsAlone, context: Context
+    ) -> None:
+        self.commands: list[NDArray[np.float64]] = []
+        self._bridge = _bridge(scenario, hub)
+        self._machine = MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED)
+        self.loop = Runtime(
+            target,
+            self._bridge,
+            context=context,
+            guards=arm_guards(scenario, aging=False, max_missed=inf),
+            # The last message of a cycle: all the others are there.
+            pace="wrench",
+            patience=PATIENCE / scenario.period,
+            continuity=CONTINUITY,
+            watchers=(self._take_down,),
+        )
+
+    def __enter__(self) -> _Real:
+        self._machine.start()
+        deadline = time.monotonic() + PATIENCE
+        while not all(reception.count for reception in self._bridge.sensed.values()):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the machine has not told its state in {PATIENCE:g} s")
+            self._bridge.poll(1.0)
+        self.loop.switch("real")
+        # A first command begins the exchange.
+        self.loop.cycle()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._machine.close()
+        self._bridge.close()
+
+    def _take_down(self, cycle: Cycle) -> None:
+        self.commands.append(cycle.verdict.commands["joint_torque"].copy())

@@ -1,0 +1,68 @@
+"""What is taken down of a trial, against the plant's own poses and the definition of the motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diagrams.manipulator.arm import Arm
+from diagrams.manipulator.motions import CIRCLE
+from diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.runtime import Runtime
+
+SCENARIO = trial_scenario("admittance")
+
+
+@pytest.fixture(scope="module")
+def circle() -> Track:
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    testbed.write(context, DURATIONS)
+    bridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), "memq://")
+    bridge.open()
+    loop = Runtime(testbed, bridge, context=context, clock=SimulatedClock())
+    track = run_trial(loop, (CIRCLE,))
+    bridge.close()
+    return track
+
+
+def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
+    during = circle.motion == CIRCLE
+    x = circle.clock[during] / DURATIONS["dps.impl.circle_duration"]
+    angle = 2 * np.pi * x**3 * (10 - 15 * x + 6 * x**2)
+    radius = 0.1
+    start = circle.wanted[0]
+    expected = start + radius * np.column_stack([0 * angle, np.sin(angle), 1 - np.cos(angle)])
+    np.testing.assert_allclose(circle.wanted[during], expected, atol=1e-6)
+    assert during.sum() > 400
+
+
+def test_errors_are_the_distances_from_it(circle: Track) -> None:
+    errors = circle.errors((CIRCLE,))
+    assert 1e-5 < errors.max() < 0.002
+    nearest = np.linalg.norm(circle.tip - circle.wanted, axis=1)[circle.motion == CIRCLE]
+    np.testing.assert_array_equal(errors, nearest)
+
+
+def test_statics_against_the_wall_are_those_of_two_springs() -> None:
+    clock = np.linspace(0.0, 4.0, 401)
+    wall = SCENARIO.wall_distance - Arm().ball_radius
+    wanted = wall + 0.05 * np.clip(clock - 1.0, 0.0, 1.0)
+    K, k = 500.0, SCENARIO.wall_stiffness
+    expected = 0.05 * K * k / (K + k)
+    for inertia in (0.0, 8.0):
+        force = LawAlongX(inertia, 160.0, K).force(clock, wanted, SCENARIO)
+        assert (force[:100] == 0.0).all()
+        assert force[-1] == pytest.approx(expected, rel=1e-3)
+
+
+def test_trial_that_does_not_end_is_told() -> None:
+    testbed = SCENARIO.build()
+    bridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), "memq://")
+    bridge.open()
+    loop = Runtime(testbed, bridge, clock=SimulatedClock())
+    with pytest.raises(TimeoutError, match="circle"):
+        run_trial(loop, (CIRCLE,), limit=0.1)
+    bridge.close()
