@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import le
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from vtbdrake.testbed import Signal
 
 _LARGEST_FLOAT = float(np.finfo(float).max)
 
-# Up to this size a loop over floats is quicker than numpy's calls.
+# Up to this size Python's floats are quicker than numpy's calls.
 _SMALL = 32
 
 
@@ -97,10 +98,8 @@ class Watchdog:
     def _is_within(self, value: np.ndarray) -> bool:
         if value.size > _SMALL:
             return bool(((value >= self._lower) & (value <= self._upper)).all())
-        for entry, lower, upper in zip(value.tolist(), *self._bounds, strict=True):  # noqa: SIM110 - all() takes longer
-            if not lower <= entry <= upper:
-                return False
-        return True
+        entries, (lower, upper) = value.tolist(), self._bounds
+        return all(map(le, lower, entries)) and all(map(le, entries, upper))
 
     def _jump(self, now: float, reception: Reception, value: np.ndarray) -> Fault | None:
         before, since = self._value, reception.arrived - self._arrived
