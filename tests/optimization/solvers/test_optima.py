@@ -98,7 +98,7 @@ def test_a_mixed_problem_agrees_with_brute_force(name):
 
 
 def test_a_categorical_parameter_is_chosen_rightly():
-    space = (Choice("kind", ["up", "down", "left"]), Parameter("x", 0.0, 1.0), Choice("flag", [True, 1, 2.5]))
+    space = (Choice("kind", ["up", "down", "left"]), Parameter("x", 0.0, 1.0), Choice("flag", [True, 0, 2.5]))
 
     def cost(p):
         kind, x, flag = p
