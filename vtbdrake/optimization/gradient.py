@@ -31,10 +31,11 @@ class Gradients:
                 raise SolverError(f"there is no derivative by {parameter.address}: use gradient='central'")
         self._problem = problem
         self._addresses = [parameter.address for parameter in problem.parameters]
-        self._runners = []
-        for condition in problem.conditions:
-            scenario = problem.scenario.with_fields(split(condition)[0])
-            self._runners.append(DerivativeRunner(replace(problem.task, scenario=scenario), scenario.build()))
+        placed = [problem.placed(problem.task, condition) for condition in problem.conditions]
+        # To convert a testbed takes longer than to simulate it: most conditions share one.
+        distinct = {id(testbed): (task, testbed) for task, testbed in placed}
+        runners = {key: DerivativeRunner(*pair) for key, pair in distinct.items()}
+        self._runners = [runners[id(testbed)] for _, testbed in placed]
 
     def at(self, point: Point) -> tuple[float, ...]:
         """The gradient of the value that a solver is told, larger being better, shape (n,)."""

@@ -29,6 +29,9 @@ class Judge:
         racing: drop a point as soon as it can no longer be better than the best one known, whatever the conditions
             that it has not seen would say. It never drops the winner: the risk does not fall when a quality rises,
             and the best that a quality can be is `Quality.upper` (of a cost, 0).
+
+    Attributes:
+        best: the best evaluation so far; None where there are several qualities.
     """
 
     def __init__(
@@ -44,8 +47,7 @@ class Judge:
         self._racing = racing and len(problem.conditions) > 1
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
-        self._incumbent: Point | None = None
-        self._best = -inf
+        self.best: Evaluation | None = None
 
     def judge(self, points: Sequence[Point]) -> list[Evaluation]:
         """One evaluation per point, in their order."""
@@ -55,8 +57,8 @@ class Judge:
         else:
             self._complete([(point, condition) for point in distinct for condition in self._conditions])
             evaluations = {point: self.evaluation(point) for point in distinct}
-        for point, evaluation in evaluations.items():
-            self._remember(point, evaluation)
+        for evaluation in evaluations.values():
+            self._remember(evaluation)
         return [evaluations[point] for point in points]
 
     def _complete(self, rows: Sequence[Row]) -> None:
@@ -66,7 +68,7 @@ class Judge:
 
     def _race(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
         """In each round, only the conditions of the rounds so far count: an interrupted study may know more."""
-        if self._incumbent is None and len(points) > 1:
+        if self.best is None and len(points) > 1:
             self._find_incumbent(points)
         order = self._order()
         evaluations: dict[Point, Evaluation] = {}
@@ -81,35 +83,32 @@ class Judge:
         return evaluations
 
     def _find_incumbent(self, points: Sequence[Point]) -> None:
-        """The point that does best in the first condition meets the others too, so that the rest can be held against
-        it."""
+        """Lets the point that does best in the first condition meet the others too: the rest is held against it."""
         first = list(self._conditions)[:1]
         self._complete([(point, condition) for point in points for condition in first])
         leads = [evaluation for point in points if (evaluation := self.evaluation(point, first)).feasible]
         if leads:
             leader = max(leads, key=lambda evaluation: evaluation.values[0]).point
             self._complete([(leader, condition) for condition in self._conditions])
-            self._remember(leader, self.evaluation(leader))
+            self._remember(self.evaluation(leader))
 
     def _order(self) -> list[int]:
         """The conditions, those first in which the best point fares worst: they tell most."""
-        if self._incumbent is None:
+        if self.best is None:
             return list(self._conditions)
-        h = [self._known[self._incumbent, condition].value * self._signs[0] for condition in self._conditions]
+        h = [self._known[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
         return sorted(self._conditions, key=lambda condition: h[condition])
 
     def _lost(self, evaluation: Evaluation) -> bool:
         """Whether a point, judged by a bound from above, cannot become the best."""
         if evaluation.failed:
             return True
-        if self._incumbent is None or evaluation.point == self._incumbent:
+        if self.best is None or evaluation.point == self.best.point:
             return False
-        return not evaluation.feasible or evaluation.values[0] <= self._best
+        return not evaluation.feasible or evaluation.values[0] <= self.best.values[0]
 
     def evaluation(self, point: Point, conditions: Collection[int] | None = None) -> Evaluation:
-        """What the known outcomes of a point say, or those under some conditions; what it has not seen counts as the
-        best that could be.
-        """
+        """What the known outcomes of a point say, or those under some conditions; others count as the best possible."""
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
         seen = [outcome for outcome in outcomes if outcome is not None]
@@ -135,6 +134,8 @@ class Judge:
         # Adding 0 makes 0 of -0.
         return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
 
-    def _remember(self, point: Point, evaluation: Evaluation) -> None:
-        if len(self._signs) == 1 and evaluation.exact and evaluation.feasible and evaluation.values[0] > self._best:
-            self._incumbent, self._best = point, evaluation.values[0]
+    def _remember(self, evaluation: Evaluation) -> None:
+        if len(self._signs) > 1 or not evaluation.counts:
+            return
+        if self.best is None or evaluation.values[0] > self.best.values[0]:
+            self.best = evaluation

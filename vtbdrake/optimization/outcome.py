@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any
 
-from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.solvers.solver import Judged, Point
 from vtbdrake.rollout import RolloutResult
 
 # (point, number of the condition)
@@ -33,7 +32,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Trial(Judged):
     """A point s^0 of a study, and how good it is.
 
     Attributes:
@@ -61,12 +60,3 @@ class Trial:
     def value(self) -> float:
         """Of the first quality."""
         return self.values[0]
-
-    @property
-    def failed(self) -> bool:
-        return not all(isfinite(value) for value in self.values)
-
-    @property
-    def feasible(self) -> bool:
-        """Whether it has a value and keeps all constraints."""
-        return not self.failed and all(violation <= 0.0 for violation in self.violations)

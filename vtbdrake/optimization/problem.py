@@ -175,8 +175,12 @@ class Problem:
         return Motion(runner.task.scenario, result.times, result.record["plant.state"])
 
     def _runner(self, task: RolloutTask, parameters: Mapping[str, Any]) -> RolloutRunner:
-        scenario = self._scenario(parameters)
-        return RolloutRunner(replace(task, scenario=scenario), self._testbeds.get(scenario))
+        return RolloutRunner(*self.placed(task, parameters))
+
+    def placed(self, task: RolloutTask, values: Mapping[str, Any]) -> tuple[RolloutTask, VirtualTestbed]:
+        """The task and the testbed for ``values`` (address -> value), which may set fields of the scenario."""
+        scenario = self._scenario(values)
+        return replace(task, scenario=scenario), self._testbeds.get(scenario)
 
     def sweep(
         self,

@@ -125,21 +125,22 @@ class StudyRecord:
         """
         if len(self.directions) > 1:
             raise ValueError("of several qualities there is no best point: ask for pareto()")
-        found = [trial for trial in self.trials if trial.exact and trial.feasible]
+        found = [trial for trial in self.trials if trial.counts]
         if not found:
             kept = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
             raise ValueError(f"no point has a quality{kept}{self._why()}")
-        sign = self._signs[0]
+        sign = self.signs[0]
         return max(found, key=lambda trial: sign * trial.value)
 
     def pareto(self) -> tuple[Trial, ...]:
         """The points that no other point beats in one quality without losing in another."""
-        found = [trial for trial in self.trials if trial.exact and trial.feasible]
-        signed = {t.number: [s * v for s, v in zip(self._signs, t.values, strict=True)] for t in found}
+        found = [trial for trial in self.trials if trial.counts]
+        signed = {t.number: [s * v for s, v in zip(self.signs, t.values, strict=True)] for t in found}
         return tuple(t for t in found if not any(_dominates(signed[o.number], signed[t.number]) for o in found))
 
     @property
-    def _signs(self) -> tuple[float, ...]:
+    def signs(self) -> tuple[float, ...]:
+        """1 for a quality, -1 for a cost."""
         return tuple(-1.0 if direction == "minimize" else 1.0 for direction in self.directions)
 
     def _why(self) -> str:

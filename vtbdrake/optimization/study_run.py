@@ -31,11 +31,7 @@ class _SpentError(Exception):
 
 
 class StudyRun:
-    """Runs a study in a file once.
-
-    Args:
-        known: what the file holds is told to the solver first, batch by batch as it was found.
-    """
+    """Runs a study in a file once. What the file holds is told to the solver first, batch by batch as it was found."""
 
     def __init__(
         self, file: StudyFile, problem: Problem, solver: Solver, executor: Executor, *, racing: bool, progress: bool
@@ -54,7 +50,6 @@ class StudyRun:
         self._limit: float = inf
         self._deadline = inf
         self._target: float | None = None
-        self._best = -inf
 
     def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
         """Runs; returns why it ended, in a word and in a sentence."""
@@ -100,18 +95,17 @@ class StudyRun:
             if batch >= self._told:
                 self._record(batch, evaluations, len(asked), method, ended=True)
                 silent = 0 if len(self._known) > before else silent + 1
-            self._show(evaluations)
+            self._show()
             batch += 1
 
     def _resume(self) -> int:
-        """The batch to begin with. A solver that can be told again begins where the study did, others where it
-        stands."""
+        """The batch to begin with: the first for a solver that can be told again, else the one where the study is."""
         if self._solver.reproducible or not self._told:
             return 0
         points = list(dict.fromkeys(row[2] for row in self._file.trials()))
         evaluations = self._judge.judge(points)
         self._solver.tell(evaluations)
-        self._show(evaluations)
+        self._show()
         return self._told
 
     def _solvers_end(self) -> str:
@@ -153,7 +147,7 @@ class StudyRun:
             return
         for point in points:
             evaluation = self._judge.evaluation(point)
-            if evaluation.exact and evaluation.feasible and evaluation.values[0] >= self._target:
+            if evaluation.counts and evaluation.values[0] >= self._target:
                 (value,) = self._judge.in_the_users_terms(evaluation)
                 raise _SpentError(TARGET, f"the target is reached: {value:g}")
 
@@ -179,17 +173,11 @@ class StudyRun:
         ]
         self._file.save_trials(rows, told=batch + 1 if ended else None)
 
-    def _show(self, evaluations: Sequence[Evaluation]) -> None:
-        for evaluation in evaluations:
-            if (
-                len(evaluation.values) == 1
-                and evaluation.exact
-                and evaluation.feasible
-                and evaluation.values[0] > self._best
-            ):
-                self._best = evaluation.values[0]
-                assert self._bar is not None
-                self._bar.set_postfix_str(f"best {self._judge.in_the_users_terms(evaluation)[0]:.6g}", refresh=False)
+    def _show(self) -> None:
+        if self._judge.best is not None:
+            assert self._bar is not None
+            (value,) = self._judge.in_the_users_terms(self._judge.best)
+            self._bar.set_postfix_str(f"best {value:.6g}", refresh=False)
 
 
 def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:

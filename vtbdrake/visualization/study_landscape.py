@@ -26,7 +26,6 @@ from vtbdrake.visualization.study_points import (
     point_keys,
     quality_label,
     scales,
-    signs,
     values,
 )
 
@@ -91,7 +90,7 @@ def _draw_line(
     """Returns legend entries."""
     draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
     axes.set_ylabel(quality_label(study, quality))
-    best = points.best_at(lambda trials: scale.places(trials)[:, None], quality, signs(study)[quality])
+    best = points.best_at(lambda trials: scale.places(trials)[:, None], quality, study.signs[quality])
     handles: list[Artist] = []
     # Where nearly every point has a place of its own, the best at each is no curve.
     if not isinstance(scale.dimension, Choice) and (not others or 2 * len(best.known) <= len(points.known)):
@@ -114,7 +113,7 @@ def _draw_surface(
     axes: Axes, study: StudyRecord, points: Points, x: Scale, y: Scale, *, quality: int, others: int
 ) -> list[Artist]:
     """Returns legend entries."""
-    sign = signs(study)[quality]
+    sign = study.signs[quality]
     # Bright is good.
     style: dict[str, Any] = {"cmap": colormaps["viridis" if sign > 0.0 else "viridis_r"]}
 

@@ -27,7 +27,6 @@ from vtbdrake.visualization.study_points import (
     point_keys,
     quality_label,
     scales,
-    signs,
     values,
 )
 
@@ -66,7 +65,7 @@ def plot_history(study: StudyRecord) -> Figure:
         )
         if points.kept:
             numbers = np.array([trial.number for trial in points.kept])
-            best = signs(study)[quality] * np.maximum.accumulate(signs(study)[quality] * values(points.kept, quality))
+            best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.kept, quality))
             # What was best at the end stays so up to the last point.
             axes.plot(
                 [*numbers, trials[-1].number],
@@ -182,7 +181,7 @@ def plot_pareto(study: StudyRecord) -> Figure:
             markeredgewidth=0.6,
             linestyle="-" if count == 2 else "none",
             linewidth=1.0,
-            drawstyle="steps-pre" if signs(study)[i] > 0.0 else "steps-post",
+            drawstyle="steps-pre" if study.signs[i] > 0.0 else "steps-post",
             zorder=4,
             gid="front",
         )

@@ -79,7 +79,7 @@ class Points:
 
     def best(self, study: StudyRecord, quality: int) -> Trial | None:
         """The best in one quality; None if no point keeps the constraints."""
-        sign = signs(study)[quality]
+        sign = study.signs[quality]
         return max(self.kept, key=lambda trial: sign * trial.values[quality], default=None)
 
 
@@ -90,11 +90,6 @@ def _kind(trial: Trial) -> str:
     if not trial.exact:
         return "dropped"
     return "kept" if trial.feasible else "broken"
-
-
-def signs(study: StudyRecord) -> tuple[float, ...]:
-    """1 for a quality, -1 for a cost."""
-    return tuple(1.0 if direction == "maximize" else -1.0 for direction in study.directions)
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
@@ -253,7 +248,7 @@ def point_keys(study: StudyRecord, points: Points) -> list[Line2D]:
 
 def _dropped_style(study: StudyRecord, quality: int) -> dict[str, Any]:
     # It points to where the value may be.
-    return {**_DROPPED_STYLE, "marker": "v" if signs(study)[quality] > 0.0 else "^"}
+    return {**_DROPPED_STYLE, "marker": "v" if study.signs[quality] > 0.0 else "^"}
 
 
 def _marks(

@@ -16,8 +16,30 @@ class SolverError(ValueError):
     """A solver that is unknown, or cannot solve the problem."""
 
 
+class Judged:
+    """What can be said of anything with values and violations; see `Evaluation`."""
+
+    values: tuple[float, ...]
+    violations: tuple[float, ...]
+    exact: bool
+
+    @property
+    def failed(self) -> bool:
+        return not all(isfinite(value) for value in self.values)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it has a value and keeps all constraints."""
+        return not self.failed and all(violation <= 0.0 for violation in self.violations)
+
+    @property
+    def counts(self) -> bool:
+        """Whether it can be the best: it is feasible, and its values are no mere bounds."""
+        return self.exact and self.feasible
+
+
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Judged):
     """How good a point is.
 
     Attributes:
@@ -34,15 +56,6 @@ class Evaluation:
     violations: tuple[float, ...] = ()
     gradient: tuple[float, ...] | None = None
     exact: bool = True
-
-    @property
-    def failed(self) -> bool:
-        return not all(isfinite(value) for value in self.values)
-
-    @property
-    def feasible(self) -> bool:
-        """Whether it has a value and keeps all constraints."""
-        return not self.failed and all(violation <= 0.0 for violation in self.violations)
 
 
 class Solver(ABC):
