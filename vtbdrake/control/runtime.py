@@ -69,7 +69,6 @@ class Runtime:
 
     Attributes:
         cycles: how many there were.
-        missed: how many were left out.
     """
 
     def __init__(
@@ -101,9 +100,7 @@ class Runtime:
         self.continuity = dict(continuity or {})
         self.ready = ready
         self.cycles = 0
-        self.missed = 0
         self._steps = 0
-        self._missed_in_a_row = 0
         self._pace = pace
         self._patience = patience * period
         self._watchers = list(watchers)
@@ -128,6 +125,11 @@ class Runtime:
         """The DPS's time in seconds."""
         return float(self._context.get_time())
 
+    @property
+    def missed(self) -> int:
+        """How many cycles were left out."""
+        return self.statistics.misses
+
     # -- the loop
 
     def run(
@@ -137,8 +139,7 @@ class Runtime:
         seconds: float | None = None,
         until: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Runs cycles until there were enough, or `stop` is called. Ctrl-C sends the fallback commands once, and ends
-        it.
+        """Runs cycles until there were enough, or `stop` is called. Ctrl-C sends the fallback commands once.
 
         Args:
             cycles: how many.
@@ -184,12 +185,9 @@ class Runtime:
         """The next deadline; those that have passed already are left out and counted."""
         if self._pace is not None:
             return self.clock.now()
-        behind = floor((self.clock.now() - deadline) / self.period)
         # The one that is due just now can still be kept.
-        behind = max(behind, 0)
-        self.missed += behind
+        behind = max(floor((self.clock.now() - deadline) / self.period), 0)
         self.statistics.miss(behind)
-        self._missed_in_a_row = self._missed_in_a_row + behind if behind else 0
         return deadline + (behind + 1) * self.period
 
     def cycle(self, *, lateness: float = 0.0) -> Cycle:
@@ -209,7 +207,7 @@ class Runtime:
             commands,
             active,
             error=error,
-            missed=self._missed_in_a_row,
+            missed=self.statistics.run,
             not_ready=self.ready() if active else None,
         )
         if verdict.commands:
@@ -244,8 +242,10 @@ class Runtime:
         self.look()
 
     def look(self) -> None:
-        """Looks which signals are on real: sensor signals are watched, actuator signals commanded. To be called after a
-        switch was thrown by other means than `perform`, unless `run` or a `request` did."""
+        """Looks which signals are on real: sensor signals are watched, actuator signals commanded.
+
+        To be called after a switch was thrown by other means than `perform`, unless `run` or a `request` did.
+        """
         sensed = self.bridge.sensed
         self._active = [] if self._idle else self._ports.active()
         if isinstance(self.target, DpsAlone):
@@ -261,8 +261,7 @@ class Runtime:
                 self._ports.feed(name, reception.value)
 
     def command(self, name: str) -> Any:
-        """What the DPS would command now for an actuator signal, wherever its switch stands; None if it has not
-        begun."""
+        """What the DPS would command now, wherever the signal's switch stands; None if the DPS has not begun."""
         if self._idle:
             return None
         port = self.target.dps.GetOutputPort(name)
@@ -270,14 +269,15 @@ class Runtime:
 
     def _send_fallback(self, reason: str) -> None:
         verdict = self.guards.fault(reason, self.clock.now(), self._watched)
-        if verdict.commands and not self._idle:
-            self.bridge.publish({name: verdict.commands[name] for name in self._active})
+        # The guards know what was on real in the last cycle, and give nothing for a signal that has not been commanded.
+        farewell = {name: command for name, command in verdict.commands.items() if name in self._active}
+        if farewell:
+            self.bridge.publish(farewell)
 
     # -- switches
 
     def prepare(self, mode: str | None = None, **sides: Any) -> Preparation:
-        """First phase: looks whether switches can be thrown, and changes nothing; arguments as
-        `VirtualTestbed.switch`."""
+        """First phase: whether switches (as of `VirtualTestbed.switch`) can be thrown; changes nothing."""
         return prepare(self, mode, **sides)
 
     def perform(self, preparation: Preparation) -> None:
