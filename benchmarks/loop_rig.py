@@ -12,12 +12,13 @@ from typing import Any
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import JOINTS
 from vtbdrake.control.bridge import Bridge
+from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.machine import MachineProcess
 from vtbdrake.control.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
-from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
 HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 80, 75, 70

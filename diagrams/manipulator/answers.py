@@ -16,10 +16,11 @@ from diagrams.manipulator.scenario import ManipulatorScenario
 from diagrams.manipulator.trials import CONTINUITY, DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.machine import MachineProcess
 from vtbdrake.control.protocol import protocol_of
-from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}

@@ -16,12 +16,13 @@ from diagrams.manipulator.safety import arm_guards
 from diagrams.manipulator.trials import CONTINUITY, DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.machine import MachineProcess
 from vtbdrake.control.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
-from vtbdrake.control.runtime import Cycle, Runtime
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.testbed import DpsAlone
 

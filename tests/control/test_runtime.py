@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from vtbdrake.control.bridge import Reception
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
@@ -260,3 +261,42 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     clock = SimulatedClock()
     with pytest.raises(ValueError, match=message):
         Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)
+
+
+def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
+    cycles = []
+    runtime, _, _ = make(watchers=(cycles.append,), continuity={"velocity": ("speed", 5.0)})
+    runtime.cycle()
+    runtime.switch("real")
+    runtime.write({"u.target": [0.1, 0.1]})
+    runtime.cycle()
+    runtime.guards.fault("told", runtime.clock.now(), {})
+    runtime.reset()
+    runtime.cycle()
+    switch, write = cycles[1].changes
+    assert switch.kind == "switch"
+    assert switch.values == {"sense.position": "real", "sense.speed": "real", "act.velocity": "real"}
+    assert write.kind == "write" and write.values == {"u.target": [0.1, 0.1]}
+    assert [change.kind for change in cycles[2].changes] == ["reset"]
+    assert cycles[0].changes == ()
+    assert np.array_equal(cycles[0].fed["position"], [0.05, 0.0])
+
+
+def test_commands_u_that_come_by_the_bridge_reach_the_dps_and_those_that_the_dps_refuses_are_counted():
+    runtime, bridge, _ = make()
+    bridge.commanded["target"] = Reception()
+    runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
+    bridge.commanded["target"].value, bridge.commanded["target"].count = np.array([0.3, 0.2]), 1
+    runtime.cycle()
+    assert np.array_equal(runtime.target.read(runtime.context, "u.target"), [0.3, 0.2])
+    bridge.commanded["target"].value, bridge.commanded["target"].count = np.array([np.nan, 0.2]), 2
+    done = runtime.cycle()
+    assert done.changes == () and bridge.commanded["target"].rejected == {"refused": 1}
+    assert np.array_equal(runtime.target.read(runtime.context, "u.target"), [0.3, 0.2])
+
+
+@pytest.mark.parametrize("address", ["T_act.velocity", "T_sense.speed", "time"])
+def test_switches_and_time_are_not_written(address):
+    runtime, _, _ = make()
+    with pytest.raises(ValueError, match="switch"):
+        runtime.write({address: 1.0})

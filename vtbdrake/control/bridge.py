@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any
@@ -53,11 +53,14 @@ class Bridge(ABC):
         interface: the DPS's signals.
         sensed: reception of each sensor signal, by name.
         commanded: reception of each command u that comes from outside, by name.
+        tap: called with channel and bytes of every message that comes or has left, by a bridge that has such; it must
+            not raise, and costs the loop's time.
     """
 
     interface: Interface
     sensed: dict[str, Reception]
     commanded: dict[str, Reception]
+    tap: Callable[[str, bytes], None] | None = None
 
     @abstractmethod
     def open(self) -> None:

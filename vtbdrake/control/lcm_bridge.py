@@ -99,7 +99,7 @@ class LcmBridge(Bridge):
         if watch is None:
             watch = url.startswith(_OPEN_TO_ALL)
         self._watches = {map.channel: CommandWatch(on_alarm) for map in act} if watch else {}
-        handlers: dict[str, Handler] = {inlet.channel: inlet.take for inlet in self._inlets}
+        handlers: dict[str, Handler] = {inlet.channel: self._tapped(inlet) for inlet in self._inlets}
         handlers |= {channel: watch.take for channel, watch in self._watches.items()}
         self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
 
@@ -150,7 +150,18 @@ class LcmBridge(Bridge):
             watch = self._watches.get(outlet.channel)
             if watch is not None:
                 watch.expect(data)
-            outlet.count(self._link.publish(outlet.channel, data))
+            sent = self._link.publish(outlet.channel, data)
+            outlet.count(sent)
+            if sent and self.tap is not None:
+                self.tap(outlet.channel, data)
+
+    def _tapped(self, inlet: Inlet) -> Handler:
+        def take(channel: str, data: bytes) -> None:
+            if self.tap is not None:
+                self.tap(channel, data)
+            inlet.take(channel, data)
+
+        return take
 
     def take_over(self) -> None:
         """Asks a hub for the command channels that it protects; it grants those whose owner has fallen silent.

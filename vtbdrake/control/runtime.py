@@ -8,38 +8,22 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from math import floor, inf
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.bridge import Bridge, Reception
 from vtbdrake.control.clock import Clock, WallClock
-from vtbdrake.control.guard import Guards, Verdict
+from vtbdrake.control.cycle import RESET, WRITE, Change, Cycle
+from vtbdrake.control.guard import Guards
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
-from vtbdrake.testbed.switch import REAL
+from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
 
 _log = logging.getLogger(__name__)
-
-
-class Cycle(NamedTuple):
-    """What happened in one cycle, for those who watch: a recorder, a plot.
-
-    Attributes:
-        number: of the cycle, from 0.
-        time: of the DPS, in seconds, at the end of the cycle.
-        now: on the runtime's clock, when the cycle's messages had been taken in.
-        commands: what the DPS commanded, by signal; empty if it raised.
-        verdict: what the guards made of it; `Verdict.commands` is what was sent.
-    """
-
-    number: int
-    time: float
-    now: float
-    commands: Mapping[str, Any]
-    verdict: Verdict
 
 
 class Runtime:
@@ -113,6 +97,14 @@ class Runtime:
         self._stop = threading.Event()
         self._watched: Mapping[str, Reception] = {}
         self._active: list[str] = []
+        self._changes: list[Change] = []
+        self._fed: dict[str, Any] = {}
+        # How many of each signal's values are known: what is counted beyond that is new.
+        self._sensed = dict.fromkeys(bridge.sensed, 0)
+        self._commanded = dict.fromkeys(bridge.commanded, 0)
+        for name in bridge.commanded:
+            if f"{COMMAND}{name}" not in target.variables():
+                raise ValueError(f"the command {name} comes from inside the testbed, the bridge cannot give it as well")
         self.look()
 
     @property
@@ -196,6 +188,8 @@ class Runtime:
         self.bridge.poll()
         now = self.clock.now()
         self._serve()
+        if self._commanded:
+            self._take_commands()
         self.feed()
         active = self._active
         fed = self.clock.now()
@@ -213,7 +207,9 @@ class Runtime:
         if verdict.commands:
             self.bridge.publish(verdict.commands)
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
-        done = Cycle(self.cycles, self.time, now, commands, verdict)
+        done = Cycle(self.cycles, self.time, now, tuple(self._changes), self._fed, commands, verdict)
+        self._changes.clear()
+        self._fed = {}
         self.cycles += 1
         for watcher in self._watchers[:]:
             try:
@@ -255,10 +251,40 @@ class Runtime:
             self._watched = {name: sensed[name] for name, position in positions.items() if position == REAL}
 
     def feed(self) -> None:
-        """Gives the newest samples to the DPS's real ports."""
+        """Gives samples that are new to the DPS's real ports."""
         for name, reception in self.bridge.sensed.items():
-            if reception.value is not None:
+            if reception.count != self._sensed[name]:
+                self._sensed[name] = reception.count
                 self._ports.feed(name, reception.value)
+                self._fed[name] = reception.value
+
+    def _take_commands(self) -> None:
+        for name, reception in self.bridge.commanded.items():
+            if reception.count != self._commanded[name]:
+                self._commanded[name] = reception.count
+                address = f"{COMMAND}{name}"
+                try:
+                    self.write({address: np.reshape(reception.value, self.target.variables()[address].shape)})
+                except ValueError:
+                    reception.reject("refused")
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Sets variables by address, in the thread that runs the cycles, or between them; from another one by
+        `request`.
+
+        Raises:
+            ValueError: an address is unknown or a value impossible (nothing has changed), or it is the time or a
+                switch.
+        """
+        for address in values:
+            if address == "time" or address.startswith((T_SENSE, T_ACT)):
+                raise ValueError(f"{address} is not written while the loop runs: switches are thrown by switch()")
+        self.target.write(self._context, values)
+        self.changed(WRITE, values)
+
+    def changed(self, kind: str, values: Mapping[str, Any]) -> None:
+        """Notes for those who watch what has changed the target; see `Change`."""
+        self._changes.append(Change(kind, dict(values)))
 
     def command(self, name: str) -> Any:
         """What the DPS would command now, wherever the signal's switch stands; None if the DPS has not begun."""
@@ -299,7 +325,10 @@ class Runtime:
         self.perform(self.prepare(mode, **sides))
 
     def request(self, action: Callable[[], Any]) -> Future[Any]:
-        """Has ``action`` (a switch, a write to a variable) done at the beginning of the next cycle; from any thread."""
+        """Has ``action`` (a `switch`, a `write`) done at the beginning of the next cycle; from any thread.
+
+        What changes the context by other means than the runtime's own is not recorded: a replay would lack it.
+        """
         future: Future[Any] = Future()
         self._requests.append((action, future))
         return future
@@ -324,3 +353,4 @@ class Runtime:
         reasons = self.guards.reset(self.clock.now(), self._watched)
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
+        self.changed(RESET, {})

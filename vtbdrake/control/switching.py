@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vtbdrake.control.cycle import SWITCH
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.testbed.switch import REAL, SIM
 from vtbdrake.testbed.testbed import MODES, check_mode
@@ -115,6 +116,11 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
         if position != SIM and name in runtime.continuity:
             # Within its limits, the command departs from what is measured.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
+    runtime.changed(
+        SWITCH,
+        {f"sense.{name}": position for name, position in senses.items()}
+        | {f"act.{name}": position for name, position in acts.items()},
+    )
     if isinstance(target, DpsAlone):
         runtime.begin()
         return

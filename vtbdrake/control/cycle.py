@@ -1,0 +1,47 @@
+"""What is known of one cycle of the loop, for those who watch: a recorder, a plot, residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from vtbdrake.control.guard import Verdict
+
+WRITE, SWITCH, RESET = "write", "switch", "reset"
+
+
+class Change(NamedTuple):
+    """Something beside time and sensor values that changed what is stepped, before a cycle's step.
+
+    Attributes:
+        kind: ``write`` (variables), ``switch`` or ``reset`` (of the guards).
+        values: of ``write`` the new values by address; of ``switch`` the positions, by ``sense.<signal>`` and
+            ``act.<signal>``.
+    """
+
+    kind: str
+    values: Mapping[str, Any]
+
+
+class Cycle(NamedTuple):
+    """What happened in one cycle.
+
+    From the state before the first cycle, ``changes`` and ``fed`` of every cycle determine all that the DPS does.
+
+    Attributes:
+        number: of the cycle, from 0.
+        time: of the DPS, in seconds, at the end of the cycle; that of the cycle before if it raised or is idle.
+        now: on the runtime's clock, when the cycle's messages had been taken in.
+        changes: what changed the target before the step, in order.
+        fed: the sensor values that are new to the DPS in this cycle, by signal.
+        commands: what the DPS commanded, by signal; empty if it raised.
+        verdict: what the guards made of it; `Verdict.commands` is what was sent.
+    """
+
+    number: int
+    time: float
+    now: float
+    changes: tuple[Change, ...]
+    fed: Mapping[str, Any]
+    commands: Mapping[str, Any]
+    verdict: Verdict
