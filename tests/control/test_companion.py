@@ -1,0 +1,116 @@
+"""The process beside the loop: frames arrive whole and in order, nothing waits for it, its end is noticed."""
+
+import os
+import select
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from vtbdrake.control.companion import Companion, Frames
+
+TIMEOUT = 30.0
+
+
+def echo(channel):
+    while True:
+        channel.send(channel.receive())
+
+
+def sum_up(channel):
+    total = 0
+    try:
+        while True:
+            total += len(channel.receive())
+    except EOFError:
+        channel.send(str(total).encode())
+
+
+def fall_asleep(channel):
+    signal.pause()
+
+
+def tell_scheduling(channel):
+    handler = signal.getsignal(signal.SIGINT)
+    channel.send(f"{os.sched_getscheduler(0)} {handler == signal.SIG_IGN}".encode())
+
+
+def fail(channel, code):
+    os._exit(code)
+
+
+def taken(companion, count):
+    """The first ``count`` frames that come back."""
+    frames, end = [], time.monotonic() + TIMEOUT
+    while len(frames) < count:
+        companion.flush()
+        ready, _, _ = select.select((companion,), (), (), 0.05)
+        frames += companion.take() if ready else []
+        assert time.monotonic() < end, f"{len(frames)} frames of {count} came back"
+    return frames
+
+
+def test_frames_come_back_whole_and_in_order():
+    random = np.random.default_rng(0)
+    sent = [random.bytes(int(size)) for size in random.integers(0, 300_000, 60)]
+    companion = Companion(echo, name="echo")
+    try:
+        back = []
+        for frame in sent:
+            assert companion.post(frame[:10], frame[10:])
+            back += companion.take()
+        back += taken(companion, len(sent) - len(back))
+        assert back == sent and companion.dropped == 0
+    finally:
+        assert companion.close() == 0
+
+
+@pytest.mark.parametrize("cut", [1, 7, 8, 9, 1000])
+def test_a_stream_that_is_cut_anywhere_gives_the_same_frames(cut):
+    frames = [b"", b"a", b"b" * 100, bytes(range(256))]
+    stream = b"".join(len(f).to_bytes(8, "little") + f for f in frames)
+    reader = Frames()
+    assert [f for i in range(0, len(stream), cut) for f in reader.feed(stream[i : i + cut])] == frames
+
+
+def test_what_waits_is_sent_before_it_ends():
+    companion = Companion(sum_up, name="sum", backlog=1 << 26)
+    for _ in range(100):
+        assert companion.post(bytes(100_000))
+    assert companion.close() == 0
+    assert companion.take() == [b"10000000"]
+
+
+def test_a_full_backlog_drops_and_counts_and_does_not_wait():
+    companion = Companion(fall_asleep, name="sleeper", backlog=1 << 20)
+    accepted = [companion.post(bytes(1 << 16)) for _ in range(200)]
+    companion.kill()
+    assert companion.dropped == accepted.count(False) > 0
+    assert sum(accepted) <= 200 and companion.waiting <= 1 << 20
+
+
+def test_one_that_is_killed_is_noticed_and_frames_are_counted():
+    companion = Companion(echo, name="victim")
+    companion.post(b"hello")
+    assert taken(companion, 1) == [b"hello"]
+    os.kill(companion.pid, signal.SIGKILL)
+    select.select((companion,), (), (), TIMEOUT)
+    assert companion.take() == [] and not companion.alive
+    assert not companion.post(b"again") and companion.dropped == 1
+    assert companion.close() == -signal.SIGKILL
+
+
+def test_one_that_does_not_end_is_killed():
+    companion = Companion(fall_asleep, name="sleeper")
+    assert companion.close(timeout=1.0) == -signal.SIGKILL
+
+
+def test_its_exit_code_is_told():
+    assert Companion(fail, 3, name="failure").close() == 3
+
+
+def test_it_has_ordinary_scheduling_and_leaves_interrupts_to_the_main_process():
+    companion = Companion(tell_scheduling, name="teller")
+    assert taken(companion, 1) == [f"{os.SCHED_OTHER} True".encode()]
+    companion.close()

@@ -1,0 +1,261 @@
+"""A process that works for the loop without holding it up: it writes files, computes what takes long, tells others."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+_log = logging.getLogger(__name__)
+
+_LENGTH = struct.Struct("<Q")
+_CHUNK = 1 << 18
+_BUFFER = 1 << 20  # of the socket, in bytes; the system may grant less
+
+
+class Frames:
+    """Puts frames together again, each its length and its bytes, from a stream that is cut anywhere."""
+
+    def __init__(self) -> None:
+        self._pending = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The frames that ``data`` completes."""
+        pending, frames, start = self._pending, [], 0
+        pending += data
+        while len(pending) - start >= _LENGTH.size:
+            end = start + _LENGTH.size + _LENGTH.unpack_from(pending, start)[0]
+            if len(pending) < end:
+                break
+            frames.append(bytes(pending[start + _LENGTH.size : end]))
+            start = end
+        del pending[:start]
+        return frames
+
+
+class Channel:
+    """The companion's own end of the line; its calls wait."""
+
+    def __init__(self, line: socket.socket) -> None:
+        self._line = line
+        self._frames = Frames()
+        self._received: deque[bytes] = deque()
+
+    def fileno(self) -> int:
+        """What becomes readable when frames arrive."""
+        return self._line.fileno()
+
+    def receive(self, timeout: float | None = None) -> bytes:
+        """The next frame.
+
+        Raises:
+            EOFError: there are no more.
+            TimeoutError: none came within ``timeout`` seconds.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self._received:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if not select.select((self._line,), (), (), left)[0]:
+                raise TimeoutError(f"no frame came within {timeout} s")
+            data = self._line.recv(_CHUNK)
+            if not data:
+                raise EOFError("the loop's end of the line is closed")
+            self._received += self._frames.feed(data)
+        return self._received.popleft()
+
+    def send(self, data: bytes) -> None:
+        """
+        Raises:
+            OSError: the other end is closed.
+        """
+        self._line.sendall(_LENGTH.pack(len(data)) + data)
+
+
+class Companion:
+    """A process of its own at the other end of a socket: a fresh interpreter that runs ``function(channel,
+    *arguments)``.
+
+    It ends with `close`, and with the process that started it, whose end of the line then closes. No call of it waits,
+    except for `close`; to start one takes some milliseconds. It has ordinary scheduling and leaves Ctrl-C to the main
+    process.
+
+    Args:
+        function: of a `Channel` and the arguments; travels by cloudpickle, with them.
+        name: what it is called in errors and logs.
+        backlog: bytes that may wait for it; frames beyond that are dropped.
+
+    Attributes:
+        dropped: how many frames were not taken.
+    """
+
+    def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
+        import cloudpickle
+
+        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.companion import main; main()"
+        self.name = name
+        self.dropped = 0
+        self._backlog = backlog
+        self._waiting: deque[memoryview] = deque()
+        self._waits = 0
+        self._frames = Frames()
+        self._back: list[bytes] = []
+        self._gone = False
+        self._line, theirs = socket.socketpair()
+        with theirs:
+            for end in (self._line, theirs):
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+            self._line.setblocking(False)
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", program, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+            )
+        order = cloudpickle.dumps((function, arguments))
+        self._send(_LENGTH.pack(len(order)) + order)
+
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return not self._gone and self._process.poll() is None
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait to be sent."""
+        return self._waits
+
+    def post(self, *parts: bytes) -> bool:
+        """Sends one frame, of the parts' bytes one after another; whether it was taken."""
+        size = sum(map(len, parts))
+        if self._gone or (self._waits and self._waits + size > self._backlog):
+            self.dropped += 1
+            return False
+        taken = self._send(b"".join((_LENGTH.pack(size), *parts)))
+        self.dropped += not taken
+        return taken
+
+    def _send(self, data: bytes) -> bool:
+        """Whether it goes on its way."""
+        if self._waiting:
+            self._keep(data)
+            self.flush()
+        elif (sent := self._push(data)) < len(data):
+            self._keep(data[sent:])
+        return not self._gone
+
+    def _keep(self, data: bytes) -> None:
+        self._waiting.append(memoryview(data))
+        self._waits += len(data)
+
+    def flush(self) -> None:
+        """Sends what waits, as far as there is room."""
+        while self._waiting and not self._gone:
+            first = self._waiting[0]
+            sent = self._push(first)
+            self._waits -= sent
+            if sent < len(first):
+                self._waiting[0] = first[sent:]
+                return
+            self._waiting.popleft()
+
+    def _push(self, data: bytes | memoryview) -> int:
+        try:
+            return self._line.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            self._lose(error)
+            return 0
+
+    def _lose(self, error: OSError) -> None:
+        if not self._gone:
+            self._gone = True
+            _log.error("%s (process %d) is gone: %s", self.name, self.pid, error)
+
+    def take(self) -> list[bytes]:
+        """The frames that came back since it was asked last, in order."""
+        self._receive()
+        found, self._back = self._back, []
+        return found
+
+    def _receive(self) -> None:
+        if self._line.fileno() < 0:
+            return
+        size = _CHUNK
+        while size == _CHUNK:  # a smaller one was all that there was
+            try:
+                data = self._line.recv(_CHUNK)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._lose(error)
+                return
+            size = len(data)
+            self._gone |= not data
+            self._back += self._frames.feed(data)
+
+    def fileno(self) -> int:
+        """What becomes readable when frames come back."""
+        return self._line.fileno()
+
+    def close(self, timeout: float = 10.0) -> int:
+        """Sends what waits, tells it the end, and waits for it; after ``timeout`` seconds it is killed.
+
+        Returns:
+            The exit code; negative if a signal ended it.
+        """
+        end = time.monotonic() + timeout
+        while self._waiting and not self._gone and (left := end - time.monotonic()) > 0.0:
+            select.select((), (self._line,), (), left)
+            self.flush()
+        try:
+            self._line.shutdown(socket.SHUT_WR)
+        except OSError as error:
+            self._lose(error)
+        # What it still has to say is taken in, for else it would wait for room.
+        while not self._gone and (left := end - time.monotonic()) > 0.0:
+            select.select((self._line,), (), (), left)
+            self._receive()
+        try:
+            self._process.wait(max(0.0, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            _log.error("%s (process %d) does not end, and is killed", self.name, self.pid)
+        self.kill()
+        return int(self._process.returncode)
+
+    def kill(self) -> None:
+        """Ends it at once; what came back before may still be taken."""
+        self._process.kill()
+        self._process.wait()
+        if self._line.fileno() >= 0:
+            self._receive()
+            self._line.close()
+        self._gone = True
+
+
+def main() -> None:
+    """The main program of a companion."""
+    import cloudpickle
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with socket.socket(fileno=int(sys.argv[1])) as line:
+        channel = Channel(line)
+        try:
+            function, arguments = cloudpickle.loads(channel.receive())
+            function(channel, *arguments)
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            return  # The loop's process has ended, or has closed the line.
