@@ -34,7 +34,7 @@ demo-control: $(STAMP)
 	$(RUN) -m diagrams.manipulator.demo
 
 test: $(STAMP)
-	$(RUN) -m pytest $(ARGS)
+	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .
