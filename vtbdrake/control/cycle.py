@@ -7,16 +7,18 @@ from typing import Any, NamedTuple
 
 from vtbdrake.control.guard import Verdict
 
-WRITE, SWITCH, RESET = "write", "switch", "reset"
+WRITE, SWITCH, RESET, RESULT = "write", "switch", "reset", "result"
 
 
 class Change(NamedTuple):
     """Something beside time and sensor values that changed what is stepped, before a cycle's step.
 
     Attributes:
-        kind: ``write`` (variables), ``switch`` or ``reset`` (of the guards).
+        kind: ``write`` (variables), ``switch``, ``reset`` (of the guards) or ``result`` (of a slow part).
         values: of ``write`` the new values by address; of ``switch`` the positions, by ``sense.<signal>`` and
-            ``act.<signal>``.
+            ``act.<signal>``; of ``result`` one entry: path of the slow part -> ``{"tick": number of the sample (int),
+            name: array, ...}``, where the arrays (of any dtype and shape; none, if the result is declared missing) are
+            what `SlowPart.deliver` takes besides the tick.
     """
 
     kind: str
