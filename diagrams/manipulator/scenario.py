@@ -13,7 +13,6 @@ from diagrams.manipulator.dps import gravity_torque, make_dps
 from diagrams.manipulator.dynamics import ArmDynamics
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import HOME, MOTIONS
-from diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import (
     ErrorModel,
@@ -148,6 +147,9 @@ class ManipulatorScenario(Scenario):
         return make_dps(self.law, period=self.period, compile=self.compile)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        # The plant's modules, which the DPS on the robot does without.
+        from diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
+
         arm = Arm()
         plant, scene_graph = builder.add_plant(self.plant)
         instance = add_arm(plant, arm)

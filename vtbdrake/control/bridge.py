@@ -6,9 +6,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vtbdrake.testbed import Interface
+if TYPE_CHECKING:
+    # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
+    from vtbdrake.testbed import Interface
 
 
 class BridgeError(RuntimeError):

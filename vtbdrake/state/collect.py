@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
-from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram
 
-from vtbdrake.state.friction import friction_variables
-from vtbdrake.state.multibody import Prefix, multibody_variables, pose_entries_by_demand
+from vtbdrake.state.kinds import is_plant, is_scene_graph
 from vtbdrake.state.systems import leaf_variables, leaves
 from vtbdrake.state.variable import Variable
 from vtbdrake.state.variables import Variables
+
+if TYPE_CHECKING:
+    from vtbdrake.state.multibody import Prefix
 
 
 def collect(
@@ -32,17 +33,21 @@ def collect(
     """
     plant_prefix = plant_prefix or (lambda path, instance: path)
     systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
-    scene_graph = next((system for _, system in systems if isinstance(system, SceneGraph)), None)
+    scene_graph = next((system for _, system in systems if is_scene_graph(system)), None)
     listed: list[Variable] = list(extra)
     by_demand: dict[str, Callable[[], Variable]] = {}
     for path, system in systems:
-        if isinstance(system, MultibodyPlant):
+        if is_plant(system):
+            # They need the modules that such a system has brought with it.
+            from vtbdrake.state.friction import friction_variables
+            from vtbdrake.state.multibody import multibody_variables, pose_entries_by_demand
+
             prefix = _prefix_of(plant_prefix, path)
             listed.extend(multibody_variables(system, prefix=prefix))
             if scene_graph is not None and system.geometry_source_is_registered():
                 listed.extend(friction_variables(system, scene_graph, prefix=prefix))
             by_demand |= pose_entries_by_demand(system, prefix=prefix)
-        elif not isinstance(system, SceneGraph):
+        elif not is_scene_graph(system):
             listed.extend(leaf_variables(path, system))
     return Variables(listed, derived_by_demand=by_demand)
 

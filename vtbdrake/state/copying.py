@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context, Diagram, System
-from pydrake.systems.sensors import RgbdSensor
 
+from vtbdrake.state.kinds import is_camera, is_scene_graph
 from vtbdrake.state.systems import leaves
 from vtbdrake.state.variables import Variables
 
@@ -40,7 +39,7 @@ class StateCopier:
         from_paths, to_paths = dict(leaves(source)), dict(leaves(target))
         self._pairs = []
         for path, system in to_paths.items():
-            if isinstance(system, SceneGraph | RgbdSensor) or _is_empty(system) or not only(path):
+            if is_scene_graph(system) or is_camera(system) or _is_empty(system) or not only(path):
                 continue
             if path not in from_paths:
                 raise ValueError(f"the testbed to copy from has no system {path}")

@@ -9,13 +9,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, System
-from pydrake.systems.sensors import RgbdSensor
 
 from vtbdrake.state.archive import read_archive, write_archive
 from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
+from vtbdrake.state.kinds import is_camera, is_plant, is_scene_graph
 from vtbdrake.state.systems import group_size, is_python, leaves, read_group, write_group
 from vtbdrake.state.variables import Variables
 
@@ -153,7 +151,7 @@ def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Var
     context.SetTime(snapshot.time)
     for path, system in leaves(diagram):
         leaf_context = system.GetMyMutableContextFromRoot(context)
-        if not isinstance(system, SceneGraph | RgbdSensor):
+        if not (is_scene_graph(system) or is_camera(system)):
             # What a snapshot cannot hold, the memory of a discrete plant's last step, is to be that of a new context.
             system.SetDefaultContext(leaf_context)
         for group, index in numeric_groups(leaf_context):
@@ -183,7 +181,8 @@ def _refuse_lost(diagram: Diagram, context: Context, variables: Variables) -> No
     carried = {variable.address for variable in variables.values() if variable.hidden}
     for path, system in leaves(diagram):
         leaf_context = system.GetMyContextFromRoot(context)
-        if isinstance(system, MultibodyPlant | SceneGraph | RgbdSensor) or path.rpartition(".")[0] in carried:
+        by_address = is_plant(system) or is_scene_graph(system) or is_camera(system)
+        if by_address or path.rpartition(".")[0] in carried:
             continue
         if leaf_context.num_abstract_parameters() or (leaf_context.num_abstract_states() and not is_python(system)):
             raise SnapshotError(

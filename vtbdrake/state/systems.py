@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, System
 from pydrake.systems.primitives import ConstantVectorSource
-from pydrake.systems.sensors import RgbdSensor
 
 from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Element
+from vtbdrake.state.kinds import is_camera
 from vtbdrake.state.variable import A, Variable, X
+
+if TYPE_CHECKING:
+    from pydrake.systems.sensors import RgbdSensor
 
 POSE_UNIT = "m, rad"
 
@@ -41,7 +45,7 @@ def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | N
 
     ``declared`` names its elements where the system itself, one of Drake's, cannot.
     """
-    if isinstance(system, RgbdSensor):
+    if is_camera(system):
         yield from _camera_pose(path, system)
     for element in _elements(system) if declared is None else declared:
         address = f"{path}.{element.name}" if element.name else path

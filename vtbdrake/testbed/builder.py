@@ -6,9 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 from numpy.typing import ArrayLike
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 from pydrake.systems.primitives import RandomSource
 
@@ -21,6 +18,9 @@ from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat, SceneGraph
+    from pydrake.multibody.plant import MultibodyPlant
+
     from vtbdrake.testbed.scenario import Scenario
 
 ROLES = ("sense", "sys", "act", "env")
@@ -60,6 +60,8 @@ class VirtualTestbedBuilder:
 
     def add_plant(self, fields: PlantFields | None = None) -> tuple[MultibodyPlant, SceneGraph]:
         """Adds the MultibodyPlant, a direct child named ``plant`` as CENIC wants it, and its SceneGraph."""
+        from pydrake.multibody.plant import AddMultibodyPlant
+
         self.plant, self.scene_graph = AddMultibodyPlant((fields or PlantFields()).config(), self.builder)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
@@ -161,6 +163,8 @@ class VirtualTestbedBuilder:
         if meshcat is not None:
             if self.scene_graph is None:
                 raise ValueError("there is nothing to draw: the testbed has no plant with a SceneGraph")
+            from pydrake.geometry import MeshcatVisualizer, MeshcatVisualizerParams
+
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.builder, self.scene_graph, meshcat, parameters)
         diagram = self.build_diagram("vtb")
@@ -232,6 +236,8 @@ class VirtualTestbedBuilder:
         """The role of every model instance of the plant: ``sys`` or ``env``."""
         if self.plant is None:
             return {}
+        from pydrake.multibody.tree import ModelInstanceIndex
+
         roles = {}
         for index in range(self.plant.num_model_instances()):
             instance = ModelInstanceIndex(index)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
-from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlantConfig
 
 
 @dataclass
@@ -43,4 +46,6 @@ class PlantFields:
 
     def config(self) -> MultibodyPlantConfig:
         """Drake's config of the same values."""
+        from pydrake.multibody.plant import MultibodyPlantConfig
+
         return MultibodyPlantConfig(**asdict(self))

@@ -11,12 +11,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, get_args, get_type_hints
 
 import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
-from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import GetIntegrationSchemes
 from pydrake.systems.framework import System
 
@@ -25,6 +24,9 @@ from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
 
 # Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
 _DRAKE = version("drake")

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, System
 
 from vtbdrake.state import Snapshot, SnapshotError, Variable, collect
@@ -20,6 +18,9 @@ from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import ACT_POSITIONS, BOARD, REAL, SENSE_POSITIONS, SIM, T_ACT, T_SENSE, TWIN, Selector
 
 if TYPE_CHECKING:
+    from pydrake.geometry import SceneGraph
+    from pydrake.multibody.plant import MultibodyPlant
+
     from vtbdrake.testbed.scenario import Scenario
 
 # Mode -> where (T_sense, T_act) stand.

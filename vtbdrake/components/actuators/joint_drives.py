@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import expm1, inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from vtbdrake.state import Element, discrete_state, parameter
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Joint
 
 _TINY = float(np.finfo(float).tiny)
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Joint
 
 
 class JointEncoders(SampledSensor):

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.multibody.plant import ContactResults, MultibodyPlant
-from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import parameter
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import RigidBody
 
 
 class ContactSensor(SampledSensor):
@@ -45,6 +48,8 @@ class ContactSensor(SampledSensor):
         errors: ErrorModel | None = None,
     ) -> None:
         """``threshold`` is a force (N), and a parameter of the Context."""
+        from pydrake.multibody.plant import ContactResults
+
         super().__init__(
             "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", stream=stream, errors=errors
         )

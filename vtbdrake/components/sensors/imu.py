@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from math import atan2, cos, sin, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Frame
 
 Vector3 = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Joint, RevoluteJoint
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Joint, RevoluteJoint
 
 
 class ForceTorqueSensor(SampledSensor):
@@ -84,6 +87,8 @@ class JointTorqueSensors(SampledSensor):
         stream: int = 5,
         errors: ErrorModel | None = None,
     ) -> None:
+        from pydrake.multibody.tree import RevoluteJoint
+
         for joint in joints:
             if not isinstance(joint, RevoluteJoint):
                 raise ValueError(

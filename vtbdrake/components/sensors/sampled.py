@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
 from vtbdrake.components.sensors.noise import normal_noise
 from vtbdrake.state import Element, discrete_state, parameter
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
 
 
 class SampledSensor(LeafSystem):
