@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ class Bridge(ABC):
         interface: the DPS's signals.
         sensed: reception of each sensor signal, by name.
         commanded: reception of each command u that comes from outside, by name.
+        reported: reception of the command that the machine says acts on an actuator signal, by the signal's name; of
+            those that it reports.
         tap: called with channel and bytes of every message that comes or has left, by a bridge that has such; it must
             not raise, and costs the loop's time.
     """
@@ -62,6 +65,7 @@ class Bridge(ABC):
     interface: Interface
     sensed: dict[str, Reception]
     commanded: dict[str, Reception]
+    reported: Mapping[str, Reception] = MappingProxyType({})
     tap: Callable[[str, bytes], None] | None = None
 
     @abstractmethod

@@ -12,6 +12,7 @@ from vtbdrake.control.lcm_connections import Handler
 from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.lcm_maps import LcmMap
 from vtbdrake.control.lcm_routes import CommandWatch, Inlet, Outlet, Transmission
+from vtbdrake.control.reported import reported_signals
 from vtbdrake.testbed import Interface, Signal
 
 _OPEN_TO_ALL = ("udpm://", "mpudpm://")
@@ -47,6 +48,7 @@ class LcmBridge(Bridge):
         sense: Sequence[LcmMap],
         act: Sequence[LcmMap],
         commands: Sequence[LcmMap] = (),
+        reported: Mapping[str, str] | None = None,
         watch: bool | None = None,
         on_alarm: Callable[[str, bytes], None] | None = None,
         reorder_window: float = 0.1,
@@ -61,6 +63,8 @@ class LcmBridge(Bridge):
             sense: maps of the sensor signals, each in exactly one of them.
             act: maps of the actuator signals, each in exactly one of them.
             commands: maps of those commands u that come over LCM.
+            reported: by actuator signal, the name under which a map of ``sense`` carries the command that the machine
+                says acts on it; such a value is no sensor signal.
             watch: whether to listen to the own command channels for foreign publishers. Left out: on udpm, where nobody
                 can keep them out. A hub does it by protected channels.
             on_alarm: called, in `poll`, with channel and bytes of a foreign message.
@@ -86,10 +90,12 @@ class LcmBridge(Bridge):
         self.commanded: dict[str, Reception] = {}
         self.sent = {signal.name: Transmission() for signal in interface.act}
         _check_complete(interface.act, act, "actuator")
-        _check_complete(interface.sense, sense, "sensor")
-        self._inlets = [
-            Inlet(map, _signals(interface.sense, map, "sensor"), self.sensed, reorder_window) for map in sense
-        ]
+        carriers = reported_signals(interface, reported or {})
+        self.reported = {name: Reception() for name in carriers}
+        heard = [*interface.sense, *carriers.values()]
+        _check_complete(heard, sense, "sensor")
+        receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
+        self._inlets = [Inlet(map, _signals(heard, map, "sensor"), receptions, reorder_window) for map in sense]
         _check_unique(commands)
         for map in commands:
             signals = _signals(interface.commands, map, "command")

@@ -31,17 +31,28 @@ class Protocol:
         sense: what the machine publishes; each sensor signal in one map.
         act: what it listens to; each actuator signal in one map.
         commands: commands u that reach the controller over LCM; the machine has no part in them.
+        reported: by actuator signal, the name under which a map of ``sense`` carries the command that the machine says
+            acts on it: the command of its cycle that has just ended.
         periods: by channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named.
     """
 
     sense: Sequence[LcmMap]
     act: Sequence[LcmMap]
     commands: Sequence[LcmMap] = ()
+    reported: Mapping[str, str] = field(default_factory=dict)
     periods: Mapping[str, float] = field(default_factory=dict)
 
     def bridge(self, interface: Interface, url: str, **options: Any) -> LcmBridge:
         """The controller's end, not yet open; ``options`` are those of `LcmBridge`."""
-        return LcmBridge(interface, url, sense=self.sense, act=self.act, commands=self.commands, **options)
+        return LcmBridge(
+            interface,
+            url,
+            sense=self.sense,
+            act=self.act,
+            commands=self.commands,
+            reported=self.reported,
+            **options,
+        )
 
 
 def protocol_of(scenario: Scenario) -> Protocol:

@@ -91,7 +91,8 @@ class Machine:
             side: Line(side, delay=whole_cycles(delay, config.period), period=config.period, random=random)
             for side, delay, random in ((SENSE, config.sense_delay, sense), (ACT, config.act_delay, act))
         }
-        self._sensors = Sensors(world, self.protocol, config, noise)
+        self._given: dict[str, Any] = {}
+        self._sensors = Sensors(world, self.protocol, config, noise, given=self._given)
         signals = {signal.name: signal for signal in world.interface.act}
         self._receptions = {name: Reception() for name in signals}
         self._inlets = {
@@ -104,7 +105,6 @@ class Machine:
         self._patience = whole_cycles(config.timeout, config.period)
         self._brake = Brake(world, config.brake)
         self._silent: list[str] = []
-        self._given: dict[str, Any] = {}
 
     @property
     def time(self) -> float:

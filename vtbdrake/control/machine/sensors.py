@@ -11,20 +11,30 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.machine.config import MachineConfig
 from vtbdrake.control.machine.faults import Packet
 from vtbdrake.control.protocol import Protocol
-from vtbdrake.testbed import WorldAlone
+from vtbdrake.control.reported import reported_signals
+from vtbdrake.testbed import Signal, WorldAlone
 
 
 class Sensors:
-    """Makes messages of the simulated sensor signals, with noise.
+    """Makes messages of the simulated sensor signals, with noise, and of the commands that acted last.
 
     Attributes:
         channels: on which they are told.
     """
 
     def __init__(
-        self, world: WorldAlone, protocol: Protocol, config: MachineConfig, random: np.random.Generator
+        self,
+        world: WorldAlone,
+        protocol: Protocol,
+        config: MachineConfig,
+        random: np.random.Generator,
+        *,
+        given: Mapping[str, Any],
     ) -> None:
         """
+        Args:
+            given: the commands that act, by actuator signal, kept up to date from outside.
+
         Raises:
             ValueError: there is to be noise on what is no vector sensor signal.
         """
@@ -35,7 +45,11 @@ class Sensors:
                 raise ValueError(f"noise is added to vector sensor signals ({', '.join(vectors)}), not to {name!r}")
         self._noise = config.noise
         self._random = random
-        self._maps = [(map, map.writer([signals[name] for name in map.signals])) for map in protocol.sense]
+        self._given = given
+        carriers = reported_signals(world.interface, protocol.reported)
+        known = signals | {signal.name: signal for signal in carriers.values()}
+        self._reported = {signal.name: (name, _idle(signal)) for name, signal in carriers.items()}
+        self._maps = [(map, map.writer([known[name] for name in map.signals])) for map in protocol.sense]
         self._every = {
             map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
             for map in protocol.sense
@@ -62,6 +76,13 @@ class Sensors:
         ]
 
     def _measure(self, name: str, context: Context) -> Any:
+        if name in self._reported:
+            actuator, idle = self._reported[name]
+            return self._given.get(actuator, idle)
         value = self._read[name](context)
         deviation = self._noise.get(name)
         return value if deviation is None else value + deviation * self._random.standard_normal(value.shape)
+
+
+def _idle(signal: Signal) -> Any:
+    return signal.vector(signal.idle) if signal.is_vector else signal.idle
