@@ -7,11 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from types import MappingProxyType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
-    from vtbdrake.testbed import Interface
+    from vtbdrake.control.ranges import Range
+from vtbdrake.testbed import Interface
 
 
 class BridgeError(RuntimeError):
@@ -29,6 +31,7 @@ class Reception:
         count: how many were accepted.
         rejected: how many were not, by the reason: ``fingerprint``, ``truncated``, ``trailing``, ``size``, ``not
             finite``, ``limits``, ``out of order``, ...
+        range: what the bridge checks every value against before it accepts it; None if it leaves that to others.
     """
 
     value: Any = None
@@ -36,6 +39,7 @@ class Reception:
     sent: float = float("nan")
     count: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
+    range: Range | None = None
 
     def age(self, now: float) -> float:
         """Seconds since it arrived; infinite before the first."""
@@ -56,6 +60,7 @@ class Bridge(ABC):
         interface: the DPS's signals.
         sensed: reception of each sensor signal, by name.
         commanded: reception of each command u that comes from outside, by name.
+        channels: by sensor signal, the channel of its messages, for a bridge that has such.
         reported: reception of the command that the machine says acts on an actuator signal, by the signal's name; of
             those that it reports.
         tap: called with channel and bytes of every message that comes or has left, by a bridge that has such; it must
@@ -66,6 +71,7 @@ class Bridge(ABC):
     sensed: dict[str, Reception]
     commanded: dict[str, Reception]
     reported: Mapping[str, Reception] = MappingProxyType({})
+    channels: Mapping[str, str] = MappingProxyType({})
     tap: Callable[[str, bytes], None] | None = None
 
     @abstractmethod

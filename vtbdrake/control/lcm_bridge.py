@@ -86,6 +86,7 @@ class LcmBridge(Bridge):
         self._time_of_day = time.time() - time.monotonic()
 
         _check_channels([*sense, *commands, *act])
+        self.channels = {name: map.channel for map in sense for name in map.signals}
         self.sensed = {signal.name: Reception() for signal in interface.sense}
         self.commanded: dict[str, Reception] = {}
         self.sent = {signal.name: Transmission() for signal in interface.act}

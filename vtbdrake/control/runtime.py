@@ -53,6 +53,11 @@ class Runtime:
 
     Attributes:
         cycles: how many there were.
+        steps: how many of them the DPS has done.
+        start_time: of the DPS, in seconds, before its first step.
+        idle: whether the DPS alone has not begun yet.
+        initialized: whether the events of initialization have happened; they do in the first step, unless ``context``
+            was given.
     """
 
     def __init__(
@@ -84,15 +89,16 @@ class Runtime:
         self.continuity = dict(continuity or {})
         self.ready = ready
         self.cycles = 0
-        self._steps = 0
-        self._pace = pace
+        self.steps = 0
+        self.pace = pace
+        self.initialized = context is not None
         self._patience = patience * period
         self._watchers = list(watchers)
         self._simulator = target.simulator(context, restored=context is not None)
         self._context = self._simulator.get_mutable_context()
-        self._t0 = self._context.get_time()
+        self.start_time = self._context.get_time()
         self._ports = RealPorts(target, self._context)
-        self._idle = isinstance(target, DpsAlone)
+        self.idle = isinstance(target, DpsAlone)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
         self._watched: Mapping[str, Reception] = {}
@@ -147,7 +153,7 @@ class Runtime:
                 if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                     return
                 woke = self._await(deadline)
-                lateness = 0.0 if self._pace is not None else woke - deadline
+                lateness = 0.0 if self.pace is not None else woke - deadline
                 self.cycle(lateness=lateness)
                 done += 1
                 if until():
@@ -157,14 +163,23 @@ class Runtime:
             self._send_fallback("the loop ended")
             raise
 
+    def watch(self, watcher: Callable[[Cycle], None]) -> None:
+        """Has a watcher called with every cycle from the next one on."""
+        self._watchers.append(watcher)
+
+    def unwatch(self, watcher: Callable[[Cycle], None]) -> None:
+        """Leaves a watcher out from now on; one that is not there is left out already."""
+        if watcher in self._watchers:
+            self._watchers.remove(watcher)
+
     def stop(self) -> None:
         """Ends `run` after the present cycle; from any thread."""
         self._stop.set()
 
     def _await(self, deadline: float) -> float:
-        if self._pace is None:
+        if self.pace is None:
             return self.clock.wait_until(deadline)
-        reception = self.bridge.sensed[self._pace]
+        reception = self.bridge.sensed[self.pace]
         count, limit = reception.count, self.clock.now() + self._patience
         while reception.count == count:
             left = limit - self.clock.now()
@@ -175,7 +190,7 @@ class Runtime:
 
     def _next(self, deadline: float) -> float:
         """The next deadline; those that have passed already are left out and counted."""
-        if self._pace is not None:
+        if self.pace is not None:
             return self.clock.now()
         # The one that is due just now can still be kept.
         behind = max(floor((self.clock.now() - deadline) / self.period), 0)
@@ -221,12 +236,13 @@ class Runtime:
 
     def _step(self, active: Iterable[str]) -> tuple[BaseException | None, dict[str, Any]]:
         """Steps by one period; what is raised inside is the guards' business, not the loop's end."""
-        if self._idle:
+        if self.idle:
             return None, {}
+        self.initialized = True
         try:
             # A multiple of the period, exactly: a sum would give none or two updates now and then.
-            self._simulator.AdvanceTo(self._t0 + (self._steps + 1) * self.period)
-            self._steps += 1
+            self._simulator.AdvanceTo(self.start_time + (self.steps + 1) * self.period)
+            self.steps += 1
             return None, self._ports.commands(active)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             # The time stays where it was: the step is tried again in the next cycle.
@@ -234,7 +250,7 @@ class Runtime:
 
     def begin(self) -> None:
         """Lets the DPS alone be stepped, and command."""
-        self._idle = False
+        self.idle = False
         self.look()
 
     def look(self) -> None:
@@ -243,9 +259,9 @@ class Runtime:
         To be called after a switch was thrown by other means than `perform`, unless `run` or a `request` did.
         """
         sensed = self.bridge.sensed
-        self._active = [] if self._idle else self._ports.active()
+        self._active = [] if self.idle else self._ports.active()
         if isinstance(self.target, DpsAlone):
-            self._watched = {} if self._idle else sensed
+            self._watched = {} if self.idle else sensed
         else:
             positions = self.target.positions(self._context)["sense"]
             self._watched = {name: sensed[name] for name, position in positions.items() if position == REAL}
@@ -288,7 +304,7 @@ class Runtime:
 
     def command(self, name: str) -> Any:
         """What the DPS would command now, wherever the signal's switch stands; None if the DPS has not begun."""
-        if self._idle:
+        if self.idle:
             return None
         port = self.target.dps.GetOutputPort(name)
         return port.Eval(self.target.dps.GetMyContextFromRoot(self._context))

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.systems.framework import Context
 
 from vtbdrake.control.cycle import SWITCH
-from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.testbed.switch import REAL, SIM
 from vtbdrake.testbed.testbed import MODES, check_mode
 
@@ -124,10 +125,14 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
     if isinstance(target, DpsAlone):
         runtime.begin()
         return
-    before = target.positions(context)
     runtime.feed()
+    throw(target, context, senses, acts)
+    runtime.look()
+
+
+def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
+    """Throws switches of a testbed that runs; a simulated world that takes over does so where the machine is."""
+    before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)
     if SIM in acts.values() and any(before["act"][name] != SIM for name in acts) and target.believes:
-        # The simulated world takes over where the machine is.
         target.start_from_belief(context)
-    runtime.look()
