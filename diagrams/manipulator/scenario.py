@@ -134,6 +134,7 @@ class ManipulatorScenario(Scenario):
                         "joint_position": "joint_position_measured",
                         "joint_velocity": "joint_velocity_estimated",
                         "joint_torque_measured": "joint_torque_measured",
+                        "joint_torque_reported": "joint_torque_commanded",
                     }
                 ),
                 vector_map(
@@ -141,6 +142,7 @@ class ManipulatorScenario(Scenario):
                 ),
             ],
             act=[iiwa_command(["joint_torque"])],
+            reported={"joint_torque": "joint_torque_reported"},
         )
 
     def make_dps(self) -> Diagram:
@@ -198,5 +200,7 @@ class ManipulatorScenario(Scenario):
         push = builder.add("env", "push", Push(plant, "tip"))
         builder.builder.Connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
         for k, name in enumerate(JOINT_NAMES):
-            builder.believe(f"sim.sys.arm.{name}.position", of=[f"dps.env.joint_position[{k}]"])
-            builder.believe(f"sim.sys.arm.{name}.velocity", of=[f"dps.env.joint_velocity[{k}]"])
+            for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
+                builder.believe(
+                    f"sim.sys.arm.{name}.{value}", of=[f"dps.env.joint_{value}[{k}]"], age=(1 + errors.latency) * T
+                )

@@ -172,6 +172,10 @@ class Runtime:
         if watcher in self._watchers:
             self._watchers.remove(watcher)
 
+    def watch(self, watcher: Callable[[Cycle], None]) -> None:
+        """Has ``watcher`` called with every cycle from the next one on."""
+        self._watchers.append(watcher)
+
     def stop(self) -> None:
         """Ends `run` after the present cycle; from any thread."""
         self._stop.set()

@@ -35,6 +35,7 @@ class VirtualTestbedBuilder:
 
     Attributes:
         sensors, actuators: the ports of the simulated world, by signal.
+        beliefs: what `believe` declares.
         extra_variables: those that `add_variable` lists.
     """
 
@@ -49,7 +50,7 @@ class VirtualTestbedBuilder:
         self.actuators: dict[str, InputPort] = {}
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
-        self._beliefs: list[Belief] = []
+        self.beliefs: list[Belief] = []
         self.extra_variables: list[Variable] = []
 
     def add(self, role: str, name: str, system: S) -> S:
@@ -122,15 +123,19 @@ class VirtualTestbedBuilder:
         if inputs:
             raise SignalError(f"the interface has no signal for the DPS's input port {', '.join(inputs)}")
 
-    def believe(self, target: str, *, of: Sequence[str], by: Callable[..., ArrayLike] | None = None) -> None:
+    def believe(
+        self, target: str, *, of: Sequence[str], by: Callable[..., ArrayLike] | None = None, age: float = 0.0
+    ) -> None:
         """Declares which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
 
         Args:
             target: address of the simulated variable.
             of: addresses of the estimates.
             by: makes the target's value of theirs; left out, the one estimate is the value.
+            age: how long ago it was so, in seconds, when the DPS was given the sensor values that say so; a sensor that
+                is sampled, and shows its state, is a period late. Whoever predicts from the belief needs it.
         """
-        self._beliefs.append(Belief(target, tuple(of), by))
+        self.beliefs.append(Belief(target, tuple(of), by, age))
 
     def add_variable(self, variable: Variable) -> None:
         """Lists a further variable, derived from others, say."""
@@ -178,7 +183,7 @@ class VirtualTestbedBuilder:
             act=switches.act,
             simulator=self.simulator,
             scenario=scenario,
-            beliefs=tuple(self._beliefs),
+            beliefs=tuple(self.beliefs),
             extra_variables=commands + tuple(self.extra_variables),
             plant_roles=self.plant_roles(),
             visualized=meshcat is not None,

@@ -26,6 +26,7 @@ class WorldAlone(AddressedDiagram):
         diagram: input ports ``act.<signal>``, which lead to the simulated actuators, and output ports
             ``sense.<signal>``, which come from the simulated sensors.
         plant: of the simulated world, if it has one.
+        beliefs: which estimates of the DPS set which of its variables.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -58,6 +59,7 @@ class WorldAlone(AddressedDiagram):
             ),
         )
         self.plant = parts.plant
+        self.beliefs = tuple(parts.beliefs)
         self._actuators = {s.name: (s, diagram.GetInputPort(f"act.{s.name}")) for s in parts.interface.act}
 
     def default_context(self) -> Context:
