@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from vtbdrake.control.bridge import Reception
+from vtbdrake.control.ranges import Range
 from vtbdrake.control.watchdog import Watchdog
 from vtbdrake.testbed import Signal
 
@@ -108,6 +109,49 @@ def test_abstract_signal_is_watched_for_its_age_only() -> None:
     watchdog = Watchdog(Signal("picture", model_value="", max_age=0.1))
     assert kind(watchdog, 0.0, received("cat")) is None
     assert kind(watchdog, 0.2, received("cat")) == "stale"
+
+
+def test_value_that_the_bridge_checked_by_other_limits_is_checked_again() -> None:
+    wide, narrow = signal(upper=2.0), signal(upper=1.0)
+    sample = Reception(value=np.full(2, 1.5), arrived=0.0, count=1, range=Range(wide))
+    assert kind(Watchdog(narrow), 0.0, sample) == "implausible"
+    assert kind(Watchdog(wide), 0.0, sample) is None
+
+
+def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str | None]:
+    """The watchdog's findings for samples of (sent, arrived)."""
+    watchdog = Watchdog(signal(), max_delay=max_delay)
+    receptions = [
+        Reception(value=np.zeros(2), sent=sent, arrived=arrived, count=k + 1)
+        for k, (sent, arrived) in enumerate(samples)
+    ]
+    return [kind(watchdog, reception.arrived, reception) for reception in receptions]
+
+
+def test_sample_that_took_longer_than_the_quickest_one_is_stale_until_one_is_quick_again() -> None:
+    assert delays((100.0, 5.0), (100.01, 5.02), (100.02, 5.05), (100.03, 5.04)) == [None, None, "stale", None]
+
+
+def test_quickest_sample_need_not_be_the_first() -> None:
+    assert delays((100.0, 5.03), (100.01, 5.01), (100.02, 5.05)) == [None, None, "stale"]
+
+
+def test_sender_whose_clock_was_set_back_is_measured_anew() -> None:
+    assert delays((100.0, 5.0), (90.0, 5.01), (90.01, 5.05)) == [None, None, "stale"]
+
+
+def test_clocks_that_drift_apart_by_less_than_they_may_make_nothing_stale() -> None:
+    drift = 400e-6
+    assert set(delays(*[(k * (1.0 - drift), float(k)) for k in range(1000)])) == {None}
+
+
+def test_sample_without_a_time_has_no_delay() -> None:
+    assert delays((nan, 5.0), (nan, 6.0)) == [None, None]
+
+
+def test_delay_is_positive() -> None:
+    with pytest.raises(ValueError, match="positive max_delay"):
+        Watchdog(signal(), max_delay=0.0)
 
 
 def test_jumps_need_a_finite_rate_and_a_vector() -> None:

@@ -52,7 +52,7 @@ class Guards:
         interface: of the DPS.
         period: of the loop, in seconds.
         fallback: by actuator signal; see `default_fallback` for the others.
-        jump_tolerance: by sensor signal; see `Watchdog`.
+        jump_tolerance, max_delay: by sensor signal; see `Watchdog`.
         max_missed: more deadlines missed in a row are a fault.
         log_size: how many faults `log` keeps.
 
@@ -72,18 +72,23 @@ class Guards:
         *,
         fallback: Mapping[str, Fallback] | None = None,
         jump_tolerance: Mapping[str, ArrayLike] | None = None,
+        max_delay: Mapping[str, float] | None = None,
         max_missed: float = 10,
         log_size: int = 1000,
     ) -> None:
-        fallback, jump_tolerance = dict(fallback or {}), dict(jump_tolerance or {})
+        fallback, jump_tolerance, max_delay = dict(fallback or {}), dict(jump_tolerance or {}), dict(max_delay or {})
         _refuse_unknown("fallback", fallback, interface.act)
         _refuse_unknown("jump_tolerance", jump_tolerance, interface.sense)
+        _refuse_unknown("max_delay", max_delay, interface.sense)
         if isnan(max_missed) or max_missed < 0:
             raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
         self.commands: dict[str, CommandGuard | AbstractGuard] = {
             s.name: CommandGuard(s, period=period) if s.is_vector else AbstractGuard(s) for s in interface.act
         }
-        self.watchdogs = {s.name: Watchdog(s, jump_tolerance=jump_tolerance.get(s.name)) for s in interface.sense}
+        self.watchdogs = {
+            s.name: Watchdog(s, jump_tolerance=jump_tolerance.get(s.name), max_delay=max_delay.get(s.name))
+            for s in interface.sense
+        }
         self.log: deque[Fault] = deque(maxlen=log_size)
         self._fallbacks = {
             s.name: chain(fallback.get(s.name) or default_fallback(s), s, interface=interface) for s in interface.act

@@ -8,51 +8,15 @@ from collections import deque
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
-from operator import le
 from typing import Any
-
-import numpy as np
 
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.lcm_maps import LcmMap
 from vtbdrake.control.lcm_wire import MalformedError
+from vtbdrake.control.ranges import Range, within
 from vtbdrake.testbed import Signal
 
 _log = logging.getLogger(__name__)
-
-_LARGEST = np.finfo(float).max
-
-
-def within(lower: Sequence[float], entries: Sequence[float], upper: Sequence[float]) -> bool:
-    """Whether all entries are within their limits; for so few of them, quicker than numpy."""
-    return all(map(le, lower, entries)) and all(map(le, entries, upper))
-
-
-class Range:
-    """What a signal's values can be: arrays of its size, finite and within its limits, or objects of its type."""
-
-    def __init__(self, signal: Signal) -> None:
-        self._size = signal.size
-        if signal.size is None:
-            self._type: type = type(signal.abstract_value().get_value())
-        else:
-            # An infinite entry is never within the limits, a NaN fails every comparison.
-            self.lower: list[float] = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
-            self.upper: list[float] = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
-
-    def check(self, value: Any) -> str:
-        """Why ``value`` is not one of this signal; empty if it is."""
-        if self._size is None:
-            return "" if isinstance(value, self._type) else "type"
-        try:
-            entries = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            return "type"
-        if entries.shape != (self._size,):
-            return "size"
-        if within(self.lower, entries.tolist(), self.upper):
-            return ""
-        return "limits" if np.isfinite(entries).all() else "not finite"
 
 
 class Inlet:
@@ -75,6 +39,8 @@ class Inlet:
         self._read = map.reader(signals)
         self._receptions = {signal.name: receptions[signal.name] for signal in signals}
         self._ranges = {signal.name: Range(signal) for signal in signals}
+        for name, reception in self._receptions.items():
+            reception.range = self._ranges[name]
         vectors = [self._ranges[signal.name] for signal in signals if signal.is_vector]
         self._lower = [entry for vector in vectors for entry in vector.lower]
         self._upper = [entry for vector in vectors for entry in vector.upper]

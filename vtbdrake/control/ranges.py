@@ -1,0 +1,69 @@
+"""What the values of a signal can be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import le
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.testbed import Signal
+
+_LARGEST = float(np.finfo(float).max)
+
+# Up to this size Python's floats are quicker than numpy's calls.
+_SMALL = 32
+
+
+def within(lower: Sequence[float], entries: Sequence[float], upper: Sequence[float]) -> bool:
+    """Whether all entries are within their limits; for few of them, quicker than numpy. A NaN never is."""
+    return all(map(le, lower, entries)) and all(map(le, entries, upper))
+
+
+class Range:
+    """What a signal's values can be: arrays of its size, finite and within its limits, or objects of its type.
+
+    Attributes:
+        lower, upper: of a vector signal, by entry, finite: so what is infinite is not within them.
+    """
+
+    def __init__(self, signal: Signal) -> None:
+        self._size = signal.size
+        self._type: type | None = None
+        self.lower: list[float] = []
+        self.upper: list[float] = []
+        if signal.size is None:
+            self._type = type(signal.abstract_value().get_value())
+        else:
+            self.lower = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
+            self.upper = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
+            self._lower, self._upper = np.array(self.lower), np.array(self.upper)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Range) and self._shape() == other._shape()
+
+    def __hash__(self) -> int:
+        return hash((self._size, self._type))
+
+    def check(self, value: Any) -> str:
+        """Why ``value`` is not one of this signal (``type``, ``size``, ``limits``, ``not finite``); empty if it is."""
+        if self._type is not None:
+            return "" if isinstance(value, self._type) else "type"
+        try:
+            entries = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            return "type"
+        if entries.shape != (self._size,):
+            return "size"
+        if self._has(entries):
+            return ""
+        return "limits" if np.isfinite(entries).all() else "not finite"
+
+    def _has(self, entries: np.ndarray) -> bool:
+        if entries.size > _SMALL:
+            return bool(((entries >= self._lower) & (entries <= self._upper)).all())
+        return within(self.lower, entries.tolist(), self.upper)
+
+    def _shape(self) -> tuple[Any, ...]:
+        return self._size, self._type, self.lower, self.upper
