@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from importlib import metadata
+from importlib import import_module, metadata
 from typing import Any
 
 import click
-
-from vtbdrake.rollout import WorkerError
 
 BAD_INPUT = 2
 FAILED = 1
@@ -33,7 +31,26 @@ class FailedError(click.ClickException):
 
 
 class Commands(click.Group):
-    """A group that reports every expected error as one line ``Error: ...``; see `BAD_INPUT` and `FAILED`."""
+    """A group that reports every expected error as one line ``Error: ...``; see `BAD_INPUT` and `FAILED`.
+
+    Attributes:
+        homes: name of a command -> ``module:function``. Each is imported when it is called for: the one that runs on a
+            robot does not carry the optimizers of the others.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.homes: dict[str, str] = {}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(self.homes)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in self.homes:
+            return None
+        module, _, function = self.homes[name].partition(":")
+        command: click.Command = getattr(import_module(module), function)
+        return command
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -41,12 +58,20 @@ class Commands(click.Group):
         except click.UsageError as error:
             path = error.ctx.command_path if error.ctx is not None else ctx.command_path
             raise BadInputError(one_line(f"{error.format_message()} ('{path} --help' shows an example)")) from error
-        except WorkerError as error:
-            _reraise_if_asked(ctx)
-            raise FailedError(one_line(error)) from error
         except EXPECTED as error:
             _reraise_if_asked(ctx)
             raise BadInputError(one_line(error)) from error
+        except RuntimeError as error:
+            if not _is_worker_error(error):
+                raise
+            _reraise_if_asked(ctx)
+            raise FailedError(one_line(error)) from error
+
+
+def _is_worker_error(error: RuntimeError) -> bool:
+    from vtbdrake.rollout import WorkerError
+
+    return isinstance(error, WorkerError)
 
 
 def one_line(error: object) -> str:

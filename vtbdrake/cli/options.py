@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.optimization import Parameter
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import load_scenario
+
+if TYPE_CHECKING:
+    from vtbdrake.optimization import Parameter
 
 # (address, value)
 Setting = tuple[str, float | list[Any]]
@@ -49,12 +51,16 @@ def parse_condition(text: str) -> dict[str, Any]:
 
 def parse_range(text: str) -> Parameter:
     """``ADDRESS=LOWER:UPPER``."""
+    from vtbdrake.optimization import Parameter
+
     (lower, upper), address = _numbers(text, (float, float), "ADDRESS=LOWER:UPPER")
     return Parameter(address, lower, upper)
 
 
 def parse_grid(text: str) -> tuple[Parameter, int]:
     """``ADDRESS=LOWER:UPPER:POINTS``."""
+    from vtbdrake.optimization import Parameter
+
     (lower, upper, points), address = _numbers(text, (float, float, int), "ADDRESS=LOWER:UPPER:POINTS")
     return Parameter(address, lower, upper), points
 
