@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from types import MappingProxyType
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
     from vtbdrake.control.ranges import Range
-from vtbdrake.testbed import Interface
+    from vtbdrake.testbed import Interface
 
 
 class BridgeError(RuntimeError):

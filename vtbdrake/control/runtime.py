@@ -160,7 +160,7 @@ class Runtime:
                     return
                 deadline = self._next(deadline)
         except BaseException:
-            self._send_fallback("the loop ended")
+            self.send_fallback("the loop ended")
             raise
 
     def watch(self, watcher: Callable[[Cycle], None]) -> None:
@@ -171,10 +171,6 @@ class Runtime:
         """Leaves a watcher out from now on; one that is not there is left out already."""
         if watcher in self._watchers:
             self._watchers.remove(watcher)
-
-    def watch(self, watcher: Callable[[Cycle], None]) -> None:
-        """Has ``watcher`` called with every cycle from the next one on."""
-        self._watchers.append(watcher)
 
     def stop(self) -> None:
         """Ends `run` after the present cycle; from any thread."""
@@ -313,7 +309,8 @@ class Runtime:
         port = self.target.dps.GetOutputPort(name)
         return port.Eval(self.target.dps.GetMyContextFromRoot(self._context))
 
-    def _send_fallback(self, reason: str) -> None:
+    def send_fallback(self, reason: str) -> None:
+        """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""
         verdict = self.guards.fault(reason, self.clock.now(), self._watched)
         # The guards know what was on real in the last cycle, and give nothing for a signal that has not been commanded.
         farewell = {name: command for name, command in verdict.commands.items() if name in self._active}
