@@ -10,7 +10,7 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_image, lcmt_robot_state
 
 from tests.control.arm import status
-from vtbdrake.control.lcm_wire import Layout, MalformedError, decode
+from vtbdrake.control.lcm_wire import Excerpt, Layout, MalformedError, decode
 
 
 def reason(message_type: Any, data: bytes) -> str:
@@ -62,26 +62,32 @@ def test_thousands_of_millions_of_empty_rows_are_not_read(user_types: ModuleType
     assert reason(user_types.mixed_t, bytes(data)) == "size"
 
 
-def test_layout_reads_the_numbers_that_lcm_gen_wrote() -> None:
+def test_excerpt_reads_the_numbers_that_lcm_gen_wrote() -> None:
+    layout = Layout(status(5, position=0.5, torque=-2.0))
+    excerpt = Excerpt(layout, ["joint_torque_external", "utime", "joint_position_measured"])
+    numbers = excerpt.unpack(status(6, position=0.25, torque=3.0).encode())
+    assert excerpt.fixed(numbers) == excerpt.expected
+    assert numbers[excerpt.at["utime"]] == (6,)
+    assert numbers[excerpt.at["joint_position_measured"]] == (0.25,) * 7
+    assert numbers[excerpt.at["joint_torque_external"]] == (3.0,) * 7
+    assert len(numbers) == 1 + 1 + 1 + 7 + 7  # fingerprint, time and the arrays' length come with the fields
+
+
+def test_layout_tells_where_lcm_gen_writes_a_field() -> None:
     message = status(5, position=0.5, torque=-2.0)
-    layout = Layout(message)
-    numbers = layout.unpack(status(6, position=0.25, torque=3.0).encode())
-    assert numbers is not None
-    assert numbers[layout.at["utime"]] == (6,)
-    assert numbers[layout.at["joint_position_measured"]] == (0.25,) * 7
-    assert numbers[layout.at["joint_torque_external"]] == (3.0,) * 7
+    place = Layout(message).at["joint_torque_measured"]
+    data = struct.unpack_from(f">{place.count}{place.code}", message.encode(), place.offset)
+    assert data == tuple(message.joint_torque_measured)
 
 
-def test_layout_writes_what_lcm_gen_does() -> None:
-    message = status(5, position=0.5, torque=-2.0)
-    layout = Layout(message)
-    assert layout.pack(layout.template) == message.encode()
-
-
-def test_layout_leaves_a_message_with_other_lengths_alone(user_types: ModuleType) -> None:
-    layout = Layout(status(5))
+@pytest.mark.parametrize("at", [0, 7, 19], ids=["fingerprint", "its end", "length of the arrays"])
+def test_excerpt_knows_a_message_that_is_laid_out_in_another_way(at: int) -> None:
+    excerpt = Excerpt(Layout(status(5)), ["joint_position_measured"])
     data = bytearray(status(5).encode())
-    data[16:20] = struct.pack(">i", 6)
-    assert layout.unpack(bytes(data)) is None
-    with pytest.raises(TypeError):
+    data[at] ^= 1
+    assert excerpt.fixed(excerpt.unpack(bytes(data))) != excerpt.expected
+
+
+def test_message_that_is_not_numbers_only_has_no_layout(user_types: ModuleType) -> None:
+    with pytest.raises(TypeError, match="field name"):
         Layout(mixed(user_types))

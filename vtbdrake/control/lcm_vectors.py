@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from math import nan
 from operator import attrgetter, itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vtbdrake.control.lcm_fields import Field, compose, find_field
 from vtbdrake.control.lcm_maps import LcmMap, Reader, Sample, Writer, never_sent
-from vtbdrake.control.lcm_wire import Layout
+from vtbdrake.control.lcm_wire import Excerpt, Layout, Place
 from vtbdrake.testbed import Signal
 
 MICROSECOND = 1e-6
@@ -132,21 +132,21 @@ class _VectorReader:
         self._sizes = {signal.name: signal.size for signal in signals}
         ends = np.cumsum([signal.size for signal in signals]).tolist()
         self._parts = [(s.name, slice(end - (s.size or 0), end)) for s, end in zip(signals, ends, strict=True)]
-        self._layouts: dict[int, tuple[Layout, itemgetter[Any], int]] = {}
+        self._known: dict[int, tuple[Excerpt, itemgetter[Any], int]] = {}  # by the messages' size
         self._flat = True  # until a message turns out to hold more than numbers
 
     def __call__(self, data: bytes) -> Sample:
-        known = self._layouts.get(len(data))
+        known = self._known.get(len(data))
         if known is not None:
-            layout, pick, stamp = known
-            numbers = layout.unpack(data)
-            if numbers is not None:
+            excerpt, pick, stamp = known
+            numbers = excerpt.unpack(data)
+            if excerpt.fixed(numbers) == excerpt.expected:
                 picked = pick(numbers)
                 entries = np.array(picked, dtype=float)
                 sent = numbers[stamp] * MICROSECOND if stamp else nan
                 return Sample(sent, {name: entries[part] for name, part in self._parts}, picked)
         sample = self._read(data)
-        if self._flat and known is None and len(self._layouts) < self._LAYOUTS:
+        if self._flat and known is None and len(self._known) < self._LAYOUTS:
             self._learn(data, sample)
         return sample
 
@@ -158,49 +158,88 @@ class _VectorReader:
         except TypeError:
             self._flat = False
             return
-        places = list(
-            chain.from_iterable(range(layout.at[path].start, layout.at[path].stop) for path in self._map.paths)
-        )
+        excerpt = Excerpt(layout, {self._map.stamp, *self._map.paths})
+        places = [place for path in self._map.paths for place in range(excerpt.at[path].start, excerpt.at[path].stop)]
         together = places == list(range(places[0], places[-1] + 1))
         pick = itemgetter(slice(places[0], places[-1] + 1)) if together else itemgetter(*places)
-        stamp = layout.at[self._map.stamp].start if self._map.stamp else 0
-        self._layouts[len(data)] = (layout, pick, stamp)
+        stamp = excerpt.at[self._map.stamp].start if self._map.stamp else 0
+        self._known[len(data)] = (excerpt, pick, stamp)
+
+
+class _Blank(NamedTuple):
+    """A stretch of a message where numbers go.
+
+    Attributes:
+        write: writes them, into a message, at an offset.
+        offset: in bytes.
+        part: which entries of the signal they are.
+        integer: whether they are rounded.
+    """
+
+    write: Callable[..., None]
+    offset: int
+    part: slice
+    integer: bool
+
+
+class _Form:
+    """A message of numbers only, in which the time and the signals are left to be filled in."""
+
+    def __init__(self, layout: Layout, map: VectorMap, names: Iterable[str]) -> None:
+        self._message = bytearray(layout.example)
+        self._stamp = _blank(layout.at[map.stamp], 0, integer=True) if map.stamp else None
+        self._blanks: list[tuple[str, list[_Blank]]] = []
+        for name in names:
+            begin, blanks = 0, []
+            for field in map.fields[name]:
+                place = layout.at[field.path]
+                blanks.append(_blank(place, begin, integer=field.integer))
+                begin += place.count
+            self._blanks.append((name, blanks))
+
+    def fill(self, values: Mapping[str, Any], utime: int) -> bytes:
+        """
+        Raises:
+            struct.error, OverflowError: a number does not fit its field.
+        """
+        message = self._message
+        if self._stamp is not None:
+            self._stamp.write(message, self._stamp.offset, utime)
+        for name, blanks in self._blanks:
+            entries = np.asarray(values[name], dtype=float).tolist()
+            for write, offset, part, integer in blanks:
+                numbers = entries[part]
+                write(message, offset, *(map(round, numbers) if integer else numbers))
+        return bytes(message)
+
+
+def _blank(place: Place, begin: int, *, integer: bool) -> _Blank:
+    write = struct.Struct(f">{place.count}{place.code}").pack_into
+    return _Blank(write, place.offset, slice(begin, begin + place.count), integer)
 
 
 class _VectorWriter:
-    """Writes the messages of a map, those that are numbers only by one call of `struct`."""
+    """Writes the messages of a map; those that are numbers only by filling in a form."""
 
     def __init__(self, map: VectorMap, signals: Sequence[Signal]) -> None:
         self._map = map
         self._write = LcmMap.writer(map, signals)
-        self._layouts: dict[tuple[str, ...], Layout | None] = {}
+        self._forms: dict[tuple[str, ...], _Form | None] = {}
         self._learn({signal.name: np.zeros(signal.size or 0) for signal in signals})
 
-    def _learn(self, values: Mapping[str, Any]) -> Layout | None:
+    def _learn(self, values: Mapping[str, Any]) -> _Form | None:
         encode = self._map.encode
         assert encode is not None
         message = encode(values, 0)
         message.encode()
         try:
-            layout: Layout | None = Layout(message)
+            form: _Form | None = _Form(Layout(message), self._map, values)
         except TypeError:
-            layout = None
-        self._layouts[tuple(values)] = layout
-        return layout
+            form = None
+        self._forms[tuple(values)] = form
+        return form
 
     def __call__(self, values: Mapping[str, Any], utime: int) -> bytes:
         names = tuple(values)
-        layout = self._layouts[names] if names in self._layouts else self._learn(values)
-        if layout is None:
-            return self._write(values, utime)
-        numbers = layout.template.copy()
-        if self._map.stamp:
-            numbers[layout.at[self._map.stamp].start] = utime
-        for name, value in values.items():
-            entries = np.asarray(value, dtype=float).tolist()
-            for field in self._map.fields[name]:
-                place = layout.at[field.path]
-                count = place.stop - place.start
-                numbers[place] = [round(entry) for entry in entries[:count]] if field.integer else entries[:count]
-                entries = entries[count:]
-        return layout.pack(numbers)
+        form = self._forms[names] if names in self._forms else self._learn(values)
+        return self._write(values, utime) if form is None else form.fill(values, utime)

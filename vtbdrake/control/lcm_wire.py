@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Container
 from io import BytesIO
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 FORMATS = {
     "int8_t": "b",
@@ -17,6 +18,8 @@ FORMATS = {
     "boolean": "?",
 }
 """Number types of LCM, and what `struct` calls them."""
+
+_FINGERPRINT = 8  # bytes, with which every message begins
 
 
 class MalformedError(ValueError):
@@ -70,14 +73,33 @@ def decode(message_type: Any, data: bytes) -> Any:
     return message
 
 
+class Place(NamedTuple):
+    """Where the numbers of a field lie in a message.
+
+    Attributes:
+        offset: of the first, in bytes.
+        count: how many there are.
+        code: their type, as `struct` calls it.
+    """
+
+    offset: int
+    count: int
+    code: str
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.count * struct.calcsize(f">{self.code}")
+
+
 class Layout:
     """Where each number lies in messages of a type whose arrays are as long as an example's.
 
-    Such messages are read and written by one call of `struct`, five times as fast as field by field.
+    Such messages are read and written by calls of `struct`, many times as fast as field by field.
 
     Attributes:
-        size: bytes of such a message.
-        at: by field, which entries of `unpack` and `pack` are its numbers; entry 0 is the fingerprint.
+        example: the example's bytes.
+        at: by field, where its numbers are.
+        lengths: the fields that tell the lengths of arrays.
     """
 
     def __init__(self, message: Any) -> None:
@@ -86,32 +108,40 @@ class Layout:
             TypeError: the type holds more than numbers and one-dimensional arrays of numbers.
         """
         kind = type(message)
-        code = ">8s"
-        template: list[Any] = [kind._get_packed_fingerprint()]
-        self.at: dict[str, slice] = {}
+        self.example: bytes = message.encode()
+        self.at: dict[str, Place] = {}
+        end = _FINGERPRINT
         lengths: set[str] = set()
         for name, typename, dimensions in zip(kind.__slots__, kind.__typenames__, kind.__dimensions__, strict=True):
-            value = getattr(message, name)
             if typename not in FORMATS or len(dimensions or ()) > 1:
                 raise TypeError(f"field {name} of {kind.__name__} is a {typename} with dimensions {dimensions}")
-            numbers = [value] if dimensions is None else list(value)
+            count = 1 if dimensions is None else len(getattr(message, name))
             lengths.update(dimension for dimension in dimensions or () if isinstance(dimension, str))
-            self.at[name] = slice(len(template), len(template) + len(numbers))
-            code += f"{len(numbers)}{FORMATS[typename]}"
-            template += numbers
-        self._struct = struct.Struct(code)
-        self.size = self._struct.size
-        self._fixed = itemgetter(0, *(self.at[name].start for name in kind.__slots__ if name in lengths))
-        self.template = template
-        self._expected = self._fixed(template)
+            self.at[name] = Place(end, count, FORMATS[typename])
+            end = self.at[name].end
+        self.lengths = tuple(name for name in kind.__slots__ if name in lengths)
 
-    def unpack(self, data: bytes) -> tuple[Any, ...] | None:
-        """All numbers of the message, or None if it is not laid out like this."""
-        if len(data) != self.size:
-            return None
-        numbers = self._struct.unpack(data)
-        return numbers if self._fixed(numbers) == self._expected else None
 
-    def pack(self, numbers: list[Any]) -> bytes:
-        """The message of these numbers: `template` with some of them replaced."""
-        return self._struct.pack(*numbers)
+class Excerpt:
+    """Reads the numbers of some fields, from all messages of a layout, by one call of `struct`.
+
+    Attributes:
+        size: bytes of such a message.
+        unpack: takes a message of this size; entry 0 of what it returns is the fingerprint.
+        at: by field, which of these entries are its numbers.
+        fixed: picks those entries by which one tells that a message is laid out so.
+        expected: what they are then.
+    """
+
+    def __init__(self, layout: Layout, fields: Container[str]) -> None:
+        code, end, count = f">{_FINGERPRINT}s", _FINGERPRINT, 1
+        self.at: dict[str, slice] = {}
+        for name, place in layout.at.items():
+            if name in layout.lengths or name in fields:
+                code += f"{place.offset - end}x{place.count}{place.code}"
+                self.at[name] = slice(count, count + place.count)
+                end, count = place.end, count + place.count
+        self.size = len(layout.example)
+        self.unpack = struct.Struct(f"{code}{self.size - end}x").unpack
+        self.fixed = itemgetter(0, *(self.at[name].start for name in layout.lengths))
+        self.expected = self.fixed(self.unpack(layout.example))
