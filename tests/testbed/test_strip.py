@@ -5,6 +5,7 @@ import pytest
 
 from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.state import Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone
 
 
@@ -62,3 +63,52 @@ def test_commands_go_with_it():
     context = testbed.default_context()
     testbed.write(context, {"u.angle": 0.7})
     assert alone.read(alone.continue_from(testbed, context), "u.angle") == 0.7
+
+
+def in_the_middle(scenario):
+    """The testbed after some steps, and its context."""
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    testbed.write(simulator.get_mutable_context(), {"u.heading": 0.2})
+    simulator.AdvanceTo(0.5)
+    return testbed, simulator.get_context()
+
+
+@pytest.mark.parametrize("through_itself", [False, True])
+def test_a_snapshot_does_as_well_as_the_testbed(tmp_path, through_itself):
+    testbed, context = in_the_middle(SpaceClimberScenario())
+    alone = DpsAlone(SpaceClimberScenario())
+    expected = alone.snapshot(alone.continue_from(testbed, context))
+    source = expected if through_itself else testbed.snapshot(context)
+    source.save(tmp_path / "s")
+
+    restored = alone.default_context()
+    assert expected.compare(alone.snapshot(restored))
+    alone.restore(restored, Snapshot.load(tmp_path / "s"))
+    assert not expected.compare(alone.snapshot(restored))
+    assert (restored.get_time(), alone.read(restored, "u.heading")) == (0.5, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "difference"),
+    [(SpaceClimberScenario(gravity=3.71), "gravity: 1.62 there, 3.71 here"), (PendulumScenario(), "PendulumScenario")],
+)
+def test_a_snapshot_of_another_scenario_is_refused(scenario, difference):
+    testbed = SpaceClimberScenario(gravity=1.62).build()
+    snapshot = testbed.snapshot(testbed.default_context())
+    alone = DpsAlone(scenario)
+    with pytest.raises(SnapshotError, match=difference):
+        alone.restore(alone.default_context(), snapshot)
+
+
+def test_a_snapshot_with_another_dps_is_refused():
+    testbed = AcrobotScenario().build()
+    whole = testbed.snapshot(testbed.default_context())
+    alone = DpsAlone(AcrobotScenario())
+    key = next(key for key in whole.groups if key.startswith("dps/"))
+    lacking = Snapshot(whole.time, whole.values, {k: v for k, v in whole.groups.items() if k != key})
+    with pytest.raises(SnapshotError, match=f"{key} has .* entries in this testbed"):
+        alone.restore(alone.default_context(), lacking)
+    more = Snapshot(whole.time, whole.values, {**whole.groups, "dps/discrete/7": [0.0]})
+    with pytest.raises(SnapshotError, match="has a group dps/discrete/7"):
+        alone.restore(alone.default_context(), more)

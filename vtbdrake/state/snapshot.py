@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -123,15 +123,26 @@ def take(
     return Snapshot(context.get_time(), values, groups, scenario or {})
 
 
-def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Variables) -> None:
+def apply(
+    snapshot: Snapshot,
+    diagram: Diagram,
+    context: Context,
+    variables: Variables,
+    *,
+    only: Callable[[str], bool] = lambda path: True,
+) -> None:
     """Sets time, state and parameters of ``context`` from ``snapshot``.
+
+    Args:
+        only: says of the path of a system whether it is set, and looked for in the snapshot; left out, all are.
 
     Raises:
         SnapshotError: the Diagram is built in another way than the one that the snapshot was taken from; the
             context is unchanged.
     """
+    systems = [(path, system) for path, system in leaves(diagram) if only(path)]
     expected = set()
-    for path, system in leaves(diagram):
+    for path, system in systems:
         leaf_context = system.GetMyContextFromRoot(context)
         for group, index in numeric_groups(leaf_context):
             key = f"{path}/{group}/{index}"
@@ -142,6 +153,8 @@ def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Var
                 raise SnapshotError(f"{key} has {size} entries in this testbed, but the snapshot has {found}")
         expected |= {f"{path}/abstract/{index}" for index in _codecs(path, system, leaf_context)}
     for key in snapshot.groups:
+        if not only(key.partition("/")[0]):
+            continue
         if (key.rsplit("/", 1)[0] if "/abstract/" in key else key) not in expected:
             raise SnapshotError(f"the snapshot has a group {key}, which this testbed does not have")
     hidden = [v for v in variables.values() if v.hidden and not v.derived]
@@ -149,7 +162,7 @@ def apply(snapshot: Snapshot, diagram: Diagram, context: Context, variables: Var
         if variable.address not in snapshot.values:
             raise SnapshotError(f"the snapshot has no value of {variable.address}, which this testbed has")
     context.SetTime(snapshot.time)
-    for path, system in leaves(diagram):
+    for path, system in systems:
         leaf_context = system.GetMyMutableContextFromRoot(context)
         if not (is_scene_graph(system) or is_camera(system)):
             # What a snapshot cannot hold, the memory of a discrete plant's last step, is to be that of a new context.

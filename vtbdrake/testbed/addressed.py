@@ -10,7 +10,8 @@ import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
-from vtbdrake.state import AddressError, Variables
+from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
+from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variables import suggestion
@@ -105,6 +106,30 @@ class AddressedDiagram:
                 port = system.get_output_port(i)
                 ports[f"{path}.{port.get_name()}".lstrip(".")] = (system, port)
         return ports
+
+    # -- s(t) as a whole
+
+    def snapshot(self, context: Context) -> Snapshot:
+        """s(t) as named arrays."""
+        record = self.scenario.record() if self.scenario is not None else {}
+        return snapshots.take(self.diagram, context, self._variables, scenario=record)
+
+    def check_scenario(self, snapshot: Snapshot) -> None:
+        """
+        Raises:
+            SnapshotError: the snapshot is of another scenario.
+        """
+        if self.scenario is None or not snapshot.scenario:
+            return
+        mine, theirs = self.scenario.record(), snapshot.scenario
+        keys = ["scenario"] if theirs["scenario"] != mine["scenario"] else [*mine, *(theirs.keys() - mine.keys())]
+        differing = [
+            f"{key}: {theirs.get(key, 'nothing')!r} there, {mine.get(key, 'nothing')!r} here"
+            for key in keys
+            if key not in mine or key not in theirs or mine[key] != theirs[key]
+        ]
+        if differing:
+            raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
 
     def copier_from(self, source: AddressedDiagram) -> StateCopier:
         """Copies contexts of ``source`` (this one, or another of the same scenario) to contexts of this one."""

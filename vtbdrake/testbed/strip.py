@@ -9,14 +9,15 @@ import numpy as np
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
-from vtbdrake.state import Variable, collect
+from vtbdrake.state import Snapshot, Variable, collect
+from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
-from vtbdrake.testbed.switch import BOARD, REAL, Switches
+from vtbdrake.testbed.switch import BOARD, COMMAND, REAL, Switches
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -76,12 +77,27 @@ class DpsAlone(AddressedDiagram):
                 testbed.variables(),
                 self.diagram,
                 self.variables(),
-                only=lambda path: path == "dps" or path.startswith("dps."),
+                only=_is_dps,
             )
         self._copiers[id(testbed)].copy(context, own)
-        commands = [f"u.{signal.name}" for signal in self.interface.commands]
+        commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]
         self.write(own, {a: testbed.read(context, a) for a in commands if a in testbed.variables()})
         return own
+
+    def restore(self, context: Context, snapshot: Snapshot) -> None:
+        """Makes ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
+
+        Raises:
+            SnapshotError: it is of another scenario, or of a DPS that is built in another way.
+        """
+        self.check_scenario(snapshot)
+        snapshots.apply(snapshot, self.diagram, context, self._variables, only=_is_dps)
+        commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]
+        self.write(context, {a: snapshot[a] for a in commands if a in snapshot.values})
+
+
+def _is_dps(path: str) -> bool:
+    return path == "dps" or path.startswith("dps.")
 
 
 def _without_plant(fields: SimulatorFields) -> SimulatorFields:

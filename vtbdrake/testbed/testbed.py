@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state import Snapshot, SnapshotError, Variable, collect
+from vtbdrake.state import Snapshot, Variable, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -156,27 +156,13 @@ class VirtualTestbed(AddressedDiagram):
 
     # -- s(t) as a whole
 
-    def snapshot(self, context: Context) -> Snapshot:
-        """s(t) as named arrays."""
-        record = self.scenario.record() if self.scenario is not None else {}
-        return snapshots.take(self.diagram, context, self._variables, scenario=record)
-
     def restore(self, context: Context, snapshot: Snapshot) -> None:
         """Makes ``context`` continue from ``snapshot``: s_sim(t0) from a file.
 
         Raises:
             SnapshotError: it is of another scenario, or of a testbed that is built in another way.
         """
-        if self.scenario is not None and snapshot.scenario:
-            mine, theirs = self.scenario.record(), snapshot.scenario
-            keys = ["scenario"] if theirs["scenario"] != mine["scenario"] else [*mine, *(theirs.keys() - mine.keys())]
-            differing = [
-                f"{key}: {theirs.get(key, 'nothing')!r} there, {mine.get(key, 'nothing')!r} here"
-                for key in keys
-                if key not in mine or key not in theirs or mine[key] != theirs[key]
-            ]
-            if differing:
-                raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
+        self.check_scenario(snapshot)
         snapshots.apply(snapshot, self.diagram, context, self._variables)
 
     @property
