@@ -4,6 +4,7 @@ from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.scenario import Scenario, ScenarioError, load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
+from vtbdrake.testbed.slow_part import SlowPart, slow_parts
 from vtbdrake.testbed.strip import DpsAlone
 from vtbdrake.testbed.switch import Command
 from vtbdrake.testbed.testbed import VirtualTestbed
@@ -19,8 +20,10 @@ __all__ = [
     "Signal",
     "SignalError",
     "SimulatorFields",
+    "SlowPart",
     "VirtualTestbed",
     "VirtualTestbedBuilder",
     "WorldAlone",
     "load_scenario",
+    "slow_parts",
 ]

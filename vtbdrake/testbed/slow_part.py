@@ -1,0 +1,315 @@
+"""The slow parts of a DPS: what they compute takes longer than a cycle of the fast loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import ceil, inf
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, State
+
+from vtbdrake.state import Codec, discrete_state
+from vtbdrake.state.codecs import array_codec, codec_of
+from vtbdrake.state.systems import leaves
+from vtbdrake.testbed.slow_function import MEMORY, Arrays, SlowFunction, SlowPartError, decode, encode, parts_of
+
+MOST_UNDER_WAY = 16
+_SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
+_RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED)
+_WAITING, _DONE, _MISSING = range(3)
+
+
+class SlowPart(LeafSystem):
+    """A part of a DPS that takes its time: perception, a planner, a localization.
+
+    .. pydrake_system::
+
+        name: SlowPart
+        input_ports:
+        - <input>
+        output_ports:
+        - <output>
+        - sampled_at (s; when the inputs were sampled that the outputs belong to, at first -inf)
+        - valid (1 if the result that was due last was there, else 0)
+        - missed (how many were not)
+
+    At t_k = offset + k period it samples its inputs. From t_k + latency on, exactly, its outputs show ``function`` of
+    them: what is updated at that instant sees it already. Until the first result they show ``initial``.
+
+    In a simulation, the function is computed when its result is due. A runtime has it computed in another process, and
+    hands the result in with `deliver` at any time before. A result that is declared missing is left out: the outputs
+    stay as they are. What has neither come nor been declared missing is computed here: so a copy of a running context
+    goes on by itself.
+
+    All that it knows lies in its context, as arrays: the samples and results under way, latency / period of them, and
+    the memory.
+
+    Args:
+        function: ``function(**inputs)`` returns the outputs by name, or, if there is one only, its value. It depends
+            on nothing else, changes nothing, and travels by cloudpickle.
+        inputs: by name, the size of a vector port, or a value like those of an abstract one.
+        outputs: likewise.
+        period, latency, offset: in seconds. The latency may be longer than the period.
+        initial: outputs until the first result; by default zeros, and the values given in ``outputs``.
+        memory: what the function remembers from one call to the next, at first: it is the argument ``memory``, and
+            the function returns ``(outputs, memory)``. A call begins with the memory of the last one whose result has
+            come, be it too late to be shown.
+        codecs: by port name or ``memory``, how values become arrays, where `codec_of` knows no way.
+        patience: after how many latencies without an answer a runtime ends the other process, and starts another.
+
+    Attributes:
+        function: from arrays to arrays, see `SlowFunction`.
+
+    Raises:
+        ValueError: a name or a time is impossible, more than 16 samples would be under way, or a value has no codec.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *,
+        inputs: Mapping[str, Any],
+        outputs: Mapping[str, Any],
+        period: float,
+        latency: float,
+        offset: float = 0.0,
+        initial: Mapping[str, Any] | None = None,
+        memory: Any = None,
+        codecs: Mapping[str, Codec] | None = None,
+        patience: float = 20.0,
+    ) -> None:
+        super().__init__()
+        _check_times(period, latency, offset, patience)
+        _check_names(inputs, outputs, initial or {})
+        self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
+        models = {**inputs, **outputs, **({} if memory is None else {MEMORY: memory})}
+        known = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
+        self.function = SlowFunction(
+            function, {name: known[name] for name in inputs}, {name: known[name] for name in outputs}, known.get(MEMORY)
+        )
+        self._inputs = {name: self._declare_input(name, model) for name, model in inputs.items()}
+        first = {name: np.zeros(model) if _is_size(model) else model for name, model in outputs.items()}
+        shown = encode({**first, **(initial or {})}, self.function.outputs)
+        self._output_arrays = frozenset(shown)
+        sizes = {name: model for name, model in outputs.items() if _is_size(model)}
+        self._vectors = {name: self.DeclareDiscreteState(shown.pop(name)) for name in sizes}
+        told = {_SAMPLED_AT: -inf, _VALID: 0.0, _MISSED: 0.0}
+        self._told = {name: self.DeclareDiscreteState([value]) for name, value in told.items()}
+        remembered = {MEMORY: known[MEMORY]} if memory is not None else {}
+        progress = _Progress(shown=shown, memory=encode({MEMORY: memory}, remembered))
+        self._remembered = frozenset(progress.memory)
+        self._progress = self.DeclareAbstractState(Value(progress))
+        for name, model in outputs.items():
+            if name not in self._vectors:
+                self._declare_abstract_output(name, model)
+        for name, index in {**self._vectors, **self._told}.items():
+            self.DeclareStateOutputPort(name, index)
+        self.variables = (
+            *(discrete_state(name, self._vectors[name], shape=() if n == 1 else (n,)) for name, n in sizes.items()),
+            discrete_state(_SAMPLED_AT, self._told[_SAMPLED_AT], unit="s"),
+            discrete_state(_VALID, self._told[_VALID], bounds=(0.0, 1.0)),
+            discrete_state(_MISSED, self._told[_MISSED], bounds=(0.0, inf)),
+        )
+        self.codecs = {int(self._progress): Codec(_progress_arrays, _progress_of)}
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._sample)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency, self._show)
+
+    def _declare_input(self, name: str, model: Any) -> InputPort:
+        if _is_size(model):
+            return self.DeclareVectorInputPort(name, model)
+        return self.DeclareAbstractInputPort(name, Value(model))
+
+    def _declare_abstract_output(self, name: str, model: Any) -> None:
+        codec = self.function.outputs[name]
+
+        def calc(context: Context, output: AbstractValue) -> None:
+            output.set_value(decode(self._read(context).shown, name, codec))
+
+        ticket = self.abstract_state_ticket(self._progress)
+        self.DeclareAbstractOutputPort(name, lambda: Value(model), calc, prerequisites_of_calc={ticket})
+
+    def _read(self, context: Context) -> _Progress:
+        progress: _Progress = context.get_abstract_state(self._progress).get_value()
+        return progress
+
+    # -- while time runs
+
+    def _sample(self, context: Context, state: State) -> None:
+        value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
+        progress: _Progress = value.get_value()
+        tick = round((context.get_time() - self.offset) / self.period)
+        # The events of an instant are repeated after an exception in one of them.
+        if progress.find(tick) is None:
+            sample = {name: port.Eval(context) for name, port in self._inputs.items()}
+            work = _Work(tick, _WAITING, encode(sample, self.function.inputs))
+            value.set_value(replace(progress, under_way=(*progress.under_way, work)))
+
+    def _show(self, context: Context, state: State) -> None:
+        value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
+        progress: _Progress = value.get_value()
+        tick = round((context.get_time() - self.offset - self.latency) / self.period)
+        work = progress.find(tick)
+        if work is None:
+            return
+        if work.status == _WAITING:
+            progress = progress.having(tick, self.function({**work.arrays, **progress.memory}))
+            work = progress.find(tick)
+            assert work is not None
+        told = {_VALID: float(work.status == _DONE)}
+        if work.status == _DONE:
+            told[_SAMPLED_AT] = self.offset + tick * self.period
+        else:
+            told[_MISSED] = context.get_discrete_state(self._told[_MISSED]).value()[0] + 1.0
+        numbers = {index: work.arrays[name] for name, index in self._vectors.items() if name in work.arrays}
+        numbers |= {self._told[name]: [number] for name, number in told.items()}
+        for index, number in numbers.items():
+            state.get_mutable_discrete_state().set_value(int(index), number)
+        value.set_value(progress.shown_up_to(work, without=self._vectors))
+
+    # -- results from outside
+
+    def due(self, tick: int) -> float:
+        """When the result of sample number ``tick`` is shown, in seconds."""
+        return self.offset + self.latency + tick * self.period
+
+    def waiting(self, context: Context) -> dict[int, Arrays]:
+        """The samples whose results are neither there nor declared missing: what `function` takes besides the memory,
+        by tick, in order.
+
+        Args:
+            context: of the whole Diagram; so in `memory` and `deliver`.
+        """
+        progress = self._read(self.GetMyContextFromRoot(context))
+        return {work.tick: work.arrays for work in progress.under_way if work.status == _WAITING}
+
+    def memory(self, context: Context) -> Arrays:
+        """The memory that the next call begins with; empty for a part without."""
+        return self._read(self.GetMyContextFromRoot(context)).memory
+
+    def deliver(self, context: Context, tick: int, arrays: Arrays) -> None:
+        """Hands in the result of sample number ``tick``, which will be shown when it is due, and at once takes over
+        its memory. Of a result that is not waited for, only the memory is taken.
+
+        Args:
+            arrays: what `function` returned; its memory alone; or nothing, which declares the result missing.
+
+        Raises:
+            SlowPartError: they are neither.
+        """
+        self._check_result(arrays)
+        own = self.GetMyMutableContextFromRoot(context)
+        own.SetAbstractState(self._progress, self._read(own).having(tick, arrays))
+
+    def _check_result(self, arrays: Arrays) -> None:
+        remembered = {name for name in arrays if name.partition(".")[0] == MEMORY}
+        outputs = arrays.keys() - remembered
+        if remembered not in (set(), self._remembered) or outputs not in (set(), self._output_arrays):
+            expected = sorted(self._output_arrays | self._remembered)
+            raise SlowPartError(f"a result has the arrays {', '.join(expected)}, not {', '.join(arrays)}")
+        for name in self._vectors.keys() & outputs:
+            size = self.get_output_port_by_name(name).size()
+            if arrays[name].shape != (size,):
+                raise SlowPartError(f"the result {name} has {size} entries, not the shape {arrays[name].shape}")
+
+
+def slow_parts(diagram: Diagram, *, below: str = "dps") -> dict[str, SlowPart]:
+    """The slow parts in the DPS of a testbed's diagram (or below another path), by path."""
+    found = {path: system for path, system in leaves(diagram) if path == below or path.startswith(f"{below}.")}
+    return {path: system for path, system in found.items() if isinstance(system, SlowPart)}
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What became of one sample: its arrays while it waits, those of the outputs when it is done."""
+
+    tick: int
+    status: int
+    arrays: Arrays = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """What a slow part keeps beside numbers; never changed, and so shared by all copies of a context."""
+
+    shown: Arrays
+    memory: Arrays
+    under_way: tuple[_Work, ...] = ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Progress:
+        return self
+
+    def find(self, tick: int) -> _Work | None:
+        return next((work for work in self.under_way if work.tick == tick), None)
+
+    def having(self, tick: int, arrays: Arrays) -> _Progress:
+        """With a result; with none of the outputs in it, it is missing."""
+        outputs = {name: array for name, array in arrays.items() if name.partition(".")[0] != MEMORY}
+        memory = {name: array for name, array in arrays.items() if name not in outputs}
+        result = _Work(tick, _DONE if outputs else _MISSING, outputs)
+        under_way = tuple(result if work.tick == tick and work.status == _WAITING else work for work in self.under_way)
+        return replace(self, memory=memory or self.memory, under_way=under_way)
+
+    def shown_up_to(self, work: _Work, *, without: Mapping[str, Any]) -> _Progress:
+        """With the outputs of ``work``, less some that are shown elsewhere, and without what came before it."""
+        shown = {name: array for name, array in work.arrays.items() if name not in without}
+        later = tuple(other for other in self.under_way if other.tick > work.tick)
+        return replace(self, shown=shown if work.status == _DONE else self.shown, under_way=later)
+
+
+def _progress_arrays(progress: _Progress) -> dict[str, np.ndarray]:
+    ticks = [(work.tick, work.status) for work in progress.under_way]
+    arrays = {"ticks": np.array(ticks, dtype=np.int64).reshape(-1, 2)}
+    groups = {"shown": progress.shown, "memory": progress.memory}
+    groups |= {f"under_way.{work.tick}": work.arrays for work in progress.under_way}
+    return arrays | {f"{group}.{name}": a for group, members in groups.items() for name, a in members.items()}
+
+
+def _progress_of(arrays: Arrays) -> _Progress:
+    under_way = tuple(
+        _Work(int(tick), int(status), parts_of(arrays, f"under_way.{tick}")) for tick, status in arrays["ticks"]
+    )
+    return _Progress(parts_of(arrays, "shown"), parts_of(arrays, MEMORY), under_way)
+
+
+def _is_size(model: Any) -> bool:
+    return isinstance(model, int | np.integer) and not isinstance(model, bool)
+
+
+def _codec(name: str, model: Any) -> Codec:
+    try:
+        return array_codec((model,)) if _is_size(model) else codec_of(model)
+    except ValueError as error:
+        raise ValueError(f"{name} of a slow part: {error}") from error
+
+
+def _check_times(period: float, latency: float, offset: float, patience: float) -> None:
+    for name, value in {"period": period, "latency": latency, "patience": patience}.items():
+        if not 0.0 < value < inf:
+            raise ValueError(f"the {name} of a slow part is positive and finite, not {value}")
+    if not 0.0 <= offset < inf:
+        raise ValueError(f"a slow part begins at a finite time that is not negative, not at {offset} s")
+    if ceil(latency / period) > MOST_UNDER_WAY:
+        raise ValueError(
+            f"with a period of {period:g} s and a latency of {latency:g} s, {ceil(latency / period)} samples of a slow "
+            f"part would be under way; choose a period of at least {latency / MOST_UNDER_WAY:g} s"
+        )
+
+
+def _check_names(inputs: Mapping[str, Any], outputs: Mapping[str, Any], initial: Mapping[str, Any]) -> None:
+    if not inputs or not outputs:
+        raise ValueError("a slow part has at least one input and one output")
+    for name in [*inputs, *outputs]:
+        if not name.isidentifier() or name in _RESERVED:
+            raise ValueError(
+                f"a port of a slow part has a name like a variable's, and none of {', '.join(_RESERVED)}; not {name!r}"
+            )
+    for name, model in {**inputs, **outputs}.items():
+        if _is_size(model) and model < 1:
+            raise ValueError(f"{name} of a slow part has at least one entry, not {model}")
+    if both := inputs.keys() & outputs.keys():
+        raise ValueError(f"inputs and outputs of a slow part have different names, but both have {', '.join(both)}")
+    if unknown := initial.keys() - outputs.keys():
+        raise ValueError(f"initial names no output of the slow part: {', '.join(sorted(unknown))}")
