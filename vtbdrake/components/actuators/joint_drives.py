@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from math import expm1, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    NumericParameterIndex,
+    ValueProducer,
+)
 
 from vtbdrake.state import Element, discrete_state, parameter
 
@@ -101,64 +110,73 @@ class JointDrives(LeafSystem):
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
-        self._torque = self.DeclareDiscreteState(before)
-        self._motor = self.DeclareDiscreteState(before)
-        self._reference = self.DeclareDiscreteState(before)
-        self.DeclareStateOutputPort("torque", self._torque)
+        torque = self.DeclareDiscreteState(before)
+        self.DeclareStateOutputPort("torque", torque)
+        # One group for all that nobody else reads: every group costs more than the arithmetic.
+        memory = self.DeclareDiscreteState(np.tile(before, 2 + self._max_delay))
         values = [*np.concatenate(list(entries.values())), float(time_constant), float(delay)]
-        self._parameters = self.DeclareNumericParameter(BasicVector(values))
-        self.variables = self._elements(before)
+        parameters = NumericParameterIndex(self.DeclareNumericParameter(BasicVector(values)))
+        self._torque, self._memory, self._parameters = int(torque), int(memory), int(parameters)
+        self.variables = tuple(self._elements())
+        self._settings = self.DeclareCacheEntry(
+            "settings",
+            ValueProducer(allocate=lambda: Value(object()), calc=self._calc_settings),
+            {self.numeric_parameter_ticket(parameters)},
+        )
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
-    def _elements(self, before: NDArray[np.float64]) -> tuple[Element, ...]:
-        n = self._n
+    def _elements(self) -> Iterator[Element]:
+        n, index = self._n, self._parameters
+        yield discrete_state("torque", self._torque, shape=(n,), unit="N m")
+        yield discrete_state("motor_torque", self._memory, shape=(n,), unit="N m")
+        yield discrete_state("reference", self._memory, start=n, shape=(n,), unit="N m")
         units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
-        elements = [
-            discrete_state("torque", self._torque, shape=(n,), unit="N m"),
-            discrete_state("motor_torque", self._motor, shape=(n,), unit="N m"),
-            discrete_state("reference", self._reference, shape=(n,), unit="N m"),
-            *(
-                parameter(name, self._parameters, start=k * n, shape=(n,), unit=unit, bounds=(0.0, inf))
-                for k, (name, unit) in enumerate(units.items())
-            ),
-            parameter("time_constant", self._parameters, start=5 * n, unit="s", bounds=(0.0, inf)),
-            parameter("delay", self._parameters, start=5 * n + 1, unit="period", bounds=(0.0, float(self._max_delay))),
-        ]
+        for k, (name, unit) in enumerate(units.items()):
+            yield parameter(name, index, start=k * n, shape=(n,), unit=unit, bounds=(0.0, inf))
+        yield parameter("time_constant", index, start=5 * n, unit="s", bounds=(0.0, inf))
+        yield parameter("delay", index, start=5 * n + 1, unit="period", bounds=(0.0, float(self._max_delay)))
         if self._max_delay:
-            self._line = self.DeclareDiscreteState(np.tile(before, self._max_delay))
-            elements.append(discrete_state("in_transit", self._line, shape=(self._max_delay, n), unit="N m"))
-        return tuple(elements)
+            yield discrete_state("in_transit", self._memory, start=2 * n, shape=(self._max_delay, n), unit="N m")
+
+    def _calc_settings(self, context: Context, settings: Value) -> None:
+        n = self._n
+        values = context.get_numeric_parameter(self._parameters).value()
+        limit, rate, viscous, coulomb, coulomb_velocity = np.array(values[: 5 * n]).reshape(5, n)
+        time_constant, delay = values[5 * n :].tolist()
+        gain = -expm1(-self._period / time_constant) if time_constant > 0.0 else 1.0
+        # A velocity of 0 makes the friction a step.
+        width = np.maximum(coulomb_velocity, _TINY)
+        reach = rate * self._period
+        settings.set_value(_Settings(limit, reach, gain, viscous, coulomb, width, round(delay)))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
-        values = context.get_numeric_parameter(self._parameters).value()
-        limit, rate, viscous, coulomb, coulomb_velocity = values[: 5 * n].reshape(5, n)
-        time_constant, delay = values[5 * n :].tolist()
-        u = self._delayed(context, state, round(delay))
-        last = context.get_discrete_state(self._reference).value()
-        reach = rate * self._period
-        reference = np.minimum(np.maximum(u, -limit), limit)
-        reference = np.minimum(np.maximum(reference, last - reach), last + reach)
-        motor = context.get_discrete_state(self._motor).value()
-        gain = -expm1(-self._period / time_constant) if time_constant > 0.0 else 1.0
-        motor = motor + gain * (reference - motor)
+        settings: _Settings = self._settings.Eval(context)
+        u = self._command.Eval(context)
         v = self._state_port.Eval(context)[self._velocities]
-        # A velocity of 0 makes the friction a step.
-        smooth = np.tanh(v / np.maximum(coulomb_velocity, _TINY))
-        state.set_value(self._reference, reference)
-        state.set_value(self._motor, motor)
-        state.set_value(self._torque, motor - viscous * v - coulomb * smooth)
+        memory = context.get_discrete_state(self._memory).value()
+        motor, last, line = memory[:n], memory[n : 2 * n], memory[2 * n :]
+        delayed = line[(settings.delay - 1) * n : settings.delay * n] if settings.delay else u
+        reference = np.minimum(np.maximum(delayed, -settings.limit), settings.limit)
+        reference = np.minimum(np.maximum(reference, last - settings.reach), last + settings.reach)
+        motor = motor + settings.gain * (reference - motor)
+        friction = settings.viscous * v + settings.coulomb * np.tanh(v / settings.width)
+        following = (motor, reference, u, line[:-n]) if self._max_delay else (motor, reference)
+        state.set_value(self._torque, motor - friction)
+        state.set_value(self._memory, np.concatenate(following))
 
-    def _delayed(self, context: Context, state: DiscreteValues, delay: int) -> NDArray[np.float64]:
-        """The command of ``delay`` periods ago."""
-        u: NDArray[np.float64] = self._command.Eval(context)
-        if not self._max_delay:
-            return u
-        n = self._n
-        line = context.get_discrete_state(self._line).value()
-        delayed = line[(delay - 1) * n : delay * n].copy() if delay else u
-        state.set_value(self._line, np.concatenate((u, line[:-n])))
-        return delayed
+
+@dataclass(frozen=True)
+class _Settings:
+    """The parameters of `JointDrives`, as they are used."""
+
+    limit: NDArray[np.float64]
+    reach: NDArray[np.float64]
+    gain: float
+    viscous: NDArray[np.float64]
+    coulomb: NDArray[np.float64]
+    width: NDArray[np.float64]
+    delay: int
 
 
 def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:

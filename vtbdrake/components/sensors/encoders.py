@@ -17,7 +17,32 @@ if TYPE_CHECKING:
     from pydrake.multibody.tree import Joint
 
 
-class JointEncoders(SampledSensor):
+class _JointSensor(SampledSensor):
+    """Measures one entry of the plant's [q; v] for each of some joints."""
+
+    def __init__(
+        self,
+        signal: str,
+        plant: MultibodyPlant,
+        entries: Sequence[int],
+        *,
+        default: NDArray[np.float64],
+        period: float,
+        unit: str,
+        stream: int,
+        errors: ErrorModel | None,
+    ) -> None:
+        noise = {"noise": (len(entries), unit)}
+        super().__init__(signal, default=default, period=period, unit=unit, noise=noise, stream=stream, errors=errors)
+        self._entries = np.array(entries, dtype=int)
+        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        x: NDArray[np.float64] = self._state_port.Eval(context)
+        return x[self._entries]
+
+
+class JointEncoders(_JointSensor):
     """Measures the positions of joints that have one degree of freedom.
 
     .. pydrake_system::
@@ -41,25 +66,15 @@ class JointEncoders(SampledSensor):
         stream: int = 1,
         errors: ErrorModel | None = None,
     ) -> None:
-        check_single(joints, self)
-        self._indices = np.array([joint.position_start() for joint in joints], dtype=int)
+        _check_single(joints, self)
+        entries = [joint.position_start() for joint in joints]
+        default = plant.GetDefaultPositions()[entries]
         super().__init__(
-            "joint_encoders",
-            default=plant.GetDefaultPositions()[self._indices],
-            period=period,
-            unit="rad",
-            noise={"noise": (len(joints), "rad")},
-            stream=stream,
-            errors=errors,
+            "joint_encoders", plant, entries, default=default, period=period, unit="rad", stream=stream, errors=errors
         )
-        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-
-    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        x: NDArray[np.float64] = self._state_port.Eval(context)
-        return x[self._indices]
 
 
-class JointTachometers(SampledSensor):
+class JointTachometers(_JointSensor):
     """Measures the velocities of joints that have one degree of freedom.
 
     .. pydrake_system::
@@ -83,25 +98,15 @@ class JointTachometers(SampledSensor):
         stream: int = 3,
         errors: ErrorModel | None = None,
     ) -> None:
-        check_single(joints, self)
-        self._indices = np.array([plant.num_positions() + joint.velocity_start() for joint in joints], dtype=int)
+        _check_single(joints, self)
+        entries = [plant.num_positions() + joint.velocity_start() for joint in joints]
+        default = np.zeros(len(joints))
         super().__init__(
-            "joint_velocity",
-            default=np.zeros(len(joints)),
-            period=period,
-            unit="rad/s",
-            noise={"noise": (len(joints), "rad/s")},
-            stream=stream,
-            errors=errors,
+            "joint_velocity", plant, entries, default=default, period=period, unit="rad/s", stream=stream, errors=errors
         )
-        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-
-    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        x: NDArray[np.float64] = self._state_port.Eval(context)
-        return x[self._indices]
 
 
-def check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
+def _check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
     """
     Raises:
         ValueError: a joint has not exactly one degree of freedom.

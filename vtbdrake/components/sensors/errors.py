@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf, isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    NumericParameterIndex,
+    ValueProducer,
+)
 
 from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
 from vtbdrake.state import Element, discrete_state, parameter
@@ -72,69 +82,143 @@ class ErrorModel:
                 raise ValueError(f"{owner}: {name} must be {expected}, not {getattr(self, name)!r}")
 
 
+@dataclass(frozen=True)
+class _Settings:
+    """The parameters of an `ErrorStage`, as they are used. None: there is no such error."""
+
+    seed: int
+    noise: NDArray[np.float64] | None = None
+    bias: NDArray[np.float64] | None = None
+    # Of one step of the random walk.
+    drift: NDArray[np.float64] | None = None
+    quantization: NDArray[np.float64] | None = None
+    latency: int = 0
+    dropout: float = 0.0
+
+    @cached_property
+    def exact(self) -> bool:
+        """Whether there are no errors at all."""
+        found = (self.noise, self.bias, self.drift, self.quantization)
+        return not self.latency and not self.dropout and all(values is None for values in found)
+
+
+def _unless_zero(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    return np.array(values) if values.any() else None
+
+
 class ErrorStage:
-    """All of an `ErrorModel` but the white noise, in the Context of a sensor.
+    """The errors of a sensor, in its Context.
 
     Attributes:
-        variables: its parameters ``bias``, ``drift``, ``quantization`` (one per entry), ``latency`` and ``dropout``,
-            and its state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown, newest first).
+        variables: the parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also
+            ``bias``, ``drift``, ``quantization`` (one per entry), ``latency`` and ``dropout``, and the state ``walk``
+            (the drift) and ``in_transit`` (the samples not yet shown, newest first).
     """
 
     def __init__(
         self,
         sensor: LeafSystem,
-        model: ErrorModel,
+        model: ErrorModel | None,
         *,
+        noise: Mapping[str, tuple[int, str]],
+        stream: int,
         default: NDArray[np.float64],
         output: int,
         period: float,
         unit: str,
     ) -> None:
-        """``output`` is the discrete state of ``sensor`` that it shows."""
-        n = default.size
-        self._n, self._output, self._root_period = n, output, sqrt(period)
-        self._longest = max(int(model.latency), int(model.max_latency))
-        values = np.repeat([model.bias, model.drift, model.quantization], n)
-        self._parameters = int(
-            sensor.DeclareNumericParameter(BasicVector([*values, float(model.latency), float(model.dropout)]))
+        """``noise`` as `SampledSensor` has it; ``output`` is the discrete state of ``sensor`` that it shows."""
+        self._n, self._output, self._period, self._stream = default.size, output, period, stream
+        self._counts = [count for count, _ in noise.values()]
+        self._more = model is not None
+        seed, std = (0, 0.0) if model is None else (model.seed, model.noise)
+        values = [float(seed), *[std] * len(noise)]
+        if model is not None:
+            self._longest = max(int(model.latency), int(model.max_latency))
+            values += np.repeat([model.bias, model.drift, model.quantization], self._n).tolist()
+            values += [float(model.latency), float(model.dropout)]
+            self._memory = int(sensor.DeclareDiscreteState(np.r_[np.zeros(self._n), np.tile(default, self._longest)]))
+        self._parameters = int(sensor.DeclareNumericParameter(BasicVector(values)))
+        self._settings = sensor.DeclareCacheEntry(
+            "error settings",
+            ValueProducer(allocate=lambda: Value(object()), calc=self._calc_settings),
+            {sensor.numeric_parameter_ticket(NumericParameterIndex(self._parameters))},
         )
-        self._walk = int(sensor.DeclareDiscreteState(np.zeros(n)))
-        self.variables: tuple[Element, ...] = (
-            parameter("bias", self._parameters, shape=(n,), unit=unit),
-            parameter("drift", self._parameters, start=n, shape=(n,), unit=f"({unit})/s^0.5", bounds=(0.0, inf)),
-            parameter("quantization", self._parameters, start=2 * n, shape=(n,), unit=unit, bounds=(0.0, inf)),
-            parameter("latency", self._parameters, start=3 * n, unit="period", bounds=(0.0, float(self._longest))),
-            parameter("dropout", self._parameters, start=3 * n + 1, bounds=(0.0, 1.0)),
-            discrete_state("walk", self._walk, shape=(n,), unit=unit),
-        )
-        if self._longest:
-            self._line = int(sensor.DeclareDiscreteState(np.tile(default, self._longest)))
-            self.variables += (discrete_state("in_transit", self._line, shape=(self._longest, n), unit=unit),)
+        self.variables = tuple(self._elements(noise, unit))
 
-    def apply(
-        self, context: Context, state: DiscreteValues, y: NDArray[np.float64], *, seed: int, stream: int, tick: int
-    ) -> NDArray[np.float64]:
-        """What the sensor shows when it measures ``y`` (with its white noise) at ``tick``."""
-        n = self._n
+    def _elements(self, noise: Mapping[str, tuple[int, str]], unit: str) -> Iterator[Element]:
+        n, index = self._n, self._parameters
+        yield parameter("seed", index, bounds=(0.0, 2.0**53))
+        for k, (name, (_, noise_unit)) in enumerate(noise.items()):
+            yield parameter(name, index, start=1 + k, unit=noise_unit, bounds=(0.0, inf))
+        if not self._more:
+            return
+        start = 1 + len(noise)
+        yield parameter("bias", index, start=start, shape=(n,), unit=unit)
+        yield parameter("drift", index, start=start + n, shape=(n,), unit=f"({unit})/s^0.5", bounds=(0.0, inf))
+        yield parameter("quantization", index, start=start + 2 * n, shape=(n,), unit=unit, bounds=(0.0, inf))
+        yield parameter("latency", index, start=start + 3 * n, unit="period", bounds=(0.0, float(self._longest)))
+        yield parameter("dropout", index, start=start + 3 * n + 1, bounds=(0.0, 1.0))
+        yield discrete_state("walk", self._memory, shape=(n,), unit=unit)
+        if self._longest:
+            yield discrete_state("in_transit", self._memory, start=n, shape=(self._longest, n), unit=unit)
+
+    def _calc_settings(self, context: Context, settings: Value) -> None:
+        n, start = self._n, 1 + len(self._counts)
         values = context.get_numeric_parameter(self._parameters).value()
-        walk = context.get_discrete_state(self._walk).value()
-        if not (self._longest or values.any() or walk.any()):
-            return y  # the quick way of a sensor without errors
-        drift, q = values[n : 2 * n], values[2 * n : 3 * n]
-        latency, dropout = round(float(values[3 * n])), float(values[3 * n + 1])
-        if drift.any():
-            step = normal_noise(n, seed=seed, stream=stream, tick=tick, channel=_DRIFT_CHANNEL)
-            walk = walk + self._root_period * drift * step
-            state.set_value(self._walk, walk)
-        y = y + values[:n] + walk
-        if q.any():
+        found = _Settings(int(values[0]), _unless_zero(np.repeat(values[1:start], self._counts)))
+        if self._more:
+            bias, drift, quantization = values[start : start + 3 * n].reshape(3, n)
+            latency, dropout = values[start + 3 * n :].tolist()
+            found = replace(
+                found,
+                bias=_unless_zero(bias),
+                drift=_unless_zero(sqrt(self._period) * drift),
+                quantization=_unless_zero(quantization),
+                latency=round(latency),
+                dropout=dropout,
+            )
+        settings.set_value(found)
+
+    def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the sensor shows when it measures ``y``."""
+        settings: _Settings = self._settings.Eval(context)
+        if settings.exact and not (self._more and self._remembers(context)):
+            return y
+        key = {"seed": settings.seed, "stream": self._stream, "tick": round(context.get_time() / self._period)}
+        if settings.noise is not None:
+            y = y + settings.noise * normal_noise(y.size, **key)
+        return self._shown(context, state, y, settings, key) if self._more else y
+
+    def _remembers(self, context: Context) -> bool:
+        """Whether there may be samples in transit, or the walk has led away from zero."""
+        return self._longest > 0 or bool(np.count_nonzero(context.get_discrete_state(self._memory).value()))
+
+    def _shown(
+        self,
+        context: Context,
+        state: DiscreteValues,
+        y: NDArray[np.float64],
+        settings: _Settings,
+        key: Mapping[str, int],
+    ) -> NDArray[np.float64]:
+        n, q = self._n, settings.quantization
+        memory = context.get_discrete_state(self._memory).value()
+        walk = memory[:n]
+        if settings.drift is not None:
+            walk = walk + settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
+        if settings.bias is not None:
+            y = y + settings.bias
+        if np.count_nonzero(walk):
+            y = y + walk
+        if q is not None:
             steps = np.where(q > 0.0, q, 1.0)
             y = np.where(q > 0.0, np.round(y / steps) * steps, y)
-        if self._longest:
-            line = context.get_discrete_state(self._line).value()
-            state.set_value(self._line, np.concatenate((y, line[:-n])))
-            if latency:
-                y = np.array(line[(latency - 1) * n : latency * n])
-        if dropout and uniform_noise(seed=seed, stream=stream, tick=tick, channel=_DROPOUT_CHANNEL) < dropout:
-            y = np.array(context.get_discrete_state(self._output).value())
+        newest = y
+        if settings.latency:
+            y = memory[settings.latency * n : (settings.latency + 1) * n]
+        if settings.dropout and uniform_noise(channel=_DROPOUT_CHANNEL, **key) < settings.dropout:
+            y = context.get_discrete_state(self._output).value()
+        if self._longest or settings.drift is not None:
+            state.set_value(self._memory, np.concatenate((walk, newest, memory[n:]))[: memory.size])
         return y

@@ -96,7 +96,7 @@ class JointTorqueSensors(SampledSensor):
                 )
         self._places = places(plant, joints)
         # In Jc and in the frame of the parent, an axis has the same components.
-        self._axes = [joint.revolute_axis() for joint in joints]
+        self._axes = [joint.revolute_axis().tolist() for joint in joints]
         super().__init__(
             "joint_torque",
             default=np.zeros(len(joints)),
@@ -110,7 +110,10 @@ class JointTorqueSensors(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         F_CJc_Jc = self._port.Eval(context)
-        return np.array([axis @ F_CJc_Jc[k].rotational() for k, axis in zip(self._places, self._axes, strict=True)])
+        # Plain floats: for three numbers several times faster than numpy.
+        moments = [F_CJc_Jc[k].rotational().tolist() for k in self._places]
+        along = [a * x + b * y + c * z for (a, b, c), (x, y, z) in zip(self._axes, moments, strict=True)]
+        return np.array(along)
 
 
 def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:

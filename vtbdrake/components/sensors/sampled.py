@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
-from vtbdrake.components.sensors.noise import normal_noise
-from vtbdrake.state import Element, discrete_state, parameter
+from vtbdrake.state import Element, discrete_state
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -45,31 +44,28 @@ class SampledSensor(LeafSystem):
         if not period > 0:
             raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
         self._period = float(period)
-        self._stream = int(stream)
         y0 = np.asarray(default, dtype=float)
-        self._output = self.DeclareDiscreteState(y0)
-        self.DeclareStateOutputPort(signal, self._output)
+        self._output = int(self.DeclareDiscreteState(y0))
+        self.DeclareStateOutputPort(signal, DiscreteStateIndex(self._output))
         if errors is not None:
             errors.check(type(self).__name__)
             if errors.noise and not noise:
                 raise ValueError(
                     f"{type(self).__name__} has no noise, but noise={errors.noise:g} is given: leave it out."
                 )
-        self._counts = np.array([count for count, _ in noise.values()], dtype=int)
         self.variables: tuple[Element, ...] = (discrete_state(signal, self._output, shape=y0.shape, unit=unit),)
         self._stage: ErrorStage | None = None
         if noise or errors is not None:
-            seed, std = (errors.seed, errors.noise) if errors is not None else (0, 0.0)
-            self._noise = int(self.DeclareNumericParameter(BasicVector([float(seed), *[std] * len(noise)])))
-            self.variables += (
-                parameter("seed", self._noise, start=0, bounds=(0.0, 2.0**53)),
-                *(
-                    parameter(name, self._noise, start=1 + k, unit=noise_unit, bounds=(0.0, np.inf))
-                    for k, (name, (_, noise_unit)) in enumerate(noise.items())
-                ),
+            self._stage = ErrorStage(
+                self,
+                errors,
+                noise=noise,
+                stream=int(stream),
+                default=y0,
+                output=self._output,
+                period=self._period,
+                unit=unit,
             )
-        if errors is not None:
-            self._stage = ErrorStage(self, errors, default=y0, output=int(self._output), period=self._period, unit=unit)
             self.variables += self._stage.variables
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
 
@@ -84,14 +80,8 @@ class SampledSensor(LeafSystem):
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)
-        if self._counts.size or self._stage is not None:
-            seed, *stds = context.get_numeric_parameter(self._noise).value().tolist()
-            tick = round(context.get_time() / self._period)
-            if any(stds):
-                noise = normal_noise(y.size, seed=int(seed), stream=self._stream, tick=tick)
-                y = y + np.repeat(stds, self._counts) * noise
-            if self._stage is not None:
-                y = self._stage.apply(context, state, y, seed=int(seed), stream=self._stream, tick=tick)
+        if self._stage is not None:
+            y = self._stage.apply(context, state, y)
         state.set_value(self._output, y)
 
 
