@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from diagrams.answers import Answer
-from diagrams.manipulator.safety import arm_guards
+from diagrams.manipulator.safety import CONTINUITY, arm_guards
 from diagrams.manipulator.scenario import ManipulatorScenario
-from diagrams.manipulator.trials import CONTINUITY, DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
+from diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle

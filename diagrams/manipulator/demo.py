@@ -12,8 +12,8 @@ from contextlib import suppress
 import numpy as np
 
 from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
-from diagrams.manipulator.safety import arm_guards
-from diagrams.manipulator.trials import CONTINUITY, DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
+from diagrams.manipulator.safety import CONTINUITY, arm_guards
+from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle

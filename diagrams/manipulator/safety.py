@@ -18,6 +18,9 @@ from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.fallback import Fallback, FallbackController, Zero
 from vtbdrake.control.guard import Guards
 
+# The switch to real is refused where the command is further than this from the measured torque (N m).
+CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
+
 SLIP = 0.02
 """How far the held pose may be from the arm (rad)."""
 
@@ -54,6 +57,11 @@ class FloatInPlace:
         return torque
 
 
+def arm_fallback() -> dict[str, Fallback]:
+    """What commands the arm after a fault: it floats in place."""
+    return {"joint_torque": FallbackController(FloatInPlace(), otherwise=Zero())}
+
+
 def arm_guards(scenario: ManipulatorScenario, *, aging: bool = True, **options: Any) -> Guards:
     """Guards that let the arm float in place after a fault.
 
@@ -64,5 +72,4 @@ def arm_guards(scenario: ManipulatorScenario, *, aging: bool = True, **options: 
     interface = scenario.interface()
     if not aging:
         interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
-    fallback: Fallback = FallbackController(FloatInPlace(), otherwise=Zero())
-    return Guards(interface, scenario.period, fallback={"joint_torque": fallback}, **options)
+    return Guards(interface, scenario.period, fallback=arm_fallback(), **options)

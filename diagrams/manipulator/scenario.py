@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from drake import lcmt_force_torque
+from drake import lcmt_force_torque, lcmt_scope
 from pydrake.systems.framework import Diagram
 
 from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
@@ -25,6 +25,7 @@ from vtbdrake.components.sensors import (
 )
 from vtbdrake.control.lcm_types import iiwa_command, iiwa_status
 from vtbdrake.control.lcm_vectors import vector_map
+from vtbdrake.control.operation import Operation
 from vtbdrake.control.protocol import Protocol
 from vtbdrake.testbed import (
     Interface,
@@ -126,7 +127,7 @@ class ManipulatorScenario(Scenario):
         )
 
     def protocol(self) -> Protocol:
-        """What the arm speaks: the iiwa messages, and the wrench at its flange beside them."""
+        """What the arm speaks: the iiwa messages and the wrench at its flange; on ARM_MOTION one chooses the motion."""
         return Protocol(
             sense=[
                 iiwa_status(
@@ -142,8 +143,15 @@ class ManipulatorScenario(Scenario):
                 ),
             ],
             act=[iiwa_command(["joint_torque"])],
+            commands=[vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"})],
             reported={"joint_torque": "joint_torque_reported"},
         )
+
+    def operation(self) -> Operation:
+        """How the DPS is run on the arm: after a fault, the arm floats in place."""
+        from diagrams.manipulator.safety import CONTINUITY, arm_fallback
+
+        return Operation(period=self.period, guards={"fallback": arm_fallback()}, continuity=CONTINUITY)
 
     def make_dps(self) -> Diagram:
         return make_dps(self.law, period=self.period, compile=self.compile)

@@ -30,9 +30,6 @@ FREE = (SWING, CIRCLE)
 
 _STEP = 1e-4  # s, of the prediction's integration
 
-# The switch to real is refused where the command is further than this from the measured torque (N m).
-CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
-
 
 def trial_scenario(law: str) -> ManipulatorScenario:
     """The arm before the wall."""
