@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from math import floor, inf
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -18,9 +18,10 @@ from vtbdrake.control.bridge import Bridge, Reception
 from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.cycle import RESET, WRITE, Change, Cycle
 from vtbdrake.control.guard import Guards
+from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
-from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
 from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,9 @@ class Runtime:
 
     A testbed begins with its switches as they stand in ``context``; the DPS alone begins idle: it is stepped, and
     commands, from its switch to ``real`` on.
+
+    The slow parts of the DPS work beside it, each in a process of its own, from the beginning until `close`, or the end
+    of a ``with`` block.
 
     Args:
         target: what is stepped.
@@ -53,6 +57,7 @@ class Runtime:
 
     Attributes:
         cycles: how many there were.
+        slow_parts: of the DPS, with their statistics.
         steps: how many of them the DPS has done.
         start_time: of the DPS, in seconds, before its first step.
         idle: whether the DPS alone has not begun yet.
@@ -111,7 +116,20 @@ class Runtime:
         for name in bridge.commanded:
             if f"{COMMAND}{name}" not in target.variables():
                 raise ValueError(f"the command {name} comes from inside the testbed, the bridge cannot give it as well")
+        self.slow_parts = SlowParts(
+            slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.changed
+        )
         self.look()
+
+    def close(self) -> None:
+        """Ends the processes of slow parts; the last thing to do with it."""
+        self.slow_parts.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def context(self) -> Context:
@@ -206,6 +224,7 @@ class Runtime:
         if self._commanded:
             self._take_commands()
         self.feed()
+        self.slow_parts.receive()
         active = self._active
         fed = self.clock.now()
         error, commands = self._step(active)
@@ -221,6 +240,7 @@ class Runtime:
         )
         if verdict.commands:
             self.bridge.publish(verdict.commands)
+        self.slow_parts.send()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         done = Cycle(self.cycles, self.time, now, tuple(self._changes), self._fed, commands, verdict)
         self._changes.clear()
