@@ -12,7 +12,7 @@ from vtbdrake.control.machine.config import MachineConfig
 from vtbdrake.control.machine.faults import Packet
 from vtbdrake.control.protocol import Protocol
 from vtbdrake.control.reported import reported_signals
-from vtbdrake.testbed import Signal, WorldAlone
+from vtbdrake.testbed import WorldAlone
 
 
 class Sensors:
@@ -48,7 +48,7 @@ class Sensors:
         self._given = given
         carriers = reported_signals(world.interface, protocol.reported)
         known = signals | {signal.name: signal for signal in carriers.values()}
-        self._reported = {signal.name: (name, _idle(signal)) for name, signal in carriers.items()}
+        self._reported = {signal.name: (name, signal) for name, signal in carriers.items()}
         self._maps = [(map, map.writer([known[name] for name in map.signals])) for map in protocol.sense]
         self._every = {
             map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
@@ -77,12 +77,9 @@ class Sensors:
 
     def _measure(self, name: str, context: Context) -> Any:
         if name in self._reported:
-            actuator, idle = self._reported[name]
-            return self._given.get(actuator, idle)
+            actuator, signal = self._reported[name]
+            given = self._given.get(actuator, signal.idle)
+            return signal.vector(given) if signal.is_vector else given
         value = self._read[name](context)
         deviation = self._noise.get(name)
         return value if deviation is None else value + deviation * self._random.standard_normal(value.shape)
-
-
-def _idle(signal: Signal) -> Any:
-    return signal.vector(signal.idle) if signal.is_vector else signal.idle
