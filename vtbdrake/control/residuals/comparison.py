@@ -1,0 +1,183 @@
+"""Compares what a machine tells with what its model predicts, window by window."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vtbdrake.control.residuals.config import TWIN, ResidualConfig
+from vtbdrake.control.residuals.predictor import Predictor
+from vtbdrake.control.residuals.rows import INDEX, TIME, Array, RowLayout
+from vtbdrake.testbed import Interface
+
+_log = logging.getLogger(__name__)
+
+
+class Window(NamedTuple):
+    """The residuals of one prediction.
+
+    Attributes:
+        time: of the DPS at its end, in seconds.
+        residual: mean of measured less predicted over its samples, all signals one after another; NaN where there was
+            no sample.
+    """
+
+    time: float
+    residual: Array
+
+
+class ResidualLayout:
+    """Which entries of a window belong to which signal: ``sense.<name>``, and ``act.<name>`` of reported commands.
+
+    Attributes:
+        places: by signal.
+        size: of all together.
+    """
+
+    def __init__(self, interface: Interface, reported: Collection[str]) -> None:
+        self.places: dict[str, slice] = {}
+        self.size = 0
+        known = [signal for signal in interface.act if signal.name in reported]
+        for side, signals in (("sense", interface.sense), ("act", known)):
+            for signal in signals:
+                width = signal.size or 0
+                self.places[f"{side}.{signal.name}"] = slice(self.size, self.size + width)
+                self.size += width
+
+    def where(self, k: int) -> tuple[str, int]:
+        """Signal and entry of it, of entry ``k`` of a window."""
+        for name, place in self.places.items():
+            if k < place.stop:
+                return name, k - place.start
+        raise IndexError(k)
+
+
+class Comparison:
+    r"""Predicts the samples of each window from the belief at its begin, and compares them with those that came.
+
+    With the machine's samples y_i at instants i T, the belief b_s about its state at s T, the commands c_j that act
+    from j T to (j+1) T, and the model's prediction ``\hat y``, a window of H periods that begins at s has the residuals
+
+        mean over i = s+1 .. s+H of  y_i - \hat y_i(b_s, c_s, ..., c_{i-1})                  (sense)
+        mean over j = s .. s+H-1 of  (reported command of j) - (the DPS's command for j)     (act)
+
+    The DPS's command in the row of y_i is for j = i + delay; the one that is reported beside y_i acted in j = i - 1.
+    A twin is driven by the DPS's commands, a shadow by those that are reported: they are what acts.
+
+    Attributes:
+        layout: of the residuals.
+        skipped: windows that were not judged, for rows that are missing, or a belief or command in them.
+        failed: those whose prediction failed; ``error`` says how the last one did.
+    """
+
+    def __init__(self, predictor: Predictor, rows: RowLayout, config: ResidualConfig, *, mode: str) -> None:
+        self.layout = ResidualLayout(predictor.interface, rows.reported)
+        self.skipped = 0
+        self.failed = 0
+        self.error = ""
+        self._predictor = predictor
+        self._where = rows
+        self._config = config
+        self._twin = mode == TWIN
+        # Rows that have to be there before a window can be predicted, after its end.
+        self._wait = max(0, max(predictor.ages) - config.horizon)
+        self._rows: dict[int, Array] = {}
+        self._newest: int | None = None
+        self._next = 0
+        self._settled = 0
+
+    def take(self, rows: Array) -> list[Window]:
+        """The windows that further rows complete."""
+        horizon, found = self._config.horizon, []
+        for row in rows:
+            index = int(row[INDEX])
+            if self._newest is None or not 0 < index - self._newest <= horizon:
+                self._restart(index)
+            self._newest = index
+            self._rows[index] = row
+            while index >= self._next + horizon + self._wait:
+                window = self._window(self._next)
+                self._next += horizon
+                if window is not None:
+                    found.append(window)
+                oldest = self._next - max(self._config.delay, 1)
+                self._rows = {i: kept for i, kept in self._rows.items() if i >= oldest}
+        return found
+
+    def _restart(self, index: int) -> None:
+        """Begins anew with the first window all of whose rows come from here on."""
+        horizon = self._config.horizon
+        if self._newest is not None:
+            self.skipped += max(0, (index - self._next) // horizon)
+        self._rows.clear()
+        self._next = -(-(index + (self._config.delay if self._twin else 0)) // horizon) * horizon
+        self._settled = -self._config.settle
+        self._started = False
+
+    def _window(self, s: int) -> Window | None:
+        try:
+            sums, counts, whole = self._compare(s)
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            _log.warning("a prediction failed, and begins anew: %s", error)
+            self.failed += 1
+            self.error = f"{type(error).__name__}: {error}"
+            self._predictor.forget()
+            self._started = False
+            self._settled = -self._config.settle
+            return None
+        self._settled += 1
+        if self._settled <= 0:
+            return None
+        if not whole:
+            self.skipped += 1
+            return None
+        with np.errstate(invalid="ignore"):
+            return Window(float(self._rows[s + self._config.horizon][TIME]), sums / counts)
+
+    def _compare(self, s: int) -> tuple[Array, Array, bool]:
+        """Sums and counts of the differences, and whether all rows were there that it takes."""
+        whole = self._believe(s)
+        sums, counts = np.zeros(self.layout.size), np.zeros(self.layout.size)
+        for j in range(s, s + self._config.horizon):
+            commanded, told = self._rows.get(j - self._config.delay), self._rows.get(j + 1)
+            acting = self._commands(commanded if self._twin else told)
+            whole &= told is not None and len(acting) == len(self._where.command)
+            predicted = self._predictor.step(acting)
+            if told is None:
+                continue
+            for name, value in predicted.items():
+                self._add(f"sense.{name}", told[self._where.sense[name]] - value, sums, counts)
+            if commanded is not None:
+                for name, place in self._where.reported.items():
+                    self._add(f"act.{name}", told[place] - commanded[self._where.command[name]], sums, counts)
+        return sums, counts, whole
+
+    def _add(self, signal: str, difference: Array, sums: Array, counts: Array) -> None:
+        known = ~np.isnan(difference)
+        place = self.layout.places[signal]
+        sums[place][known] += difference[known]
+        counts[place][known] += 1.0
+
+    def _commands(self, row: Array | None) -> dict[str, Any]:
+        if row is None:
+            return {}
+        places = self._where.command if self._twin else self._where.reported
+        return {name: row[place] for name, place in places.items() if not np.isnan(row[place]).any()}
+
+    def _believe(self, s: int) -> bool:
+        """Sets the predicted world to what was believed of instant s; whether all of it is known."""
+        if not self._started and s in self._rows:
+            self._predictor.restart(float(self._rows[s][TIME]) - self._config.period)
+            self._started = True
+        known = self._started
+        for age, addresses in self._predictor.ages.items():
+            row = self._rows.get(s + age)
+            estimates = {} if row is None else {address: row[self._where.estimates[address]] for address in addresses}
+            if not estimates or any(np.isnan(value).any() for value in estimates.values()):
+                known = False
+            else:
+                self._predictor.believe(age, estimates)
+        return known

@@ -1,0 +1,118 @@
+"""One row of numbers per cycle: all that residuals are made of, fit to be sent to another process."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.control.cycle import Cycle
+from vtbdrake.control.residuals.config import TWIN
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import Interface, VirtualTestbed
+from vtbdrake.testbed.switch import REAL
+
+Array = NDArray[np.float64]
+
+INDEX, TIME = 0, 1
+
+
+class RowLayout:
+    """Where in a row is what; what is not known in a cycle, or not new, is NaN.
+
+    Entry 0 is the index of the sample by the machine's own time, in periods since the first; entry 1 the DPS's time at
+    the end of the cycle.
+
+    Attributes:
+        sense: by sensor signal, what the machine told.
+        command: by actuator signal, what the DPS commanded.
+        reported: by actuator signal, what the machine says acted on it in the period before the sample.
+        estimates: by address, what the DPS believes.
+        width: entries of a row.
+    """
+
+    def __init__(self, interface: Interface, reported: Collection[str], estimates: Mapping[str, int]) -> None:
+        """``estimates`` are the sizes of them, by address."""
+        self.width = 2
+        actuators = {signal.name: signal.size or 0 for signal in interface.act}
+        self.sense = self._place({signal.name: signal.size or 0 for signal in interface.sense})
+        self.command = self._place(actuators)
+        self.reported = self._place({name: size for name, size in actuators.items() if name in reported})
+        self.estimates = self._place(estimates)
+
+    def _place(self, sizes: Mapping[str, int]) -> dict[str, slice]:
+        places = {}
+        for name, size in sizes.items():
+            places[name] = slice(self.width, self.width + size)
+            self.width += size
+        return places
+
+    def empty(self, count: int) -> Array:
+        """Rows in which nothing is known yet."""
+        return np.full((count, self.width), np.nan)
+
+
+class Sampler:
+    """Fills rows with what happened in the cycles of a loop.
+
+    Args:
+        runtime: the loop; its context is read after its steps.
+        ages: by age of a belief, in periods, the addresses of its estimates, which are read once per horizon.
+        horizon: in periods.
+    """
+
+    def __init__(
+        self, runtime: Runtime, layout: RowLayout, ages: Mapping[int, Iterable[str]], *, mode: str, horizon: int
+    ) -> None:
+        self._runtime = runtime
+        self._layout = layout
+        self._sends = mode == TWIN
+        self._horizon = horizon
+        reader = runtime.target.reader
+        self._estimates = [
+            (age, [(layout.estimates[address], reader(address)) for address in addresses])
+            for age, addresses in ages.items()
+        ]
+        self._sensed = runtime.bridge.sensed
+        self._reported = [(name, runtime.bridge.reported[name]) for name in layout.reported]
+        self._counts = dict.fromkeys(layout.reported, 0)
+        self._first = np.nan
+
+    def listens(self) -> bool:
+        """Whether the DPS is fed by the machine alone, so that what it believes is about the machine."""
+        target = self._runtime.target
+        if not isinstance(target, VirtualTestbed):
+            return self._runtime.command(next(iter(self._layout.command))) is not None
+        return set(target.positions(self._runtime.context)["sense"].values()) == {REAL}
+
+    def fill(self, row: Array, cycle: Cycle) -> bool:
+        """Whether the cycle had a new sample; ``row`` is all NaN before."""
+        if not cycle.fed:
+            return False
+        sent = max(self._sensed[name].sent for name in cycle.fed)
+        if sent == sent:
+            if not self._first <= sent:  # also at first, when it is NaN, and where the sender's time was set back
+                self._first = sent
+            index = round((sent - self._first) / self._runtime.period)
+        else:
+            index = cycle.number
+        row[INDEX], row[TIME] = index, cycle.time
+        latest = sent - 0.5 * self._runtime.period
+        for name, value in cycle.fed.items():
+            # What is older than the rest came too late to be told of together with it.
+            if not self._sensed[name].sent < latest:
+                row[self._layout.sense[name]] = value
+        for name, place in self._layout.command.items():
+            command = cycle.verdict.commands.get(name) if self._sends else self._runtime.command(name)
+            if command is not None:
+                row[place] = command
+        for name, reception in self._reported:
+            if reception.count != self._counts[name]:
+                self._counts[name] = reception.count
+                row[self._layout.reported[name]] = reception.value
+        for age, estimates in self._estimates:
+            if (index - age) % self._horizon == 0:
+                for place, read in estimates:
+                    row[place] = np.ravel(read(self._runtime.context))
+        return True
