@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from drake import lcmt_force_torque, lcmt_scope
@@ -27,6 +27,7 @@ from vtbdrake.control.lcm_types import iiwa_command, iiwa_status
 from vtbdrake.control.lcm_vectors import vector_map
 from vtbdrake.control.operation import Operation
 from vtbdrake.control.protocol import Protocol
+from vtbdrake.control.residuals import ResidualConfig
 from vtbdrake.testbed import (
     Interface,
     PlantFields,
@@ -152,6 +153,24 @@ class ManipulatorScenario(Scenario):
         from diagrams.manipulator.safety import CONTINUITY, arm_fallback
 
         return Operation(period=self.period, guards={"fallback": arm_fallback()}, continuity=CONTINUITY)
+
+    def residuals(self) -> ResidualConfig:
+        """The machine's samples are compared with those of an arm whose sensors do nothing by chance."""
+        certain = {
+            name: replace(getattr(self, name), noise=0.0, drift=0.0, dropout=0.0)
+            for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
+        }
+        return ResidualConfig(
+            scenario=replace(self, **certain),
+            period=self.period,
+            tolerance={
+                "sense.joint_position": 1e-6,
+                "sense.joint_velocity": 1e-4,
+                "sense.joint_torque_measured": 0.02,
+                "sense.wrench": 0.02,
+                "act.joint_torque": 0.02,
+            },
+        )
 
     def make_dps(self) -> Diagram:
         return make_dps(self.law, period=self.period, compile=self.compile)
