@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 _log = logging.getLogger(__name__)
@@ -119,8 +119,7 @@ class Companion:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
-        order = cloudpickle.dumps((function, arguments))
-        self._send(_LENGTH.pack(len(order)) + order)
+        self.post(cloudpickle.dumps((function, arguments)))
 
     @property
     def pid(self) -> int:
@@ -138,38 +137,44 @@ class Companion:
         return self._waits
 
     def post(self, *parts: bytes) -> bool:
-        """Sends one frame, of the parts' bytes one after another; whether it was taken."""
+        """Sends one frame, of the parts' bytes one after another; whether it was taken.
+
+        What is too long to go at once is not copied: it waits as it is, and must not change.
+        """
         size = sum(map(len, parts))
         if self._gone or (self._waits and self._waits + size > self._backlog):
             self.dropped += 1
             return False
-        taken = self._send(b"".join((_LENGTH.pack(size), *parts)))
-        self.dropped += not taken
-        return taken
-
-    def _send(self, data: bytes) -> bool:
-        """Whether it goes on its way."""
-        if self._waiting:
-            self._keep(data)
-            self.flush()
-        elif (sent := self._push(data)) < len(data):
-            self._keep(data[sent:])
+        pieces: list[bytes | memoryview] = [_LENGTH.pack(size), *parts]
+        if size <= _CHUNK:
+            pieces = [memoryview(b"".join(pieces))]
+            if not self._waiting:
+                pieces = [pieces[0][self._push(pieces[0]) :]]
+        self._keep(pieces)
+        self.flush()
+        self.dropped += self._gone
         return not self._gone
 
-    def _keep(self, data: bytes) -> None:
-        self._waiting.append(memoryview(data))
-        self._waits += len(data)
+    def _keep(self, pieces: Iterable[bytes | memoryview]) -> None:
+        for piece in pieces:
+            if len(piece):
+                self._waiting.append(memoryview(piece))
+                self._waits += len(piece)
 
     def flush(self) -> None:
-        """Sends what waits, as far as there is room."""
-        while self._waiting and not self._gone:
+        """Sends what waits, as far as there is room, but not so much that it takes long."""
+        left = _CHUNK
+        while self._waiting and left > 0 and not self._gone:
             first = self._waiting[0]
-            sent = self._push(first)
+            sent = self._push(first[:left])
             self._waits -= sent
-            if sent < len(first):
+            left -= sent
+            if sent == len(first):
+                self._waiting.popleft()
+            else:
                 self._waiting[0] = first[sent:]
-                return
-            self._waiting.popleft()
+                if not sent:
+                    return
 
     def _push(self, data: bytes | memoryview) -> int:
         try:
