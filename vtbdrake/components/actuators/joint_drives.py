@@ -147,7 +147,7 @@ class JointDrives(LeafSystem):
         # A velocity of 0 makes the friction a step.
         width = np.maximum(coulomb_velocity, _TINY)
         reach = rate * self._period
-        settings.set_value(_Settings(limit, reach, gain, viscous, coulomb, width, round(delay)))
+        settings.set_value(_Settings(-limit, limit, reach, gain, viscous, coulomb, width, round(delay)))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
@@ -157,7 +157,7 @@ class JointDrives(LeafSystem):
         memory = context.get_discrete_state(self._memory).value()
         motor, last, line = memory[:n], memory[n : 2 * n], memory[2 * n :]
         delayed = line[(settings.delay - 1) * n : settings.delay * n] if settings.delay else u
-        reference = np.minimum(np.maximum(delayed, -settings.limit), settings.limit)
+        reference = np.minimum(np.maximum(delayed, settings.lower), settings.upper)
         reference = np.minimum(np.maximum(reference, last - settings.reach), last + settings.reach)
         motor = motor + settings.gain * (reference - motor)
         friction = settings.viscous * v + settings.coulomb * np.tanh(v / settings.width)
@@ -170,7 +170,8 @@ class JointDrives(LeafSystem):
 class _Settings:
     """The parameters of `JointDrives`, as they are used."""
 
-    limit: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
     reach: NDArray[np.float64]
     gain: float
     viscous: NDArray[np.float64]

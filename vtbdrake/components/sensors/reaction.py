@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
@@ -95,8 +95,8 @@ class JointTorqueSensors(SampledSensor):
                     f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute joints."
                 )
         self._places = places(plant, joints)
-        # In Jc and in the frame of the parent, an axis has the same components.
-        self._axes = [joint.revolute_axis().tolist() for joint in joints]
+        # In Jc and in the frame of the parent, an axis has the same components. A torque is the power at unit rate.
+        self._turns = [SpatialVelocity(w=joint.revolute_axis(), v=np.zeros(3)) for joint in joints]
         super().__init__(
             "joint_torque",
             default=np.zeros(len(joints)),
@@ -110,10 +110,7 @@ class JointTorqueSensors(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         F_CJc_Jc = self._port.Eval(context)
-        # Plain floats: for three numbers several times faster than numpy.
-        moments = [F_CJc_Jc[k].rotational().tolist() for k in self._places]
-        along = [a * x + b * y + c * z for (a, b, c), (x, y, z) in zip(self._axes, moments, strict=True)]
-        return np.array(along)
+        return np.array([F_CJc_Jc[k].dot(turn) for k, turn in zip(self._places, self._turns, strict=True)])
 
 
 def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:
