@@ -69,7 +69,7 @@ def test_after_an_error_in_the_quality_the_pool_serves_another_task(make):
         with pytest.raises(QualityError, match="_large_angles at t = 0 s, .* raises RuntimeError: too large"):
             list(executor.run(troubled, [{SHOULDER: 3.1}, {SHOULDER: 0.1}]))
         error_after = time.monotonic() - begin
-        assert not any(worker.job is not None for worker in getattr(executor, "_workers", []))
+        assert not any(worker.jobs for worker in getattr(executor, "_workers", []))
         _assert_right(executor, OTHER, POINTS)
     assert error_after < 4.0
 

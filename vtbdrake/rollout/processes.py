@@ -10,6 +10,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -20,6 +21,12 @@ from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import KEPT, Testbeds, failed
 
 _log = logging.getLogger(__name__)
+
+# A worker whose last rollout took less than this, in seconds, is given its next one ahead, so that it need not wait for
+# it. Where rollouts are longer this gains nothing, and one that stands behind a very long one would come late.
+_BRIEF = 0.1
+# A point of at most so many bytes fits into what a socket holds: to send it does not wait for the worker to read it.
+_SMALL = 1 << 16
 
 
 class _Worker:
@@ -40,27 +47,33 @@ class _Worker:
             )
             self.connection = Connection(ours.detach())
         self._ready = False
-        self._time_limit = float("inf")
-        self.task: bytes | None = None
-        self.job: int | None = None
-        self.deadline = float("inf")
+        self._task: bytes | None = None
+        # The rollout that it runs, and one that was given ahead.
+        self.jobs: deque[int] = deque()
+        self.deadline = inf
+        self.brief = False
 
-    def give(self, task: bytes, index: int, parameters: Parameters, *, time_limit: float) -> None:
+    def give(self, task: bytes, index: int, message: bytes) -> None:
         # Before anything is sent: a worker that was interrupted in here must not pass for an idle one.
-        self.job = index
-        self._time_limit = time_limit
-        self.deadline = float("inf")
+        self.jobs.append(index)
         if not self._ready:
             self._await_ready()
-        if self.task != task:
+        if self._task != task:
+            self.brief = False
             self.connection.send_bytes(b"T" + task)
-            self.task = task
-        kind = b"R" if time_limit == float("inf") else b"L"
-        self.connection.send_bytes(kind + pickle.dumps((index, dict(parameters))))
+            self._task = task
+        self.connection.send_bytes(message)
 
-    def begin(self) -> None:
-        """The worker has its testbed and begins its rollout: from here the time counts."""
-        self.deadline = time.monotonic() + self._time_limit
+    def begin(self, time_limit: float) -> None:
+        """It has its testbed and begins its rollout: from here the time counts."""
+        self.deadline = time.monotonic() + time_limit
+
+    def finish(self, index: int, outcome: Any) -> None:
+        """It goes on with what was given ahead."""
+        assert index == self.jobs[0], "a worker answers to another rollout than its own"
+        self.jobs.popleft()
+        self.deadline = inf
+        self.brief = isinstance(outcome, RolloutResult) and outcome.wall_time < _BRIEF
 
     def _await_ready(self) -> None:
         try:
@@ -82,7 +95,8 @@ class ProcessExecutor(Executor):
     """Processes that keep their testbed from rollout to rollout; for testbeds with systems in Python.
 
     A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
-    more by another worker, and is then a failed result.
+    more by another worker, and is then a failed result. Where rollouts are short, a worker is given the next one before
+    it has finished the last.
 
     Args:
         workers: how many; the number of cores if left out.
@@ -90,7 +104,7 @@ class ProcessExecutor(Executor):
         kept: how many testbeds each process keeps, for points with different scenario fields.
     """
 
-    def __init__(self, workers: int | None = None, *, time_limit: float = float("inf"), kept: int = KEPT) -> None:
+    def __init__(self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT) -> None:
         self._count = checked_workers(workers)
         self._time_limit = checked_time_limit(time_limit)
         self._kept = Testbeds(kept=kept).kept
@@ -111,15 +125,14 @@ class ProcessExecutor(Executor):
             self._workers.append(_Worker(self._kept))
         try:
             self._hand_out(blob, waiting, points)
-            while waiting or any(worker.job is not None for worker in self._workers):
+            while waiting or any(worker.jobs for worker in self._workers):
                 finished: list[tuple[int, RolloutResult]] = []
-                for worker, reply in self._replies():
-                    index = worker.job
-                    assert index is not None
-                    worker.job = None
+                for worker, index, reply in self._replies():
                     if isinstance(reply, RolloutResult):
                         finished.append((index, reply))
                     elif isinstance(reply, str):
+                        # What it had not begun is as good as new.
+                        waiting.extendleft(job for job in worker.jobs if job != index)
                         self._replace(worker)
                         if index in losses:
                             finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
@@ -137,44 +150,59 @@ class ProcessExecutor(Executor):
                     raise error
         finally:
             # After an error or an interruption, what still works works for nothing.
-            for worker in [worker for worker in self._workers if worker.job is not None]:
+            for worker in [worker for worker in self._workers if worker.jobs]:
                 self._workers.remove(worker)
                 worker.kill()
 
     def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
+        """A rollout for every worker that is idle; then, as long as there are enough for all, the next ones ahead."""
         for worker in list(self._workers):
-            if worker.job is None and waiting:
-                index = waiting.popleft()
-                try:
-                    worker.give(task, index, points[index], time_limit=self._time_limit)
-                except OSError:  # It died while it was idle.
-                    worker.job = None
-                    waiting.appendleft(index)
-                    self._replace(worker)
+            if waiting and not worker.jobs and not self._give(worker, task, waiting, points):
+                self._replace(worker)  # It died while it was idle.
+        for worker in self._workers:
+            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief:
+                # One that has died is found by its reply.
+                self._give(worker, task, waiting, points)
 
-    def _replies(self) -> list[tuple[_Worker, Any]]:
-        """What came in: a result, an exception to raise, or, as a string, how the worker was lost."""
-        busy = {worker.connection: worker for worker in self._workers if worker.job is not None}
+    def _give(self, worker: _Worker, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> bool:
+        """Gives the next one, unless the worker has died; one that is large is not given ahead."""
+        index = waiting[0]
+        kind = b"R" if self._time_limit == inf else b"L"
+        message = kind + pickle.dumps((index, dict(points[index])))
+        if worker.jobs and len(message) > _SMALL:
+            return True
+        waiting.popleft()
+        try:
+            worker.give(task, index, message)
+        except OSError:
+            worker.jobs.pop()
+            waiting.appendleft(index)
+            return False
+        return True
+
+    def _replies(self) -> list[tuple[_Worker, int, Any]]:
+        """What came in: worker, index, and a result, an exception to raise or, as a string, how the worker was lost."""
+        busy = {worker.connection: worker for worker in self._workers if worker.jobs}
         if not busy:
             return []
         first = min(worker.deadline for worker in busy.values())
-        ready = wait(list(busy), None if first == float("inf") else max(0.0, first - time.monotonic()))
-        replies: list[tuple[_Worker, Any]] = []
+        ready = wait(list(busy), None if first == inf else max(0.0, first - time.monotonic()))
+        replies: list[tuple[_Worker, int, Any]] = []
         for connection, worker in busy.items():
+            index = worker.jobs[0]
             if connection in ready:
                 try:
                     reply = pickle.loads(connection.recv_bytes())
                     if reply is None:
-                        worker.begin()
+                        worker.begin(self._time_limit)
                     else:
-                        index, outcome = reply
-                        assert index == worker.job, "a worker answers to another rollout than its own"
-                        replies.append((worker, outcome))
+                        worker.finish(*reply)
+                        replies.append((worker, index, reply[1]))
                 except (EOFError, OSError):
                     code = worker.process.wait()
-                    replies.append((worker, f"its worker process died (exit code {code})"))
+                    replies.append((worker, index, f"its worker process died (exit code {code})"))
             elif time.monotonic() >= worker.deadline:
-                replies.append((worker, f"it took longer than its time limit of {self._time_limit:g} s"))
+                replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))
         return replies
 
     def _replace(self, worker: _Worker) -> None:

@@ -1,0 +1,111 @@
+"""Workers that are given their next rollout ahead: it is not bound to the fate of the one before it."""
+
+import time
+from math import inf
+
+import numpy as np
+import pytest
+
+from tests.rollout.scenarios import HANG, KILL, TreacherousScenario
+from tests.testbeds import PendulumScenario
+from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, processes
+
+THETA = "sim.sys.Pendulum.theta.position"
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+GAIN = "dps.gain[0]"
+TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """However long rollouts take on this computer."""
+    monkeypatch.setattr(processes, "_BRIEF", inf)
+
+
+def _watched(executor, task, points):
+    """The results, by index, and the most rollouts that a worker had at a time."""
+    results, most = {}, 0
+    for index, result in executor.run(task, points):
+        assert index not in results
+        results[index] = result
+        most = max(most, *(len(worker.jobs) for worker in executor._workers))
+    return results, most
+
+
+def _points(count):
+    return [{THETA: 0.1 * i} for i in range(count)]
+
+
+def test_a_worker_has_its_next_rollout_before_it_has_finished_the_last(always):
+    with ProcessExecutor(1) as executor:
+        results, most = _watched(executor, TASK, _points(5))
+    assert most == 2
+    expected = dict(SerialExecutor().run(TASK, _points(5)))
+    assert all(results[i].identical(expected[i]) for i in range(5))
+
+
+def test_long_rollouts_go_to_whoever_is_free(monkeypatch):
+    monkeypatch.setattr(processes, "_BRIEF", 0.0)
+    with ProcessExecutor(1) as executor:
+        assert _watched(executor, TASK, _points(5))[1] == 1
+
+
+def test_the_last_rollouts_go_to_whoever_is_free(always):
+    with ProcessExecutor(2) as executor:
+        # When the first one is back, one waits for two workers.
+        assert _watched(executor, TASK, _points(4))[1] == 1
+        assert _watched(executor, TASK, _points(9))[1] == 2
+
+
+def test_what_would_fill_the_socket_is_not_given_ahead(always):
+    # Both sides would wait for the other to read: the worker sends a result that repeats its point.
+    points = [{THETA: np.full(200_000, 0.1 * i)} for i in range(4)]
+    with ProcessExecutor(1) as executor:
+        results, most = _watched(executor, TASK, points)
+    assert most == 1
+    assert all(results[i].failed and "200000" in results[i].message for i in range(4))
+
+
+@pytest.mark.parametrize(("how", "time_limit"), [(KILL, inf), (HANG, 2.0)])
+def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, always, tmp_path, caplog):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{SHOULDER: 0.1 * i, GAIN: 0.0} for i in range(6)]
+    with SerialExecutor() as serial:
+        expected = dict(serial.run(task, points))
+    points[1][GAIN] = how
+    with ProcessExecutor(1, time_limit=time_limit) as executor:
+        results, most = _watched(executor, task, points)
+    assert most == 2
+    # One try too many, its own, and none of the one behind it.
+    (record,) = caplog.records
+    assert record.getMessage().startswith("rollout 1 is tried again")
+    assert not results[1].failed
+    assert all(results[i].identical(expected[i]) for i in (0, 2, 3, 4, 5))
+
+
+def test_rollouts_that_kill_their_workers_one_after_another_have_two_tries_each(always, tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{GAIN: gain} for gain in (0.0, -KILL, -KILL, 0.0)]
+    with ProcessExecutor(1) as executor:
+        results, most = _watched(executor, task, points)
+    assert most == 2
+    assert [results[i].failed for i in range(4)] == [False, True, True, False]
+    assert all(results[i].message.count("died (exit code -9)") == 2 for i in (1, 2))
+
+
+def _slow(theta):
+    time.sleep(0.25)
+    return abs(theta)
+
+
+def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
+    # Each has two samples, of half a second together, and has stood behind another one.
+    task = RolloutTask(PendulumScenario(), 0.5, Quality(_slow, THETA), sample_period=0.5)
+    with ProcessExecutor(1, time_limit=0.9) as executor:
+        list(executor.run(task, _points(1)))
+        assert _watched(executor, task, _points(3))[1] == 2
+    assert caplog.text == ""
