@@ -1,0 +1,161 @@
+"""What a log says of itself: what was recorded, and how it can be built again."""
+
+from __future__ import annotations
+
+import json
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from vtbdrake.control.recording.log_format import VERSION, LogError, LoggedSignal
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, Signal, VirtualTestbed, load_scenario
+
+TESTBED, DPS = "testbed", "dps"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogHeader:
+    """The first event of a log.
+
+    Attributes:
+        version: of the format.
+        scenario: as `Scenario.save` writes it; empty where what ran was built by hand.
+        record: what identifies the scenario, see `Scenario.record`.
+        target: ``testbed`` or ``dps``, which is the DPS alone.
+        sense, act, commands: the signals.
+        period: of the loop, in seconds.
+        start_time: of the DPS, in seconds, from which its steps count.
+        steps: that it had done before the first recorded cycle.
+        first_cycle: number of the first recorded cycle.
+        initialized, idle: see `Runtime`.
+        pace: the sensor signal that began the cycles; None for the clock.
+        positions: of a testbed's switches, before the first recorded cycle.
+        versions: of vtbdrake, drake and python.
+    """
+
+    version: int = VERSION
+    scenario: str
+    record: Mapping[str, Any]
+    target: str
+    sense: Sequence[LoggedSignal]
+    act: Sequence[LoggedSignal]
+    commands: Sequence[LoggedSignal]
+    period: float
+    start_time: float
+    steps: int
+    first_cycle: int
+    initialized: bool
+    idle: bool
+    pace: str | None
+    positions: Mapping[str, Mapping[str, str]]
+    versions: Mapping[str, str] = field(default_factory=lambda: versions())
+
+    @classmethod
+    def of(cls, runtime: Runtime) -> LogHeader:
+        """That of a loop, as it stands now."""
+        target, interface = runtime.target, runtime.target.interface
+        return cls(
+            scenario=_text(target.scenario) if target.scenario else "",
+            record=target.scenario.record() if target.scenario else {},
+            target=kind_of(target),
+            sense=_logged(interface.sense),
+            act=_logged(interface.act),
+            commands=_logged(interface.commands),
+            period=runtime.period,
+            start_time=runtime.start_time,
+            steps=runtime.steps,
+            first_cycle=runtime.cycles,
+            initialized=runtime.initialized,
+            idle=runtime.idle,
+            pace=runtime.pace,
+            positions=target.positions(runtime.context) if isinstance(target, VirtualTestbed) else {},
+        )
+
+    def to_json(self) -> str:
+        """The text of the event."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> LogHeader:
+        """The inverse of `to_json`.
+
+        Raises:
+            LogError: it is of another version, or something else.
+        """
+        try:
+            values = json.loads(text)
+            if values["version"] != VERSION:
+                raise LogError(f"the log has the format {values['version']}, this version of vtbdrake reads {VERSION}")
+            for side in ("sense", "act", "commands"):
+                values[side] = tuple(LoggedSignal(*signal) for signal in values[side])
+            return cls(**values)
+        except LogError:
+            raise
+        except (ValueError, TypeError, KeyError) as error:
+            raise LogError(f"the log's header cannot be read: {error!r}") from error
+
+    def make_scenario(self) -> Scenario:
+        """The scenario that was recorded.
+
+        Raises:
+            LogError: it cannot be found or loaded, or is another one by now.
+        """
+        if not self.scenario:
+            raise LogError("the log is of something that no scenario built: give what it is to be replayed with")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scenario.yaml"
+            path.write_text(self.scenario)
+            try:
+                scenario = load_scenario(path)
+            except ScenarioError as error:
+                raise LogError(
+                    f"the scenario of the log, {self.record['scenario']}, is not to be had in this version: {error}"
+                ) from error
+        self.check(scenario)
+        return scenario
+
+    def check(self, scenario: Scenario | None) -> None:
+        """
+        Raises:
+            LogError: another one was recorded; it says what differs.
+        """
+        mine = scenario.record() if scenario is not None else {}
+        keys = ["scenario"] if mine.get("scenario") != self.record.get("scenario") else sorted({*mine, *self.record})
+        nothing = object()
+        differing = [
+            f"{key}: {self.record.get(key, 'nothing')!r} in the log, {mine.get(key, 'nothing')!r} here"
+            for key in keys
+            if mine.get(key, nothing) != self.record.get(key, nothing)
+        ]
+        if differing:
+            raise LogError(f"the log is of another scenario, or of another version of it ({'; '.join(differing)})")
+
+
+def kind_of(target: VirtualTestbed | DpsAlone) -> str:
+    """`LogHeader.target` of what is stepped."""
+    return DPS if isinstance(target, DpsAlone) else TESTBED
+
+
+def versions() -> dict[str, str]:
+    """What runs here."""
+    try:
+        own = metadata.version("vtbdrake")
+    except metadata.PackageNotFoundError:
+        own = "not installed"
+    return {"vtbdrake": own, "drake": metadata.version("drake"), "python": platform.python_version()}
+
+
+def _text(scenario: Scenario) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        scenario.save(path)
+        return path.read_text()
+
+
+def _logged(signals: Sequence[Signal]) -> tuple[LoggedSignal, ...]:
+    return tuple(LoggedSignal(signal.name, signal.size, signal.unit) for signal in signals)

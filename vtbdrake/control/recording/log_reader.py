@@ -1,0 +1,183 @@
+"""Reads what a recorder wrote, as far as it is undamaged."""
+
+from __future__ import annotations
+
+import logging
+import os
+import struct
+import zlib
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.control.lcm_wire import MalformedError, decode
+from vtbdrake.control.recording.changes import changes_of
+from vtbdrake.control.recording.control_log import ControlLog, Damage, Gap
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
+from vtbdrake.control.recording.log_events import LogEvents
+from vtbdrake.control.recording.log_format import (
+    CHANGE,
+    COMMANDED,
+    CYCLE,
+    DIGEST,
+    END,
+    FAULT,
+    LOG,
+    SENT,
+    STATE,
+    CycleLayout,
+    LogError,
+)
+from vtbdrake.control.recording.log_header import LogHeader
+from vtbdrake.control.recording.start import snapshot_of
+from vtbdrake.state import Snapshot
+from vtbdrake.state.archive import ArchiveError
+
+_log = logging.getLogger(__name__)
+
+JUMP = 0.1
+"""Seconds by which the time of day may change against the loop's clock from one cycle to the next."""
+
+
+def read_log(path: str | os.PathLike[str]) -> ControlLog:
+    """The log in a file that a `Recorder` wrote.
+
+    A file that is cut off or damaged is read all the same: `ControlLog.damages` and `ControlLog.gaps` say what is not
+    there, and a warning is logged. A cycle counts only if the checksum over all its events is right.
+
+    Raises:
+        OSError: the file cannot be read.
+        LogError: it is no log of a control loop, of another version, or damaged in its first two events.
+    """
+    path = Path(path)
+    events = LogEvents(path)
+    header, start = _begin(path, events)
+    layout = CycleLayout(header.sense, header.act)
+    damages = [Damage(*damage) for damage in events.damages]
+    records = _cycles(events, layout, damages)
+    index = {number: i for i, number in enumerate(records["number"].tolist())}
+    source, act = records["source"], records["act"]
+    log = ControlLog(
+        path=path,
+        header=header,
+        start=start,
+        numbers=records["number"].astype(int),
+        times=records["time"].astype(float),
+        now=records["now"].astype(float),
+        utimes=records["utime"].astype(int),
+        ok=records["ok"].copy(),
+        fed=_columns(records["fed"], layout.fed),
+        sources={signal.name: source[:, i].astype(int) for i, signal in enumerate(header.sense)},
+        commands=_where(records["commands"], layout, header, act & COMMANDED),
+        commanded={signal.name: act[:, i] & COMMANDED != 0 for i, signal in enumerate(header.act)},
+        sent=_where(records["sent"], layout, header, act & SENT),
+        changes=[(index[number], change) for number, change in _changes(events, index, damages)],
+        faults=[
+            (index[message.number], tuple(message.reasons))
+            for message in _messages(events, FAULT, lcmt_vtb_fault, damages)
+            if message.number in index
+        ],
+        digests=[
+            (index[message.number], message.digest)
+            for message in _messages(events, DIGEST, lcmt_vtb_digest, damages)
+            if message.number in index
+        ],
+        damages=damages,
+        gaps=_gaps(header, records["number"], [m.number for m in _messages(events, END, lcmt_vtb_end, damages)]),
+        clock_jumps=_jumps(records),
+        closed=bool(events.on(END)),
+        events=events,
+    )
+    damages.sort()
+    if damages or log.gaps or log.clock_jumps or not log.closed:
+        _log.warning("%s", log)
+    return log
+
+
+def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
+    if not events.on(LOG):
+        where = f"; {events.damages[0][1]} at byte {events.damages[0][0]}" if events.damages else ""
+        raise LogError(f"{path} is no log of a control loop: it has no event on {LOG}{where}")
+    try:
+        header = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
+        if zlib.crc32(header.header.encode()) != header.crc & 0xFFFFFFFF:
+            raise LogError(f"{path} cannot be used: its header is damaged")
+        if not events.on(STATE):
+            raise LogError(f"{path} cannot be used: the state before the first cycle is not there")
+        state = decode(lcmt_vtb_state, events.data(*events.on(STATE)[0][2:]))
+        return LogHeader.from_json(header.header), snapshot_of(state.snapshot)
+    except (MalformedError, ArchiveError) as error:
+        raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
+
+
+def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> np.ndarray:
+    """The cycles that are whole, in order."""
+    content, size = memoryview(events.content), layout.dtype.itemsize
+    whole: list[bytes] = []
+    frame_size, numbers = struct.Struct(">iI"), struct.Struct(">q")
+    newest = -1
+    for _, _, begin, end in events.on(CYCLE):
+        what = "a cycle of another length"
+        if end - begin == size:
+            length, crc = frame_size.unpack_from(content, end - frame_size.size)
+            (number,) = numbers.unpack_from(content, begin + 16)
+            if not size < length <= end or zlib.crc32(content[end - length : end - 4]) != crc:
+                what = f"the checksum of cycle {number} is wrong"
+            elif number <= newest:
+                what = f"cycle {number} follows cycle {newest}"
+            else:
+                newest = number
+                whole.append(bytes(content[begin:end]))
+                continue
+        damages.append(Damage(begin, what))
+    records = np.frombuffer(b"".join(whole), layout.dtype)
+    if not layout.fits(records).all():
+        raise LogError("the log's cycles do not have the signals that its header tells of")
+    return records
+
+
+def _columns(entries: np.ndarray, parts: dict[str, slice]) -> dict[str, np.ndarray]:
+    return {name: np.ascontiguousarray(entries[:, part], dtype=float) for name, part in parts.items()}
+
+
+def _where(entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of actuator signals; NaN where a signal has no value."""
+    columns = _columns(entries, layout.commands)
+    for i, signal in enumerate(header.act):
+        if signal.name in columns:
+            columns[signal.name][flags[:, i] == 0] = np.nan
+    return columns
+
+
+def _messages(events: LogEvents, channel: str, message_type: Any, damages: list[Damage]) -> list[Any]:
+    found = []
+    for _, _, begin, end in events.on(channel):
+        try:
+            found.append(decode(message_type, events.data(begin, end)))
+        except (MalformedError, struct.error, ValueError) as error:
+            damages.append(Damage(begin, f"an event on {channel} cannot be read ({error})"))
+    return found
+
+
+def _changes(events: LogEvents, index: dict[int, int], damages: list[Damage]) -> Sequence[tuple[int, Any]]:
+    messages = _messages(events, CHANGE, lcmt_vtb_change, damages)
+    # Of a cycle whose checksum is wrong, nothing is believed.
+    return changes_of(message for message in messages if message.number in index)
+
+
+def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
+    known = [header.first_cycle - 1, *numbers.tolist(), *(number + 1 for number in ends)]
+    return [Gap(a + 1, b - 1) for a, b in pairwise(known) if b > a + 1]
+
+
+def _jumps(records: np.ndarray) -> list[int]:
+    day, clock = np.diff(1e-6 * records["utime"]), np.diff(records["now"])
+    return [int(i) + 1 for i in np.flatnonzero((np.abs(day - clock) > JUMP) | (clock < 0.0))]

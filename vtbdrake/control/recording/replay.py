@@ -1,0 +1,216 @@
+"""Replays a log: the DPS does again, bit for bit, what it did."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vtbdrake.control.boundary import RealPorts
+from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.control.recording.abstract_values import abstract_values
+from vtbdrake.control.recording.control_log import ControlLog
+from vtbdrake.control.recording.digest import StateDigest
+from vtbdrake.control.recording.log_format import LogError
+from vtbdrake.control.recording.log_header import kind_of, versions
+from vtbdrake.control.recording.log_reader import read_log
+from vtbdrake.control.recording.replay_report import (
+    DIFFERENT,
+    IDENTICAL,
+    NOT_COMPARED,
+    ReplayReport,
+    differences,
+    largest_differences,
+)
+from vtbdrake.control.recording.replay_start import Target, begin, recorded_target
+from vtbdrake.control.switching import throw
+from vtbdrake.state.systems import leaves
+from vtbdrake.testbed import VirtualTestbed
+
+TICK = "tick"
+"""Of the values of a result: the number of its sample."""
+
+
+def replay(
+    log: ControlLog | str | os.PathLike[str],
+    target: Target | None = None,
+    *,
+    values: Mapping[str, Any] | None = None,
+    record: Sequence[str] = (),
+) -> ReplayReport:
+    """Has the DPS do again what it did when ``log`` was recorded, and compares.
+
+    It begins in the recorded state, gets in every cycle what it got, and is stepped as it was; its commands, its time
+    and the digests of its state must be the same to the last bit. A cycle in which the DPS raised raises again. Where
+    cycles are missing in the log, the replay ends.
+
+    Args:
+        log: as of `read_log`, or a file.
+        target: what is stepped; by default what was recorded, built from the log's scenario. A `DpsAlone` can replay
+            the log of a testbed whose sensor signals were all on real; a testbed can replay the log of a DPS alone,
+            with its simulated world idle beside it.
+        values: of variables, by address, that hold from the beginning on, whatever the log says of them: what would the
+            DPS have commanded with another gain? Nothing is compared then.
+        record: addresses of variables or output ports to be read after every cycle.
+
+    Raises:
+        OSError, LogError: the log cannot be read, or is of another scenario or another version of it; it says what
+            differs.
+        AddressError: an address is unknown.
+    """
+    log = log if isinstance(log, ControlLog) else read_log(log)
+    target = target or recorded_target(log)
+    run = _Replay(log, target, dict(values or {}), record)
+    run.run()
+    found = differences(log, run.times, run.commands, run.commanded, run.digests, all_told=run.same_kind)
+    outcome = NOT_COMPARED if values else DIFFERENT if found else IDENTICAL
+    here = versions()
+    return ReplayReport(
+        outcome=outcome,
+        cycles=run.count,
+        ended=run.ended,
+        first_difference=found[0] if outcome == DIFFERENT else None,
+        max_difference={} if values else largest_differences(log, run.commands),
+        digests=len(run.digests),
+        versions=tuple(
+            f"recorded with {name} {version}, replayed with {here.get(name)}"
+            for name, version in log.header.versions.items()
+            if here.get(name) != version
+        ),
+        times=run.times,
+        commands=run.commands,
+        errors=run.errors,
+        record={address: _stacked(samples) for address, samples in run.record.items()},
+    )
+
+
+class _Replay:
+    """One replay, up to the first gap.
+
+    Attributes:
+        same_kind: whether the target is what was recorded.
+        errors: what the DPS raised, by the number of the cycle.
+    """
+
+    def __init__(self, log: ControlLog, target: Target, values: dict[str, Any], record: Sequence[str]) -> None:
+        header = log.header
+        self.same_kind = kind_of(target) == header.target
+        self._log, self._target, self._values = log, target, values
+        self._context = context = begin(log, target)
+        target.write(context, values)
+        self._simulator = target.simulator(context, restored=header.initialized)
+        self._ports = RealPorts(target, context)
+        self._slow_parts: dict[str, Any] = {
+            p: system for p, system in leaves(target.diagram) if hasattr(system, "deliver")
+        }
+        self._idle, self._steps = header.idle, header.steps
+        self._digest = StateDigest(target, context)
+        self._readers = {address: target.reader(address) for address in record}
+        self._decoders = abstract_values(log, target)
+        self.count = n = _until_gap(log)
+        self.ended = f"the log lacks {log.gaps[0]}: what came then cannot be repeated" if log.gaps else ""
+        self.times = np.empty(n)
+        self.commands = {name: np.full((n, values.shape[1]), np.nan) for name, values in log.commands.items()}
+        self.commanded = {name: np.zeros(n, bool) for name in log.commanded}
+        self.digests: list[tuple[int, bytes]] = []
+        self.errors: dict[int, str] = {}
+        self.record: dict[str, list[Any]] = {address: [] for address in record}
+        self._active: list[str] = []
+        self._look()
+
+    def run(self) -> None:
+        """All cycles."""
+        log, feed, context = self._log, self._ports.feed, self._context
+        vectors = [(log.sources[name].tolist(), name, values) for name, values in log.fed.items()]
+        changes: dict[int, list[Change]] = {}
+        for i, change in log.changes:
+            changes.setdefault(i, []).append(change)
+        digests = {i for i, _ in log.digests}
+        for i in range(self.count):
+            for new, name, values in vectors:
+                if new[i]:
+                    feed(name, values[i])
+            for name, value in self._decoders.items():
+                if event := log.sources[name][i]:
+                    feed(name, value(event))
+            # What is fed is there before a switch lets the DPS see it.
+            for change in changes.get(i, ()):
+                self._apply(change)
+            if not self._idle:
+                self._step(i)
+            self.times[i] = self._time(self._steps)
+            if i in digests:
+                self.digests.append((i, self._digest()))
+            for address, read in self._readers.items():
+                self.record[address].append(read(context))
+
+    def _time(self, steps: int) -> float:
+        # As the runtime computes it, to the last bit.
+        return self._log.header.start_time + steps * self._log.header.period
+
+    def _step(self, i: int) -> None:
+        try:
+            self._simulator.AdvanceTo(self._time(self._steps + 1))
+            self._steps += 1
+            for name, value in self._ports.commands(self._active).items():
+                if name in self.commands:
+                    self.commands[name][i] = value
+                self.commanded[name][i] = True
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # As it may have done in the loop, which then went on: the comparison tells.
+            self.errors[int(self._log.numbers[i])] = f"{type(error).__name__}: {error}"
+
+    def _look(self) -> None:
+        self._active = [] if self._idle else self._ports.active()
+
+    # -- changes
+
+    def _apply(self, change: Change) -> None:
+        if change.kind not in self._CHANGES:
+            raise LogError(
+                f"the log has a change of the kind {change.kind!r}, this version of vtbdrake knows none such"
+            )
+        self._CHANGES[change.kind](self, change.values)
+
+    def _write(self, values: Mapping[str, Any]) -> None:
+        # The DPS alone has no variables of the simulated world.
+        self._target.write(self._context, {a: value for a, value in values.items() if a in self._target.variables()})
+        self._target.write(self._context, self._values)
+
+    def _switch(self, values: Mapping[str, Any]) -> None:
+        if self.same_kind and isinstance(self._target, VirtualTestbed):
+            sides: dict[str, dict[str, str]] = {"sense": {}, "act": {}}
+            for name, position in values.items():
+                side, _, signal = name.partition(".")
+                sides[side][signal] = position
+            throw(self._target, self._context, sides["sense"], sides["act"])
+        elif isinstance(self._target, VirtualTestbed):
+            self._target.switch(self._context, "real")
+        self._idle = False
+        self._look()
+
+    def _reset(self, values: Mapping[str, Any]) -> None:
+        """The guards are not replayed: what was sent is in the log."""
+
+    def _deliver(self, values: Mapping[str, Any]) -> None:
+        for path, result in values.items():
+            arrays = {name: np.asarray(array) for name, array in result.items() if name != TICK}
+            self._slow_parts[path].deliver(self._context, result[TICK], arrays)
+
+    _CHANGES: ClassVar[Mapping[str, Callable[[Any, Mapping[str, Any]], None]]] = {
+        WRITE: _write,
+        SWITCH: _switch,
+        RESET: _reset,
+        RESULT: _deliver,
+    }
+
+
+def _until_gap(log: ControlLog) -> int:
+    """How many cycles there are before the first gap."""
+    return int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)
+
+
+def _stacked(samples: list[Any]) -> Any:
+    return np.array(samples) if all(isinstance(sample, float | np.ndarray) for sample in samples) else samples
