@@ -10,36 +10,22 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.testbed import Command, Signal
 from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.feed import Feed
 
 
 class RealPorts:
     """``real.sense.*``, ``real.act.*`` and ``real.act.active`` of one context.
 
-    A value that was fixed once is changed in place afterwards, which costs a microsecond or two; a pointer to it is
-    never kept from cycle to cycle, since a write through an old one would not be noticed.
+    Attributes:
+        feed: gives a sensor signal its newest value, by name.
     """
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:
         diagram, interface = target.diagram, target.interface
         self._context = context
-        self._inputs = {s.name: (s, diagram.GetInputPort(f"real.sense.{s.name}")) for s in interface.sense}
+        self.feed = Feed({s.name: (s, diagram.GetInputPort(f"real.sense.{s.name}")) for s in interface.sense}, context)
         self._outputs = {s.name: (s, diagram.GetOutputPort(f"real.act.{s.name}")) for s in interface.act}
         self._active = diagram.GetOutputPort("real.act.active") if interface.act else None
-        self._fixed: dict[str, tuple[bool, Any]] = {}
-
-    def feed(self, name: str, value: Any) -> None:
-        """Gives a sensor signal its newest value."""
-        if name not in self._fixed:
-            signal, port = self._inputs[name]
-            fixed = port.FixValue(self._context, value if signal.is_vector else _wrapped(signal, value))
-            self._fixed[name] = (signal.is_vector, fixed)
-            return
-        is_vector, fixed = self._fixed[name]
-        data = fixed.GetMutableData()
-        if is_vector:
-            data.get_mutable_value().SetFromVector(value)
-        else:
-            data.set_value(value)
 
     def active(self) -> list[str]:
         """The actuator signals that are on real; it asks the switches and not the DPS."""
@@ -57,9 +43,3 @@ class RealPorts:
             return np.array(port.Eval(self._context))
         value = port.Eval(self._context)
         return value.value if isinstance(value, Command) else value
-
-
-def _wrapped(signal: Signal, value: Any) -> Any:
-    wrapped = signal.abstract_value()
-    wrapped.set_value(value)
-    return wrapped

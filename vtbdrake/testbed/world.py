@@ -12,6 +12,7 @@ from vtbdrake.state import Variable, collect
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.feed import Feed
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -71,10 +72,10 @@ class WorldAlone(AddressedDiagram):
 
     def command(self, context: Context, name: str, value: Any) -> None:
         """Gives the simulated actuator ``name`` a command, which lasts until the next one."""
-        signal, port = self._actuators[name]
-        if signal.is_vector:
-            port.FixValue(context, value if np.shape(value) == (signal.size,) else signal.vector(value))
-        else:
-            wrapped = signal.abstract_value()
-            wrapped.set_value(value)
-            port.FixValue(context, wrapped)
+        signal, _ = self._actuators[name]
+        vector = signal.is_vector and np.shape(value) != (signal.size,)
+        self.feed(context)(name, signal.vector(value) if vector else value)
+
+    def feed(self, context: Context) -> Feed:
+        """What commands the simulated actuators of one context again and again, at the lowest cost."""
+        return Feed(self._actuators, context)

@@ -33,7 +33,7 @@ class Brake:
             raise ValueError("only the joints of a discrete plant can be locked: choose the brake idle or hold")
         self.kind = kind or (LOCK if lockable else IDLE)
         self.engaged = False
-        self._idle = {signal.name: signal.idle for signal in world.interface.act}
+        self._idle = {s.name: s.vector(s.idle) if s.is_vector else s.idle for s in world.interface.act}
         self._plant = plant
         self._joints = []
         if plant is not None and self.kind == LOCK:
@@ -57,5 +57,5 @@ class Brake:
                     joint.Unlock(own)
 
     def idle(self) -> Mapping[str, Any]:
-        """The idle commands, by signal."""
+        """The idle commands, by signal; of a vector signal as an array of its size."""
         return self._idle

@@ -58,8 +58,9 @@ class Line:
             if _concerns(fault, packet.channel):
                 packets = [arrived for sent in packets for arrived in effect(sent)]
         for late in packets:
-            due = late.due + self._delay
-            heapq.heappush(self._waiting, (due, next(self._numbers), late._replace(due=due)))
+            if self._delay:
+                late = late._replace(due=late.due + self._delay)
+            heapq.heappush(self._waiting, (late.due, next(self._numbers), late))
 
     def arrivals(self, cycle: int) -> list[Packet]:
         """What arrives up to ``cycle``, in order."""

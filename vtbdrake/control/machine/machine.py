@@ -91,7 +91,9 @@ class Machine:
             side: Line(side, delay=whole_cycles(delay, config.period), period=config.period, random=random)
             for side, delay, random in ((SENSE, config.sense_delay, sense), (ACT, config.act_delay, act))
         }
-        self._given: dict[str, Any] = {}
+        self._brake = Brake(world, config.brake)
+        self._given = dict(self._brake.idle())
+        self._feed = world.feed(self._context)
         self._sensors = Sensors(world, self.protocol, config, noise, given=self._given)
         signals = {signal.name: signal for signal in world.interface.act}
         self._receptions = {name: Reception() for name in signals}
@@ -103,7 +105,6 @@ class Machine:
         self._accepted: dict[str, float] = dict.fromkeys(self._receptions, -inf)
         self._counts = dict.fromkeys(self._receptions, 0)
         self._patience = whole_cycles(config.timeout, config.period)
-        self._brake = Brake(world, config.brake)
         self._silent: list[str] = []
 
     @property
@@ -164,9 +165,9 @@ class Machine:
 
     def _give(self, name: str, value: Any) -> None:
         # Receptions hold a new object for every message: what is the same object has not changed.
-        if name not in self._given or self._given[name] is not value:
+        if self._given[name] is not value:
             self._given[name] = value
-            self.world.command(self._context, name, value)
+            self._feed(name, value)
 
     def messages(self) -> list[tuple[str, bytes]]:
         """Tells the present state: channel and bytes of what arrives at the controller now, in order."""

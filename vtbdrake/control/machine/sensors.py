@@ -33,7 +33,7 @@ class Sensors:
     ) -> None:
         """
         Args:
-            given: the commands that act, by actuator signal, kept up to date from outside.
+            given: the commands that act, by actuator signal (of a vector as an array), kept up to date from outside.
 
         Raises:
             ValueError: there is to be noise on what is no vector sensor signal.
@@ -48,13 +48,14 @@ class Sensors:
         self._given = given
         carriers = reported_signals(world.interface, protocol.reported)
         known = signals | {signal.name: signal for signal in carriers.values()}
-        self._reported = {signal.name: (name, signal) for name, signal in carriers.items()}
+        self._reported = {signal.name: name for name, signal in carriers.items()}
         self._maps = [(map, map.writer([known[name] for name in map.signals])) for map in protocol.sense]
         self._every = {
             map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
             for map in protocol.sense
         }
-        self._read = {name: world.reader(f"sense.{name}") for name in signals}
+        self._ports = {name: world.diagram.GetOutputPort(f"sense.{name}") for name in vectors}
+        self._readers = {name: world.reader(f"sense.{name}") for name in signals if name not in vectors}
         self.channels = list(self._every)
 
     def packets(self, context: Context, cycle: int, utime: int, errors: Mapping[str, int]) -> list[Packet]:
@@ -77,9 +78,10 @@ class Sensors:
 
     def _measure(self, name: str, context: Context) -> Any:
         if name in self._reported:
-            actuator, signal = self._reported[name]
-            given = self._given.get(actuator, signal.idle)
-            return signal.vector(given) if signal.is_vector else given
-        value = self._read[name](context)
+            return self._given[self._reported[name]]
+        if name not in self._ports:
+            return self._readers[name](context)
+        # Not a copy: it becomes a message before anything changes.
+        value = self._ports[name].Eval(context)
         deviation = self._noise.get(name)
         return value if deviation is None else value + deviation * self._random.standard_normal(value.shape)
