@@ -10,7 +10,10 @@ if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
     from vtbdrake.control.hub import Hub
     from vtbdrake.control.lcm_bridge import LcmBridge
+    from vtbdrake.control.live.client import LiveWatch, ParameterClient, watch
+    from vtbdrake.control.live.service import LiveService
     from vtbdrake.control.machine import MachineProcess
+    from vtbdrake.control.operation import Operation
     from vtbdrake.control.protocol import Protocol
     from vtbdrake.control.runtime import Runtime
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
@@ -39,8 +42,12 @@ __all__ = [
     "Hub",
     "Interface",
     "LcmBridge",
+    "LiveService",
+    "LiveWatch",
     "MachineProcess",
+    "Operation",
     "Parameter",
+    "ParameterClient",
     "PlantFields",
     "Problem",
     "Protocol",
@@ -58,13 +65,17 @@ __all__ = [
     "VirtualTestbed",
     "VirtualTestbedBuilder",
     "load_scenario",
+    "watch",
 ]
 
 _HOMES = {
     "control.guard": ("Guards",),
     "control.hub": ("Hub",),
     "control.lcm_bridge": ("LcmBridge",),
+    "control.live.client": ("LiveWatch", "ParameterClient", "watch"),
+    "control.live.service": ("LiveService",),
     "control.machine": ("MachineProcess",),
+    "control.operation": ("Operation",),
     "control.protocol": ("Protocol",),
     "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),

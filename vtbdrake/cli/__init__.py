@@ -5,11 +5,17 @@ from vtbdrake.cli.group import main
 main.homes |= {
     "boundary": "vtbdrake.cli.boundary:find_boundary",
     "diagram": "vtbdrake.cli.diagram:draw_diagram",
+    "export": "vtbdrake.cli.export:export_log",
+    "get": "vtbdrake.cli.parameters:get_values",
     "hub": "vtbdrake.cli.hub:run_hub",
     "machine": "vtbdrake.cli.machine:run_machine",
+    "replay": "vtbdrake.cli.replay:replay_log",
     "rollout": "vtbdrake.cli.rollout:run_rollout",
+    "run": "vtbdrake.cli.run:run_dps",
+    "set": "vtbdrake.cli.parameters:set_values",
     "sweep": "vtbdrake.cli.sweep:run_sweep",
     "variables": "vtbdrake.cli.variables:list_variables",
+    "watch": "vtbdrake.cli.watch:watch_values",
 }
 
 __all__ = ["main"]

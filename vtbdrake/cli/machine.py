@@ -8,7 +8,15 @@ from math import inf
 import click
 
 from vtbdrake.cli.group import FailedError, one_line
-from vtbdrake.cli.options import Setting, converted, parse_setting, scenario_argument, set_option, settings
+from vtbdrake.cli.options import (
+    Setting,
+    converted,
+    parse_setting,
+    scenario_argument,
+    set_option,
+    settings,
+    url_option,
+)
 from vtbdrake.cli.text import number
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.machine import Machine, MachineConfig
@@ -28,7 +36,7 @@ def _parse_noise(text: str) -> tuple[str, float]:
 
 @click.command("machine")
 @scenario_argument
-@click.option("--url", required=True, metavar="URL", help="The LCM bus: tcpq://127.0.0.1:7700, of a hub, say.")
+@url_option
 @click.option(
     "--period",
     type=float,

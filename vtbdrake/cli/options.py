@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.state import Snapshot
-from vtbdrake.testbed import load_scenario
+from vtbdrake.testbed import Scenario, load_scenario
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Parameter
@@ -42,6 +42,17 @@ def parse_setting(text: str) -> Setting:
     if isinstance(number, bool) or not isinstance(number, int | float | list):
         raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
     return address, number
+
+
+def parse_field(text: str) -> tuple[str, Any]:
+    """``NAME=VALUE``, the value in JSON, or else a text."""
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (name and equals and value):
+        raise click.BadParameter(f"it takes NAME=VALUE, not {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
 
 
 def parse_condition(text: str) -> dict[str, Any]:
@@ -101,6 +112,25 @@ set_option = click.option(
     metavar="ADDRESS=VALUE",
     help="Set a variable in s0: a number, or a JSON list. May be repeated.",
 )
+field_option = click.option(
+    "--field",
+    "fields",
+    callback=converted(parse_field),
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Set a field of the scenario: a number, true, false or a text. May be repeated.",
+)
+url_option = click.option(
+    "--url", required=True, metavar="URL", help="The LCM bus: tcpq://127.0.0.1:7700, of a hub, say."
+)
+timeout_option = click.option(
+    "--timeout",
+    type=float,
+    default=5.0,
+    show_default=True,
+    metavar="S",
+    help="Give up when nobody has answered for so long.",
+)
 horizon_option = click.option("--horizon", type=float, required=True, metavar="S", help="t_m, in seconds.")
 sample_period_option = click.option(
     "--sample-period",
@@ -116,6 +146,21 @@ start_option = click.option(
     metavar="SNAPSHOT",
     help="Take s0 from this file instead of the defaults.",
 )
+
+
+def with_fields(scenario: Scenario, pairs: Iterable[tuple[str, Any]]) -> Scenario:
+    """A copy of the scenario with these fields.
+
+    Raises:
+        click.UsageError: a field is set twice.
+        ScenarioError: the scenario refuses one.
+    """
+    values: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in values:
+            raise click.UsageError(f"the field {name} is set twice")
+        values[name] = value
+    return scenario.with_fields(values)
 
 
 def settings(pairs: Iterable[Setting]) -> dict[str, Any]:

@@ -111,6 +111,12 @@ class LcmLink:
             raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
         return connection
 
+    @property
+    def sources(self) -> list[Connection]:
+        """What becomes readable when messages arrive, for `select`; empty while there is no bus."""
+        connection = self._current()
+        return [] if connection is None else [connection]
+
     def take(self, timeout: float, limit: int) -> int:
         """Hands messages to their handlers, waiting up to ``timeout`` seconds for the first; says how many."""
         connection = self._required()

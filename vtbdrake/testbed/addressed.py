@@ -98,6 +98,10 @@ class AddressedDiagram:
         hint = suggestion(address, [*self._variables, *self._ports])
         raise AddressError(f"there is no variable and no output port {address!r}{hint}")
 
+    def addresses(self) -> list[str]:
+        """Of every variable and every output port."""
+        return [*self._variables, *self._ports]
+
     @cached_property
     def _ports(self) -> dict[str, tuple[System, OutputPort]]:
         ports = {}

@@ -1,0 +1,51 @@
+"""``vtbdrake set`` and ``vtbdrake get``: variables of a DPS that runs in another process."""
+
+from __future__ import annotations
+
+import click
+import numpy as np
+
+from vtbdrake.cli.group import FailedError, one_line
+from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
+from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.live.client import LiveError, ParameterClient, SilenceError
+
+
+@click.command("set")
+@click.argument("values", nargs=-1, required=True, callback=converted(parse_setting), metavar="ADDRESS=VALUE...")
+@url_option
+@timeout_option
+def set_values(values: tuple[Setting, ...], url: str, timeout: float) -> None:
+    """Set variables of a DPS that runs by vtbdrake run: all of them between two cycles, or none.
+
+    A value is a number or a JSON list of numbers. The exit code is 1 if they are refused, or if nobody answers.
+
+    \b
+    Example:
+      vtbdrake set --url tcpq://127.0.0.1:7700 u.motion=2 "dps.impl.stiffness=[20,20,20,900,900,900]"
+    """
+    try:
+        with ParameterClient(url, timeout=timeout) as client:
+            client.set(settings(values))
+    except (BridgeError, LiveError, SilenceError) as error:
+        raise FailedError(one_line(error)) from error
+
+
+@click.command("get")
+@click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
+@url_option
+@timeout_option
+def get_values(addresses: tuple[str, ...], url: str, timeout: float) -> None:
+    """Print variables and output ports of a DPS that runs by vtbdrake run, as they are between two cycles.
+
+    \b
+    Example:
+      vtbdrake get --url tcpq://127.0.0.1:7700 u.motion dps.impl.stiffness
+    """
+    try:
+        with ParameterClient(url, timeout=timeout) as client:
+            values = client.get(addresses)
+    except (BridgeError, LiveError, SilenceError) as error:
+        raise FailedError(one_line(error)) from error
+    for address, value in values.items():
+        click.echo(f"{address} = {np.asarray(value).tolist()}")

@@ -1,0 +1,312 @@
+"""The part of those who set, read and watch variables of a DPS that runs in another process."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.lcm_link import LcmLink
+from vtbdrake.control.live.messages import ANSWER, GET, SET, WATCH, WATCHED, parse, to_json
+
+_CONNECT_TIMEOUT = 2.0  # s
+_BURST = 1000  # messages to take in at a time
+_SLICE = 0.2  # s; longest wait for a message before looking at the clock
+
+Values = dict[str, float | NDArray[np.float64]]
+
+
+class LiveError(ValueError):
+    """The DPS refuses what it is asked for."""
+
+
+class SilenceError(TimeoutError):
+    """Nobody answers."""
+
+
+class ParameterClient:
+    """Sets and reads variables of a DPS that runs with a `LiveService`.
+
+    ::
+
+        with ParameterClient("tcpq://127.0.0.1:7700") as parameters:
+            parameters.set({"dps.impl.stiffness": 200.0})
+
+    Args:
+        url: the bus.
+        timeout: seconds to wait for an answer.
+
+    Raises:
+        BridgeError: there is no bus.
+    """
+
+    def __init__(self, url: str, *, timeout: float = 5.0) -> None:
+        self._timeout = timeout
+        self._answers: dict[str, dict[str, Any]] = {}
+        self._waiting = ""
+        self._link = LcmLink(
+            url, dict.fromkeys((SET + ANSWER, GET + ANSWER), self._hear), connect_timeout=_CONNECT_TIMEOUT
+        )
+        self._link.open()
+
+    def set(self, values: Mapping[str, ArrayLike]) -> None:
+        """Sets variables by address, all of them or none.
+
+        Raises:
+            LiveError: one of them is refused.
+            SilenceError: nobody answers; they may have been set or not.
+        """
+        self._ask(SET, {"set": {address: np.asarray(value).tolist() for address, value in values.items()}})
+
+    def get(self, addresses: Iterable[str]) -> Values:
+        """The present values of variables and vector output ports, by address.
+
+        Raises:
+            LiveError: one of them is refused.
+            SilenceError: nobody answers.
+        """
+        return _arrays(self._ask(GET, {"get": list(addresses)})["values"])
+
+    def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
+        self._waiting = _new_id()
+        message = {"id": self._waiting, **request}
+        _publish(self._link, channel, message)
+        limit = time.monotonic() + self._timeout
+        while self._waiting not in self._answers:
+            left = limit - time.monotonic()
+            if left <= 0.0:
+                raise _silence(self._link, self._timeout)
+            self._link.take(min(left, _SLICE), _BURST)
+        answer = self._answers.pop(self._waiting)
+        if "error" in answer:
+            raise LiveError(answer["error"])
+        return answer
+
+    def _hear(self, channel: str, data: bytes) -> None:
+        answer = json.loads(data)
+        if answer.get("id") == self._waiting:
+            self._answers[self._waiting] = answer
+
+    def close(self) -> None:
+        """Gives the connection back."""
+        self._link.close()
+
+    def __enter__(self) -> ParameterClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def watch(
+    url: str, addresses: Sequence[str], *, every: int = 1, lease: float = 2.0, timeout: float = 5.0
+) -> Iterator[tuple[float, Values]]:
+    """The values of variables and vector output ports of a DPS that runs with a `LiveService`, as time goes on.
+
+    ::
+
+        for time, values in watch("tcpq://127.0.0.1:7700", ["dps.impl.torque"], every=10):
+            print(time, values["dps.impl.torque"])
+
+    It ends when the DPS does. Who no longer iterates costs the loop nothing once the lease is over.
+
+    Args:
+        url: the bus.
+        addresses: what to watch.
+        every: so many cycles; fewer values come where the loop lacks the time to read all that is watched.
+        lease: seconds, renewed as long as one iterates.
+        timeout: seconds without a value after which one gives up.
+
+    Yields:
+        The DPS's time in seconds, and the values by address.
+
+    Raises:
+        BridgeError: there is no bus.
+        LiveError: an address is refused.
+        SilenceError: nothing comes.
+    """
+    for message in _messages(url, addresses, every, lease, timeout):
+        yield message["time"], _arrays(message["values"])
+
+
+def _messages(
+    url: str, addresses: Sequence[str], every: int, lease: float, timeout: float, stop: threading.Event | None = None
+) -> Iterator[dict[str, Any]]:
+    """Those of `messages`, with what is told beside the values."""
+    request = {"id": _new_id(), "watch": list(addresses), "every": every, "lease": lease}
+    received: deque[dict[str, Any]] = deque()
+
+    def hear(channel: str, data: bytes) -> None:
+        message = json.loads(data)
+        if channel != WATCH + ANSWER or message.get("id") == request["id"]:
+            received.append(message)
+
+    channels = (WATCH + ANSWER, f"{WATCHED}{request['id']}")
+    link = LcmLink(url, dict.fromkeys(channels, hear), connect_timeout=_CONNECT_TIMEOUT)
+    link.open()
+    renewed, heard = -np.inf, time.monotonic()
+    try:
+        while stop is None or not stop.is_set():
+            now = time.monotonic()
+            if now >= renewed + lease / 3:
+                _publish(link, WATCH, request)
+                renewed = now
+            link.take(min(_SLICE, lease / 6), _BURST)
+            while received:
+                message = received.popleft()
+                heard = time.monotonic()
+                if "error" in message:
+                    raise LiveError(message["error"])
+                if "ended" in message:
+                    return
+                if "values" in message:
+                    yield message
+            if time.monotonic() >= heard + timeout:
+                raise _silence(link, timeout)
+    finally:
+        link.publish(WATCH, to_json({**request, "watch": []}))
+        link.close()
+
+
+class LiveWatch:
+    """Keeps the newest values of what it watches, to be plotted; it takes them in by a thread of its own.
+
+    ::
+
+        with LiveWatch("tcpq://127.0.0.1:7700", ["dps.impl.torque"], every=10) as live:
+            ...
+            plt.plot(live.arrays()["time"], live.arrays()["dps.impl.torque"])
+
+    Args:
+        size: how many samples are kept.
+        url, addresses, every, lease, timeout: as of `watch`.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        addresses: Sequence[str],
+        *,
+        size: int = 10_000,
+        every: int = 1,
+        lease: float = 2.0,
+        timeout: float = 5.0,
+    ) -> None:
+        self._addresses = tuple(addresses)
+        self._samples: deque[tuple[float, Values]] = deque(maxlen=size)
+        self._error: Exception | None = None
+        self._stop = threading.Event()
+        self._grown = threading.Condition()
+        self._count = 0
+        arguments = (url, addresses, every, lease, timeout, self._stop)
+        self._thread = threading.Thread(target=self._collect, args=arguments, name="vtbdrake-live-watch", daemon=True)
+        self._thread.start()
+
+    def _collect(self, *arguments: Any) -> None:
+        try:
+            for message in _messages(*arguments):
+                with self._grown:
+                    self._samples.append((message["time"], _arrays(message["values"])))
+                    self._count += 1
+                    self._grown.notify_all()
+        except (LiveError, SilenceError, BridgeError) as error:
+            self._error = error
+        with self._grown:
+            self._grown.notify_all()
+
+    @property
+    def alive(self) -> bool:
+        """Whether more can come."""
+        return self._thread.is_alive()
+
+    def wait(self, count: int, *, timeout: float = 10.0) -> None:
+        """Waits until so many samples have come in all.
+
+        Raises:
+            LiveError, SilenceError, BridgeError: they will not.
+        """
+        with self._grown:
+            there = self._grown.wait_for(lambda: self._count >= count or not self._thread.is_alive(), timeout)
+        self._check()
+        if not there or self._count < count:
+            raise SilenceError(f"{self._count} of {count} samples came within {timeout} s")
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """``time``, shape (n,), in seconds, and by address the values, shape (n, ...); the oldest first.
+
+        Raises:
+            LiveError, SilenceError, BridgeError: nothing more comes, because of that.
+        """
+        self._check()
+        with self._grown:
+            samples = list(self._samples)
+        columns = {"time": np.array([time for time, _ in samples])}
+        return columns | {a: np.array([values[a] for _, values in samples]) for a in self._addresses}
+
+    def frame(self) -> Any:
+        """A pandas DataFrame of `arrays` with one column per number, over time.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("a frame needs pandas: pip install 'vtbdrake[dataframe]'") from error
+        arrays = self.arrays()
+        time = arrays.pop("time")
+        columns: dict[str, Any] = {}
+        for address, values in arrays.items():
+            flat = values.reshape(time.size, -1)
+            names = [address] if values.ndim < 2 else [f"{address}[{k}]" for k in range(flat.shape[1])]
+            columns |= dict(zip(names, flat.T, strict=True))
+        return pd.DataFrame(columns, index=pd.Index(time, name="time"))
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Ends it; what was taken in remains."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> LiveWatch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _publish(link: LcmLink, channel: str, message: dict[str, Any]) -> None:
+    """
+    Raises:
+        LiveError: the DPS would refuse it anyway.
+    """
+    data = to_json(message)
+    try:
+        parse(channel, data)
+    except ValueError as error:
+        raise LiveError(str(error)) from None
+    link.publish(channel, data)
+
+
+def _silence(link: LcmLink, seconds: float) -> SilenceError:
+    what = "does a DPS run there (vtbdrake run)?" if link.connected else "the bus is lost"
+    return SilenceError(f"nobody has answered on {link.url} for {seconds:g} s: {what}")
+
+
+def _new_id() -> str:
+    return uuid.uuid4().hex
+
+
+def _arrays(values: Mapping[str, Any]) -> Values:
+    return {a: np.array(value, dtype=float) if isinstance(value, list) else value for a, value in values.items()}
