@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from math import isfinite, sqrt
 from typing import Any
 
+import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -75,6 +77,7 @@ class CommandGuard:
     Attributes:
         counts: what each limit did, by its name: ``range`` (stopping before its end included), ``rate``,
             ``acceleration``. An entry that several limit counts for the last of rate, acceleration and range.
+        has_start: whether there is something that the next command departs from.
     """
 
     def __init__(self, signal: Signal, *, period: float) -> None:
@@ -98,18 +101,20 @@ class CommandGuard:
             zip(steps.tolist(), changes.tolist(), lower.tolist(), upper.tolist(), strict=True)
         )
         self.needs_start = bool(np.isfinite(steps).any() or np.isfinite(changes).any())
-        self._sent: list[float] | None = None
-        self._steps = [0.0] * self._size
-
-    @property
-    def has_start(self) -> bool:
-        """Whether there is something that the next command departs from."""
-        return self._sent is not None
+        self.has_start = False
+        # c, s, x and w of above, which the compiled check of all entries at once reads and writes in place.
+        self._wanted, self._sent, self._step_before, self._step = (np.zeros(self._size) for _ in range(4))
+        self._passes = np.zeros(1)
+        self._buffer, self._look = _passing(self._limits).buffer()
+        for index, array in enumerate((self._wanted, self._sent, self._step_before)):
+            self._buffer.set_arg(index, memoryview(array))
+        for index, array in enumerate((self._passes, self._step)):
+            self._buffer.set_res(index, memoryview(array))
 
     @property
     def last_sent(self) -> NDArray[np.float64] | None:
         """Of shape (size,); None while there is neither a start nor a command."""
-        return None if self._sent is None else np.array(self._sent)
+        return self._sent.copy() if self.has_start else None
 
     def start_from(self, value: ArrayLike) -> None:
         """Lets the next command depart from ``value`` (shape (size,)), at rest; out of range, from the range's end.
@@ -117,15 +122,16 @@ class CommandGuard:
         Raises:
             CommandFault: it has another size or is not finite.
         """
-        self._sent = [
+        self._sent[:] = [
             min(max(entry, lower), upper)
-            for entry, (_, _, lower, upper) in zip(self.checked(value), self._limits, strict=True)
+            for entry, (_, _, lower, upper) in zip(self.checked(value).tolist(), self._limits, strict=True)
         ]
-        self._steps = [0.0] * self._size
+        self._step_before[:] = 0.0
+        self.has_start = True
 
     def release(self) -> None:
         """Forgets what was sent: from now on somebody else commands."""
-        self._sent = None
+        self.has_start = False
 
     def limit(self, command: ArrayLike) -> NDArray[np.float64]:
         """What may be sent for ``command``, of shape (size,); it counts as sent.
@@ -135,8 +141,8 @@ class CommandGuard:
         """
         return self.send(self.checked(command))
 
-    def checked(self, command: ArrayLike) -> list[float]:
-        """The entries of ``command``; nothing is sent.
+    def checked(self, command: ArrayLike) -> NDArray[np.float64]:
+        """``command`` as an array; nothing is sent.
 
         Raises:
             CommandFault: as `limit`.
@@ -147,39 +153,28 @@ class CommandGuard:
             raise CommandFault("size", f"is not a vector of {self._size} numbers: {error}") from error
         if array.shape != (self._size,):
             raise CommandFault("size", f"has the shape {array.shape} instead of ({self._size},)")
-        values: list[float] = array.tolist()
         # The sum is quick, but large entries overflow it.
-        if not isfinite(sum(values)) and not all(map(isfinite, values)):
-            raise CommandFault("not finite", f"is not finite: {values}")
-        return values
+        if not isfinite(sum(array.tolist())) and not np.isfinite(array).all():
+            raise CommandFault("not finite", f"is not finite: {array.tolist()}")
+        return array
 
-    def send(self, values: Sequence[float]) -> NDArray[np.float64]:
-        """As `limit`, for entries that were `checked`."""
-        sent = self._sent
-        if sent is None:
+    def send(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """As `limit`, for what was `checked`."""
+        if not self.has_start:
             if self.needs_start:
                 raise CommandFault("not started", NOT_STARTED)
-            self._sent = sent = [
-                min(max(c, lower), upper) for c, (_, _, lower, upper) in zip(values, self._limits, strict=True)
-            ]
-        new, steps = list(values), self._steps
-        for i, (c, s, x, (step, change, lower, upper)) in enumerate(
-            zip(values, sent, steps, self._limits, strict=True)
-        ):
-            w = c - s
-            # A parabola half a change ahead lies above f: what it lets pass may pass, and most does.
-            reach = (w if w > 0.0 else -w) + 0.5 * change
-            if not (
-                -step <= w <= step
-                and -change <= w - x <= change
-                and lower <= c <= upper
-                and reach * reach <= 2.0 * change * (upper - s if w > 0.0 else s - lower)
-            ):
-                new[i] = self._limited(c, s, x, step, change, lower, upper)
-                w = new[i] - s
-            steps[i] = w
-        self._sent = new
-        return np.array(new)
+            self.start_from(values)
+        self._wanted[:] = values
+        self._look()
+        if self._passes[0]:
+            self._sent[:] = values
+            self._step_before[:] = self._step
+        else:
+            before = self._sent.copy()
+            entries = zip(values.tolist(), before.tolist(), self._step_before.tolist(), self._limits, strict=True)
+            self._sent[:] = [self._limited(c, s, x, *limits) for c, s, x, limits in entries]
+            self._step_before[:] = self._sent - before
+        return self._sent.copy()
 
     def _limited(self, c: float, s: float, x: float, step: float, change: float, lower: float, upper: float) -> float:
         """One entry of what is sent."""
@@ -201,6 +196,23 @@ class CommandGuard:
             count.count += 1
             count.largest = max(count.largest, amount)
         return sent
+
+
+def _passing(limits: Sequence[tuple[float, float, float, float]]) -> casadi.Function:
+    """Of c, s and x: whether every entry of c passes as it is, and the steps w = c - s. See `CommandGuard`."""
+    c, s, x = (casadi.SX.sym(name, len(limits)) for name in "csx")
+    w = c - s
+    rules = []
+    for i, (step, change, lower, upper) in enumerate(limits):
+        rules += [lower <= c[i], c[i] <= upper]
+        if isfinite(step):
+            rules += [casadi.fabs(w[i]) <= step]
+        if isfinite(change):
+            # A parabola half a change ahead lies above f: what it lets pass may pass, and most does.
+            reach = casadi.fabs(w[i]) + 0.5 * change
+            way = casadi.if_else(w[i] > 0.0, upper - s[i], s[i] - lower)
+            rules += [casadi.fabs(w[i] - x[i]) <= change, reach * reach <= 2.0 * change * way]
+    return casadi.Function("passing", [c, s, x], [reduce(casadi.logic_and, rules), w])
 
 
 def _longest_step(d: float, a: float) -> float:
