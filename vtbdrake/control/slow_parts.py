@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import select
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,10 +13,10 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.clock import Clock
 from vtbdrake.control.companion import Companion
-from vtbdrake.control.cycle import RESULT
-from vtbdrake.control.slow_worker import READY, pack, serve, unpack
+from vtbdrake.control.cycle import RESULT as CHANGE
+from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
 from vtbdrake.control.statistics import Histogram
-from vtbdrake.testbed.slow_function import MEMORY, Arrays
+from vtbdrake.testbed.slow_function import Arrays, split_memory
 from vtbdrake.testbed.slow_part import SlowPart
 
 _log = logging.getLogger(__name__)
@@ -56,7 +58,8 @@ class SlowParts:
         statistics: by path.
 
     Raises:
-        ValueError: a latency is so short that no result could come in time.
+        ValueError: a latency is so short that no result could come in time, or a function cannot be sent to another
+            process.
     """
 
     def __init__(
@@ -76,7 +79,8 @@ class SlowParts:
                 )
         self._context = context
         self._step = period * (1.0 + _ROUNDING)
-        self._beside = [_Beside(path, part, context, clock, changed) for path, part in parts.items()]
+        functions = {path: _sendable(path, part) for path, part in parts.items()}
+        self._beside = [_Beside(path, part, functions[path], context, clock, changed) for path, part in parts.items()]
 
     @property
     def statistics(self) -> dict[str, SlowStatistics]:
@@ -94,6 +98,12 @@ class SlowParts:
         for beside in self._beside:
             beside.send()
 
+    def wait(self, timeout: float) -> bool:
+        """Waits, between two cycles, until every process has something to say; whether they did within ``timeout``
+        seconds. For a loop on a simulated clock, which leaves no time to compute.
+        """
+        return all([beside.wait(timeout) for beside in self._beside])
+
     def close(self) -> None:
         """Ends the processes."""
         for beside in self._beside:
@@ -107,6 +117,7 @@ class _Beside:
         self,
         path: str,
         part: SlowPart,
+        function: bytes,
         context: Context,
         clock: Clock,
         changed: Callable[[str, Mapping[str, Any]], None],
@@ -117,46 +128,52 @@ class _Beside:
         self._context = context
         self._clock = clock
         self._changed = changed
-        self._patience = part.patience * part.latency
-        self._error = ""
         self._waiting = part.waiting(context)
-        self._start()
-
-    def _start(self) -> None:
-        self._companion = Companion(serve, self._part.function, name=f"the process of the slow part {self.path}")
-        self._started = self._clock.now()
-        self._ready = False
         self._working: int | None = None
+        self._ready = False
         self._asked = 0.0
+        self._trouble = ""
+        self._answers: list[bytes] = []
+        self._companion = Companion(
+            keep,
+            function,
+            part.patience * part.latency,
+            path,
+            name=f"the keeper of the slow part {path}",
+        )
 
     def receive(self, end: float) -> None:
-        for frame in self._companion.take():
-            if frame == READY:
-                self._ready = True
-            else:
-                self._take_in(unpack(frame))
-        if self._working is not None and not self._companion.alive:
-            self._miss(self._working)
-            self._working = None
+        answers, self._answers = self._answers + self._companion.take(), []
+        for answer in answers:
+            self._take_in(*unpack(answer))
         for tick in [tick for tick in self._waiting if self._part.due(tick) <= end]:
             self._miss(tick)
 
-    def _take_in(self, answer: Arrays | str) -> None:
+    def _take_in(self, kind: str, content: Any) -> None:
         tick, self._working = self._working, None
-        assert tick is not None
-        self.statistics.took.record(self._clock.now() - self._asked)
-        if isinstance(answer, str):
-            self.statistics.errors += 1
-            if answer != self._error:
-                self._error = answer
-                _log.error("the slow part %s raised:\n%s", self.path, answer)
-            self._miss(tick)
-        elif tick in self._waiting:
+        self._ready = kind != LOST
+        if kind in (RESULT, ERROR):
+            self.statistics.took.record(self._clock.now() - self._asked)
+        if kind == RESULT:
+            assert tick is not None
+            self._use(tick, content)
+        elif kind in (ERROR, LOST):
+            self.statistics.errors += kind == ERROR
+            self.statistics.restarts += kind == LOST
+            if content != self._trouble:
+                _log.error("the slow part %s: %s", self.path, content)
+                self._trouble = content
+            if tick is not None:
+                self._miss(tick)
+
+    def _use(self, tick: int, arrays: Arrays) -> None:
+        if tick in self._waiting:
             self.statistics.results += 1
-            self._deliver(tick, answer)
+            self._deliver(tick, arrays)
         else:
             self.statistics.late += 1
-            if memory := {name: array for name, array in answer.items() if name.partition(".")[0] == MEMORY}:
+            memory, _ = split_memory(arrays)
+            if memory:
                 self._deliver(tick, memory)
 
     def _miss(self, tick: int) -> None:
@@ -167,30 +184,41 @@ class _Beside:
     def _deliver(self, tick: int, arrays: Arrays) -> None:
         self._waiting.pop(tick, None)
         self._part.deliver(self._context, tick, arrays)
-        self._changed(RESULT, {self.path: {"tick": tick, **arrays}})
+        self._changed(CHANGE, {self.path: {"tick": tick, **arrays}})
 
     def send(self) -> None:
         self._companion.flush()
         self._waiting = self._part.waiting(self._context)
-        if not self._companion.alive:
-            self._replace()
-        elif self._working is not None:
-            if self._clock.now() - self._asked > self._patience:
-                _log.error("the slow part %s has not answered for %g s", self.path, self._patience)
-                self._companion.kill()
-        elif self._ready and self._waiting:
+        if self._ready and self._working is None and self._waiting:
             self._working = next(iter(self._waiting))
             self._asked = self._clock.now()
             request = {**self._waiting[self._working], **self._part.memory(self._context)}
-            self._companion.post(*pack(request))
+            if not self._companion.post(*pack(request)):
+                _log.error("the slow part %s: its processes are gone, and nothing is computed any more", self.path)
 
-    def _replace(self) -> None:
-        # To start a process costs the loop some milliseconds: one that dies at its start must not do so all the time.
-        if self._clock.now() - self._started > self._patience:
-            code = self._companion.close(0.0)
-            _log.error("the process of the slow part %s ended (exit code %d); another is started", self.path, code)
-            self.statistics.restarts += 1
-            self._start()
+    def wait(self, timeout: float) -> bool:
+        end = time.monotonic() + timeout
+        while (self._working is not None or not self._ready) and not self._answers:
+            left = end - time.monotonic()
+            if left <= 0.0:
+                return False
+            line = [self._companion.fileno()]
+            select.select(line, line if self._companion.waiting else [], [], left)
+            self._companion.flush()
+            self._answers += self._companion.take()
+        return True
 
     def close(self) -> None:
-        self._companion.kill()
+        self._companion.close()
+
+
+def _sendable(path: str, part: SlowPart) -> bytes:
+    import cloudpickle
+
+    try:
+        return bytes(cloudpickle.dumps(part.function))
+    except Exception as error:
+        raise ValueError(
+            f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "
+            f"{error}): keep what cannot be pickled out of it"
+        ) from error

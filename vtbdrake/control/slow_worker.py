@@ -1,30 +1,88 @@
-"""The other process of a slow part, and how arrays travel to it and back."""
+"""The other processes of a slow part: one that computes, and one that keeps it running; and how arrays travel."""
 
 from __future__ import annotations
 
 import pickle
+import select
 import struct
+import time
 import traceback
-from typing import TYPE_CHECKING, Any
+from math import inf
+from typing import Any
 
-if TYPE_CHECKING:
-    from vtbdrake.control.companion import Channel
-    from vtbdrake.testbed.slow_function import SlowFunction
+from vtbdrake.control.companion import Channel, Companion
 
-READY = b""
+# What comes back: the first of a message, before what it is about.
+READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
+
 _COUNT = struct.Struct("<I")
 _LENGTH = struct.Struct("<Q")
 
 
-def serve(channel: Channel, function: SlowFunction) -> None:
-    """Says that it is ready; then answers every request, arrays, by the function's arrays, or its error as text."""
-    channel.send(READY)
+def keep(channel: Channel, function: bytes, patience: float, name: str) -> None:
+    """Keeps a process that computes, and passes requests and answers on.
+
+    To end a process and to start one takes milliseconds that the loop does not have: so it is done from here.
+
+    Args:
+        function: see `serve`.
+        patience: in seconds; who takes longer for an answer is ended.
+        name: of the slow part.
+    """
+    while True:
+        begin = time.monotonic()
+        worker = Companion(serve, function, name=f"the process of the slow part {name}")
+        try:
+            reason = _pass_on(channel, worker, patience)
+        finally:
+            worker.kill()
+        channel.send(b"".join(pack((LOST, reason))))
+        _pause(channel, begin + patience - time.monotonic())
+
+
+def _pass_on(channel: Channel, worker: Companion, patience: float) -> str:
+    """Until the worker is lost; says how."""
+    deadline = inf
+    while True:
+        left = None if deadline == inf else max(0.0, deadline - time.monotonic())
+        full = [worker.fileno()] if worker.waiting else []
+        readable, _, _ = select.select([channel.fileno(), worker.fileno()], full, [], left)
+        if channel.fileno() in readable:
+            worker.post(channel.receive())
+            deadline = time.monotonic() + patience
+        worker.flush()
+        for answer in worker.take():
+            channel.send(answer)
+            deadline = inf
+        if not worker.alive:
+            return f"died (exit code {worker.close(patience)})"
+        if time.monotonic() > deadline:
+            return f"did not answer within {patience:g} s"
+
+
+def _pause(channel: Channel, seconds: float) -> None:
+    """A process that dies at its start must not be started all the time."""
+    if seconds > 0.0:
+        try:
+            channel.receive(seconds)
+        except TimeoutError:
+            return
+
+
+def serve(channel: Channel, function: bytes) -> None:
+    """Computes: says that it is ready, then answers every request, arrays, by arrays or by the error, as text.
+
+    Args:
+        function: a `SlowFunction`, by cloudpickle.
+    """
+    compute = pickle.loads(function)
+    channel.send(b"".join(pack((READY, None))))
     while True:
         request = unpack(channel.receive())
         try:
-            answer: Any = function(request)
+            answer = RESULT, compute(request)
         except Exception:
-            answer = traceback.format_exc()
+            answer = ERROR, traceback.format_exc()
         channel.send(b"".join(pack(answer)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from vtbdrake.state import Codec
 Arrays = Mapping[str, np.ndarray]
 
 MEMORY = "memory"
+T = TypeVar("T")
 
 
 class SlowPartError(ValueError):
@@ -28,13 +29,15 @@ class SlowFunction:
     Attributes:
         function: the user's, see `SlowPart`.
         inputs, outputs: the codecs, by port.
-        memory: that of the memory, if there is one.
+        memory: that of the memory, under its name; empty if there is none.
+        makes: the names of all arrays of a result.
     """
 
     function: Callable[..., Any]
     inputs: Mapping[str, Codec]
     outputs: Mapping[str, Codec]
-    memory: Codec | None = None
+    memory: Mapping[str, Codec]
+    makes: frozenset[str]
 
     def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
         """The arrays of the outputs and the memory, for those of the inputs and the memory.
@@ -42,14 +45,20 @@ class SlowFunction:
         Raises:
             SlowPartError: the function did not return what it should; what it raises itself passes.
         """
-        codecs = {**self.inputs, **({} if self.memory is None else {MEMORY: self.memory})}
+        codecs = {**self.inputs, **self.memory}
         result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
-        if self.memory is None:
-            return encode(self._by_name(result), self.outputs)
-        if not (isinstance(result, tuple) and len(result) == 2):
-            raise SlowPartError(f"a slow part with a memory returns (outputs, memory), not {result!r}")
-        outputs, memory = result
-        return encode(self._by_name(outputs), self.outputs) | encode({MEMORY: memory}, {MEMORY: self.memory})
+        remembered = {}
+        if self.memory:
+            if not (isinstance(result, tuple) and len(result) == 2):
+                raise SlowPartError(f"a slow part with a memory returns (outputs, memory), not {result!r}")
+            result, memory = result
+            remembered = encode({MEMORY: memory}, self.memory)
+        made = encode(self._by_name(result), self.outputs) | remembered
+        if made.keys() != self.makes:
+            raise SlowPartError(
+                f"a result's codecs make the arrays {', '.join(sorted(self.makes))} at first, and now {', '.join(made)}"
+            )
+        return made
 
     def _by_name(self, outputs: Any) -> Mapping[str, Any]:
         if not isinstance(outputs, Mapping) and len(self.outputs) == 1:
@@ -89,3 +98,9 @@ def parts_of(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
     prefix = f"{name}."
     parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
     return {"": arrays[name]} if name in arrays else parts
+
+
+def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
+    """The arrays of the memory and those of the outputs in a result."""
+    memory = {name: array for name, array in arrays.items() if name.partition(".")[0] == MEMORY}
+    return memory, {name: array for name, array in arrays.items() if name not in memory}

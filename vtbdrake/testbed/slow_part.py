@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import ceil, inf
 from typing import Any
 
@@ -14,12 +14,12 @@ from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, S
 from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.systems import leaves
-from vtbdrake.testbed.slow_function import MEMORY, Arrays, SlowFunction, SlowPartError, decode, encode, parts_of
+from vtbdrake.testbed.slow_function import MEMORY, Arrays, SlowFunction, SlowPartError, decode, encode, split_memory
+from vtbdrake.testbed.slow_progress import DONE, PROGRESS_CODEC, WAITING, Progress, Work
 
 MOST_UNDER_WAY = 16
 _SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
 _RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED)
-_WAITING, _DONE, _MISSING = range(3)
 
 
 class SlowPart(LeafSystem):
@@ -83,27 +83,25 @@ class SlowPart(LeafSystem):
     ) -> None:
         super().__init__()
         _check_times(period, latency, offset, patience)
-        _check_names(inputs, outputs, initial or {})
-        self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
         models = {**inputs, **outputs, **({} if memory is None else {MEMORY: memory})}
+        _check_names(inputs, outputs, initial or {}, {name: models.get(name) for name in codecs or {}})
+        self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
         known = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
-        self.function = SlowFunction(
-            function, {name: known[name] for name in inputs}, {name: known[name] for name in outputs}, known.get(MEMORY)
-        )
-        self._inputs = {name: self._declare_input(name, model) for name, model in inputs.items()}
+        taken = {name: known[name] for name in inputs}
+        made = {name: known[name] for name in outputs}
+        remembered = {MEMORY: known[MEMORY]} if MEMORY in known else {}
         first = {name: np.zeros(model) if _is_size(model) else model for name, model in outputs.items()}
-        shown = encode({**first, **(initial or {})}, self.function.outputs)
-        self._output_arrays = frozenset(shown)
+        shown = encode({**first, **(initial or {})}, made)
+        remembers = encode({MEMORY: memory}, remembered)
+        self.function = SlowFunction(function, taken, made, remembered, frozenset({*shown, *remembers}))
+        self._inputs = {name: self._declare_input(name, model) for name, model in inputs.items()}
         sizes = {name: model for name, model in outputs.items() if _is_size(model)}
         self._vectors = {name: self.DeclareDiscreteState(shown.pop(name)) for name in sizes}
         told = {_SAMPLED_AT: -inf, _VALID: 0.0, _MISSED: 0.0}
         self._told = {name: self.DeclareDiscreteState([value]) for name, value in told.items()}
-        remembered = {MEMORY: known[MEMORY]} if memory is not None else {}
-        progress = _Progress(shown=shown, memory=encode({MEMORY: memory}, remembered))
-        self._remembered = frozenset(progress.memory)
-        self._progress = self.DeclareAbstractState(Value(progress))
+        self._progress = self.DeclareAbstractState(Value(Progress(shown, remembers)))
         for name, model in outputs.items():
-            if name not in self._vectors:
+            if name not in sizes:
                 self._declare_abstract_output(name, model)
         for name, index in {**self._vectors, **self._told}.items():
             self.DeclareStateOutputPort(name, index)
@@ -113,7 +111,7 @@ class SlowPart(LeafSystem):
             discrete_state(_VALID, self._told[_VALID], bounds=(0.0, 1.0)),
             discrete_state(_MISSED, self._told[_MISSED], bounds=(0.0, inf)),
         )
-        self.codecs = {int(self._progress): Codec(_progress_arrays, _progress_of)}
+        self.codecs = {int(self._progress): PROGRESS_CODEC}
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._sample)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency, self._show)
 
@@ -131,43 +129,46 @@ class SlowPart(LeafSystem):
         ticket = self.abstract_state_ticket(self._progress)
         self.DeclareAbstractOutputPort(name, lambda: Value(model), calc, prerequisites_of_calc={ticket})
 
-    def _read(self, context: Context) -> _Progress:
-        progress: _Progress = context.get_abstract_state(self._progress).get_value()
+    def _read(self, context: Context) -> Progress:
+        progress: Progress = context.get_abstract_state(self._progress).get_value()
         return progress
 
     # -- while time runs
 
     def _sample(self, context: Context, state: State) -> None:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
-        progress: _Progress = value.get_value()
+        progress: Progress = value.get_value()
         tick = round((context.get_time() - self.offset) / self.period)
         # The events of an instant are repeated after an exception in one of them.
         if progress.find(tick) is None:
             sample = {name: port.Eval(context) for name, port in self._inputs.items()}
-            work = _Work(tick, _WAITING, encode(sample, self.function.inputs))
+            work = Work(tick, WAITING, encode(sample, self.function.inputs))
             value.set_value(replace(progress, under_way=(*progress.under_way, work)))
 
     def _show(self, context: Context, state: State) -> None:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
-        progress: _Progress = value.get_value()
+        progress: Progress = value.get_value()
         tick = round((context.get_time() - self.offset - self.latency) / self.period)
         work = progress.find(tick)
         if work is None:
             return
-        if work.status == _WAITING:
+        if work.status == WAITING:
             progress = progress.having(tick, self.function({**work.arrays, **progress.memory}))
             work = progress.find(tick)
             assert work is not None
-        told = {_VALID: float(work.status == _DONE)}
-        if work.status == _DONE:
-            told[_SAMPLED_AT] = self.offset + tick * self.period
+        if work.status == DONE:
+            outputs = dict(work.arrays)
+            numbers: dict[Any, Any] = {index: outputs.pop(name) for name, index in self._vectors.items()}
+            numbers[self._told[_SAMPLED_AT]] = [self.offset + tick * self.period]
+            progress = progress.after(work, shown=outputs)
         else:
-            told[_MISSED] = context.get_discrete_state(self._told[_MISSED]).value()[0] + 1.0
-        numbers = {index: work.arrays[name] for name, index in self._vectors.items() if name in work.arrays}
-        numbers |= {self._told[name]: [number] for name, number in told.items()}
+            missed = context.get_discrete_state(self._told[_MISSED]).value()
+            numbers = {self._told[_MISSED]: missed + 1.0}
+            progress = progress.after(work, shown=progress.shown)
+        numbers[self._told[_VALID]] = [float(work.status == DONE)]
         for index, number in numbers.items():
             state.get_mutable_discrete_state().set_value(int(index), number)
-        value.set_value(progress.shown_up_to(work, without=self._vectors))
+        value.set_value(progress)
 
     # -- results from outside
 
@@ -183,7 +184,7 @@ class SlowPart(LeafSystem):
             context: of the whole Diagram; so in `memory` and `deliver`.
         """
         progress = self._read(self.GetMyContextFromRoot(context))
-        return {work.tick: work.arrays for work in progress.under_way if work.status == _WAITING}
+        return {work.tick: work.arrays for work in progress.under_way if work.status == WAITING}
 
     def memory(self, context: Context) -> Arrays:
         """The memory that the next call begins with; empty for a part without."""
@@ -204,13 +205,13 @@ class SlowPart(LeafSystem):
         own.SetAbstractState(self._progress, self._read(own).having(tick, arrays))
 
     def _check_result(self, arrays: Arrays) -> None:
-        remembered = {name for name in arrays if name.partition(".")[0] == MEMORY}
-        outputs = arrays.keys() - remembered
-        if remembered not in (set(), self._remembered) or outputs not in (set(), self._output_arrays):
-            expected = sorted(self._output_arrays | self._remembered)
-            raise SlowPartError(f"a result has the arrays {', '.join(expected)}, not {', '.join(arrays)}")
-        for name in self._vectors.keys() & outputs:
-            size = self.get_output_port_by_name(name).size()
+        memory, outputs = split_memory(arrays)
+        whole_memory, whole_outputs = (part.keys() for part in split_memory(dict.fromkeys(self.function.makes)))
+        if memory.keys() not in (set(), whole_memory) or outputs.keys() not in (set(), whole_outputs):
+            expected = ", ".join(sorted(self.function.makes))
+            raise SlowPartError(f"the result of a slow part has the arrays {expected}, not {', '.join(arrays)}")
+        for name in self._vectors.keys() & outputs.keys():
+            size = self.GetOutputPort(name).size()
             if arrays[name].shape != (size,):
                 raise SlowPartError(f"the result {name} has {size} entries, not the shape {arrays[name].shape}")
 
@@ -219,59 +220,6 @@ def slow_parts(diagram: Diagram, *, below: str = "dps") -> dict[str, SlowPart]:
     """The slow parts in the DPS of a testbed's diagram (or below another path), by path."""
     found = {path: system for path, system in leaves(diagram) if path == below or path.startswith(f"{below}.")}
     return {path: system for path, system in found.items() if isinstance(system, SlowPart)}
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What became of one sample: its arrays while it waits, those of the outputs when it is done."""
-
-    tick: int
-    status: int
-    arrays: Arrays = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Progress:
-    """What a slow part keeps beside numbers; never changed, and so shared by all copies of a context."""
-
-    shown: Arrays
-    memory: Arrays
-    under_way: tuple[_Work, ...] = ()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> _Progress:
-        return self
-
-    def find(self, tick: int) -> _Work | None:
-        return next((work for work in self.under_way if work.tick == tick), None)
-
-    def having(self, tick: int, arrays: Arrays) -> _Progress:
-        """With a result; with none of the outputs in it, it is missing."""
-        outputs = {name: array for name, array in arrays.items() if name.partition(".")[0] != MEMORY}
-        memory = {name: array for name, array in arrays.items() if name not in outputs}
-        result = _Work(tick, _DONE if outputs else _MISSING, outputs)
-        under_way = tuple(result if work.tick == tick and work.status == _WAITING else work for work in self.under_way)
-        return replace(self, memory=memory or self.memory, under_way=under_way)
-
-    def shown_up_to(self, work: _Work, *, without: Mapping[str, Any]) -> _Progress:
-        """With the outputs of ``work``, less some that are shown elsewhere, and without what came before it."""
-        shown = {name: array for name, array in work.arrays.items() if name not in without}
-        later = tuple(other for other in self.under_way if other.tick > work.tick)
-        return replace(self, shown=shown if work.status == _DONE else self.shown, under_way=later)
-
-
-def _progress_arrays(progress: _Progress) -> dict[str, np.ndarray]:
-    ticks = [(work.tick, work.status) for work in progress.under_way]
-    arrays = {"ticks": np.array(ticks, dtype=np.int64).reshape(-1, 2)}
-    groups = {"shown": progress.shown, "memory": progress.memory}
-    groups |= {f"under_way.{work.tick}": work.arrays for work in progress.under_way}
-    return arrays | {f"{group}.{name}": a for group, members in groups.items() for name, a in members.items()}
-
-
-def _progress_of(arrays: Arrays) -> _Progress:
-    under_way = tuple(
-        _Work(int(tick), int(status), parts_of(arrays, f"under_way.{tick}")) for tick, status in arrays["ticks"]
-    )
-    return _Progress(parts_of(arrays, "shown"), parts_of(arrays, MEMORY), under_way)
 
 
 def _is_size(model: Any) -> bool:
@@ -298,18 +246,22 @@ def _check_times(period: float, latency: float, offset: float, patience: float) 
         )
 
 
-def _check_names(inputs: Mapping[str, Any], outputs: Mapping[str, Any], initial: Mapping[str, Any]) -> None:
+def _check_names(
+    inputs: Mapping[str, Any], outputs: Mapping[str, Any], initial: Mapping[str, Any], coded: Mapping[str, Any]
+) -> None:
     if not inputs or not outputs:
         raise ValueError("a slow part has at least one input and one output")
-    for name in [*inputs, *outputs]:
+    for name, model in [*inputs.items(), *outputs.items()]:
         if not name.isidentifier() or name in _RESERVED:
             raise ValueError(
                 f"a port of a slow part has a name like a variable's, and none of {', '.join(_RESERVED)}; not {name!r}"
             )
-    for name, model in {**inputs, **outputs}.items():
         if _is_size(model) and model < 1:
             raise ValueError(f"{name} of a slow part has at least one entry, not {model}")
     if both := inputs.keys() & outputs.keys():
         raise ValueError(f"inputs and outputs of a slow part have different names, but both have {', '.join(both)}")
     if unknown := initial.keys() - outputs.keys():
         raise ValueError(f"initial names no output of the slow part: {', '.join(sorted(unknown))}")
+    for name, model in coded.items():
+        if model is None or _is_size(model):
+            raise ValueError(f"a codec is for an abstract port or the memory of a slow part, not for {name}")
