@@ -140,7 +140,7 @@ class TcpqConnection(Connection):
         return self._socket.fileno()
 
     def take(self, limit: int) -> int:
-        count = self._dispatch(limit)
+        count = self._dispatch(limit) if self._records else 0
         chunk_size = _RECEIVE
         while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
             try:
@@ -151,21 +151,20 @@ class TcpqConnection(Connection):
             if not chunk:
                 raise ConnectionResetError("the hub closed the connection")
             try:
-                self._records += self._reader.feed(chunk)
+                self._records.extend(self._reader.feed(chunk))
             except ProtocolError as error:
                 raise ConnectionError(f"the hub {error}") from None
             count += self._dispatch(limit - count)
         return count
 
     def _dispatch(self, limit: int) -> int:
-        records, count = self._records, 0
-        while records and count < limit:
+        records, handlers = self._records, self._handlers
+        count = min(limit, len(records))
+        for _ in range(count):
             kind, name, record = records.popleft()
-            known = self._handlers.get(name)
-            if kind == PUBLISH and known is not None:
-                channel, handler = known
+            if kind == PUBLISH and name in handlers:
+                channel, handler = handlers[name]
                 handler(channel, bytes(record[_HEAD + len(name) :]))
-            count += 1
         return count
 
     def publish(self, channel: str, data: bytes) -> None:

@@ -91,56 +91,57 @@ class Reader:
         Raises:
             ProtocolError: the client is of no use any more.
         """
-        buffer = self._buffer
-        buffer += data
-        have = len(buffer)
-        if have < self._needed:
-            return []
-        at = 0
+        if self._buffer or len(data) < self._needed:
+            self._buffer += data
+            if len(self._buffer) < self._needed:
+                return []
+            come: bytes | bytearray = self._buffer
+        else:
+            come = bytes(data)
+        have, at = len(come), 0
         records: list[Record] = []
         if not self.greeted:
-            self._check_greeting()
+            self._check_greeting(come)
             at = _PAIR.size
-            records.append((GREET, b"", bytes(buffer[:at])))
-        while (size := self._size(at)) <= have - at:
-            end = at + size
-            channel = bytes(buffer[at + 8 : at + 8 + _LENGTH.unpack_from(buffer, at + 4)[0]])
-            kind = buffer[at + 3]
-            if at == 0 and end == have:
-                # A large message is handed on as it is, not copied.
-                self._buffer, self._needed = bytearray(), _PAIR.size
-                return [(kind, channel, buffer)]
-            records.append((kind, channel, bytes(buffer[at:end])))
-            at = end
+            records.append((GREET, b"", bytes(come[:at])))
+        while True:
+            kind, length, size = self._head(come, at, have - at)
+            if size > have - at:
+                break
+            # A large message is handed on as it is, not copied.
+            record = come if size == have else bytes(come[at : at + size])
+            records.append((kind, bytes(come[at + 8 : at + 8 + length]), record))
+            at += size
         self._needed = size
-        del buffer[:at]
+        if at or come is not self._buffer:
+            self._buffer = bytearray(come[at:])
         return records
 
-    def _check_greeting(self) -> None:
-        magic, version = _PAIR.unpack_from(self._buffer)
+    def _check_greeting(self, come: bytes | bytearray) -> None:
+        magic, version = _PAIR.unpack_from(come)
         if magic != MAGIC_CLIENT:
             raise ProtocolError("greeting", f"begins with {magic:#010x}, a tcpq client with {MAGIC_CLIENT:#010x}")
         if version != VERSION:
             raise ProtocolError("greeting", f"speaks version {version:#06x} of tcpq, the hub {VERSION:#06x}")
         self.greeted = True
 
-    def _size(self, at: int) -> int:
-        """Bytes of the record that begins here; while too little of it has come to know, of the part that tells."""
-        buffer, have = self._buffer, len(self._buffer) - at
+    def _head(self, come: bytes | bytearray, at: int, have: int) -> tuple[int, int, int]:
+        """Type and length of the channel of the record that begins here, and its size in bytes; while too little of it
+        has come to know, the size of the part that tells."""
         if have < 8:
-            return 8
-        kind, length = _PAIR.unpack_from(buffer, at)
+            return 0, 0, 8
+        kind, length = _PAIR.unpack_from(come, at)
         if not PUBLISH <= kind <= UNSUBSCRIBE:
             raise ProtocolError("malformed", f"sends a record of type {kind}, there are 1, 2 and 3")
         if not 0 < length <= MAX_CHANNEL:
             raise ProtocolError("malformed", f"sends a channel of {length} bytes, it has 1 to {MAX_CHANNEL}")
         if kind != PUBLISH:
-            return 8 + length
+            return kind, length, 8 + length
         if have < 12 + length:
-            return 12 + length
-        size = _LENGTH.unpack_from(buffer, at + 8 + length)[0]
+            return kind, length, 12 + length
+        size = _LENGTH.unpack_from(come, at + 8 + length)[0]
         if size > self._max_message:
             raise ProtocolError(
                 "too large", f"sends a message of {size} bytes, the largest allowed has {self._max_message}"
             )
-        return 12 + length + size
+        return kind, length, 12 + length + size
