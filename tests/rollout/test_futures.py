@@ -1,9 +1,15 @@
 """Pools that the user brings: nothing is lost with them, and they stay the user's."""
 
 import concurrent.futures
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +20,8 @@ from vtbdrake.rollout import FuturesExecutor, Quality, QualityError, RolloutTask
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
 TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
+ROOT = Path(__file__).resolve().parents[2]
+POOLS = ["process_pool", "loky_pool", "ray_pool"]
 
 
 def _points(count):
@@ -64,10 +72,11 @@ def test_an_interruption_takes_back_what_has_not_begun():
     assert pool._open == 0
 
 
-def test_each_process_builds_its_testbed_once(process_pool, tmp_path):
+@pytest.mark.parametrize("pool", POOLS)
+def test_each_process_builds_its_testbed_once(pool, request, tmp_path):
     file = tmp_path / "built"
     task = RolloutTask(RecordedScenario(file=str(file)), 0.1, Quality(abs, THETA))
-    executor = FuturesExecutor(process_pool)
+    executor = FuturesExecutor(request.getfixturevalue(pool))
     for _ in range(10):
         list(executor.run(task, _points(4)))
     processes = file.read_text().split()
@@ -85,8 +94,9 @@ def _bad(theta):
     raise RuntimeError("not today")
 
 
-def test_an_error_in_the_quality_reaches_the_user_and_the_pool_goes_on(process_pool):
-    with FuturesExecutor(process_pool) as executor:
+@pytest.mark.parametrize("pool", POOLS)
+def test_an_error_in_the_quality_reaches_the_user_and_the_pool_goes_on(pool, request):
+    with FuturesExecutor(request.getfixturevalue(pool)) as executor:
         with pytest.raises(QualityError, match="_bad at t = 0 s, .* raises RuntimeError: not today"):
             list(executor.run(RolloutTask(PendulumScenario(), 0.3, Quality(_bad, THETA)), _points(6)))
         assert len(list(executor.run(TASK, _points(3)))) == 3
@@ -112,16 +122,64 @@ def test_a_broken_pool_takes_no_more_rollouts(tmp_path):
             list(executor.run(task, points[:1]))
 
 
-def test_a_broken_pool_costs_the_rollouts_that_it_had(tmp_path):
+def _standard():
+    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+
+
+def _loky():
+    return pytest.importorskip("loky").ProcessPoolExecutor(1)
+
+
+@pytest.mark.parametrize(("make", "error"), [(_standard, "BrokenProcessPool"), (_loky, "TerminatedWorkerError")])
+def test_a_broken_pool_costs_the_rollouts_that_it_had(make, error, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
     points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": 0.0}, {"dps.gain[0]": KILL}, {"dps.gain[0]": 0.0}]
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with make() as pool:
         results = dict(FuturesExecutor(pool, in_flight=4).run(task, points))
     assert [results[i].failed for i in range(4)] == [False, False, True, True]
-    assert "the pool broke while it had this rollout (BrokenProcessPool: " in results[2].message
+    assert f"the pool broke while it had this rollout ({error}: " in results[2].message
     assert results[2].parameters == points[2]
+
+
+def test_ray_tries_a_lost_rollout_again(ray_pool, tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
+    results = dict(FuturesExecutor(ray_pool).run(task, [{"dps.gain[0]": gain} for gain in (0.0, KILL, 0.0, 0.0)]))
+    assert not fuse.exists()
+    assert not any(result.failed for result in results.values())
+
+
+def test_processes_of_mpi_give_identical_results(tmp_path):
+    pytest.importorskip("mpi4py")
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    mpiexec = shutil.which("mpiexec", path=path)
+    if mpiexec is None:
+        pytest.skip("no MPI here")
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent("""
+            from mpi4py.futures import MPIPoolExecutor
+            from tests.rollout.test_futures import TASK, _points
+            from vtbdrake.rollout import FuturesExecutor, SerialExecutor
+
+            if __name__ == "__main__":
+                expected = dict(SerialExecutor().run(TASK, _points(12)))
+                with MPIPoolExecutor() as pool:
+                    results = dict(FuturesExecutor(pool).run(TASK, _points(12)))
+                    print(pool.num_workers, [results[i].identical(expected[i]) for i in range(12)].count(True))
+        """)
+    )
+    done = subprocess.run(
+        [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.split() == ["2", "12"], done.stderr
 
 
 def test_a_pool_that_was_shut_down_takes_no_more():

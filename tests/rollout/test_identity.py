@@ -18,6 +18,8 @@ EXECUTORS = {
     "processes": lambda get: ProcessExecutor(2),
     "thread pool": lambda get: FuturesExecutor(ThreadPoolExecutor(2)),
     "process pool": lambda get: FuturesExecutor(get("process_pool")),
+    "loky": lambda get: FuturesExecutor(get("loky_pool")),
+    "ray": lambda get: FuturesExecutor(get("ray_pool")),
     "dask": lambda get: DaskExecutor(get("cluster").client),
 }
 

@@ -24,7 +24,10 @@ class FuturesExecutor(Executor):
 
     Each of its processes builds a testbed once and keeps it; each of its threads has a Context. When the pool breaks,
     because one of its processes was killed, the rollouts that it had are failed results, for it does not say whose
-    fault it was; `ProcessExecutor` does, and goes on.
+    fault it was; `ProcessExecutor` does, and goes on. Any other error of the pool is raised as itself.
+
+    Ray has no such pool of its own: one is a subclass of `concurrent.futures.Executor` whose ``submit(fn, *args)``
+    returns ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` says how many run at a time.
 
     Args:
         pool: where the rollouts run.
