@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from cmaes import CMA, CMAwM
 
 from vtbdrake.optimization.parameter import Dimension, Parameter
 from vtbdrake.optimization.solvers.batch import BatchSolver
 from vtbdrake.optimization.solvers.ranking import costs
 from vtbdrake.optimization.solvers.search import Search
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+
+if TYPE_CHECKING:
+    from cmaes import CMA, CMAwM
 
 
 def default_population(size: int) -> int:
@@ -69,10 +72,9 @@ class CmaEs(BatchSolver):
         if self._strategy.should_stop():
             self._end(self._found, "converged" if self._found else "no point was found whose simulation succeeds")
             return []
-        if isinstance(self._strategy, CMAwM):
-            pairs = [self._strategy.ask() for _ in range(self.population)]
-        else:
-            pairs = [(x, x) for x in (self._strategy.ask() for _ in range(self.population))]
+        drawn = [self._strategy.ask() for _ in range(self.population)]
+        # With margin, each is what is to be judged, and what it was before its integers were rounded.
+        pairs = drawn if self._counts.any() else [(x, x) for x in drawn]
         self._drawn = [raw for _, raw in pairs]
         return [self.search.point(self._decode(x)) for x, _ in pairs]
 
@@ -90,6 +92,9 @@ def _grid_count(parameter: Dimension) -> int:
 
 
 def _strategy(mean: np.ndarray, sigma: float, counts: np.ndarray, population: int, seed: int) -> CMA | CMAwM:
+    # Imported here, since it takes long: it loads scipy.stats.
+    from cmaes import CMA, CMAwM
+
     bounds = np.tile([0.0, 1.0], (len(mean), 1))
     if not counts.any():
         return CMA(mean=mean, sigma=sigma, bounds=bounds, seed=seed, population_size=population)
