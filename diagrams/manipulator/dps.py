@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import casadi
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
-from pydrake.systems.primitives import Adder, ConstantVectorSource, Multiplexer, Saturation
+from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
 
 from diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from diagrams.manipulator.dynamics import ArmDynamics, Expression, function
@@ -16,14 +16,16 @@ from diagrams.manipulator.motions import HOME, parameters, reference
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.state import discrete_state
 
-# Name -> (initial value, unit).
+# Name -> (initial value, unit). The first of a system is what others need of it.
 States = dict[str, tuple[object, str]]
+
+_STATE = "state"
 
 SENSOR_SIGNALS = {"joint_position": JOINTS, "joint_velocity": JOINTS, "joint_torque_measured": JOINTS, "wrench": 6}
 
 
 def make_dps(
-    law: str = "cartesian_impedance", *, period: float = 0.001, arm: Arm | None = None, compile: bool = False
+    law: str = "cartesian_impedance", *, period: float = 0.001, arm: Arm | None = None, compile: bool = True
 ) -> Diagram:
     """The DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
 
@@ -36,7 +38,8 @@ def make_dps(
 
     Args:
         law: a name of `LAWS`.
-        compile: evaluates machine code; needs a C compiler when it runs for the first time.
+        compile: evaluates machine code where there is a C compiler, which it needs when it runs for the first time; the
+            results are the same, bit for bit.
 
     Raises:
         ValueError: there is no such law.
@@ -47,15 +50,16 @@ def make_dps(
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense())
     env = builder.AddNamedSystem("env", _make_env(model, period=period, compile=compile))
-    impl = builder.AddNamedSystem("impl", _make_impl(model, law, period=period, compile=compile))
-    act = builder.AddNamedSystem("act", _make_act(model.arm))
+    perceived = env.GetOutputPort(_STATE)
+    impl = builder.AddNamedSystem("impl", _make_impl(model, law, perceived.size(), period=period, compile=compile))
+    act = builder.AddNamedSystem("act", _make_act(model.arm, impl.GetOutputPort(_STATE).size()))
     for signal in SENSOR_SIGNALS:
         builder.ExportInput(sense.GetInputPort(signal), signal)
     builder.ExportInput(impl.GetInputPort("wanted"), "motion")
     builder.Connect(sense.get_output_port(), env.GetInputPort("measured"))
     builder.Connect(sense.get_output_port(), impl.GetInputPort("measured"))
-    builder.Connect(env.GetOutputPort("contact_wrench"), impl.GetInputPort("contact_wrench"))
-    builder.Connect(impl.GetOutputPort("torque"), act.GetInputPort("torque"))
+    builder.Connect(perceived, impl.GetInputPort("perceived"))
+    builder.Connect(impl.GetOutputPort(_STATE), act.GetInputPort("controlled"))
     builder.ExportOutput(act.get_output_port(), "joint_torque")
     dps = builder.Build()
     dps.set_name("dps")
@@ -140,12 +144,16 @@ def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
     )
 
 
-def _make_impl(model: ArmDynamics, law: str, *, period: float, compile: bool) -> System:
-    """Motions and control law in one; ``torque`` changes no faster than ``torque_rate``."""
+def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, compile: bool) -> System:
+    """Motions and control law in one; ``torque`` changes no faster than ``torque_rate``.
+
+    ``perceived`` is the size of the state of ``env``.
+    """
     chosen = LAWS[law]
     z = casadi.SX.sym("measured", sum(SENSOR_SIGNALS.values()))
     q, v = z[:JOINTS], z[JOINTS : 2 * JOINTS]
-    wanted, wrench = casadi.SX.sym("wanted"), casadi.SX.sym("contact_wrench", 6)
+    wanted, seen = casadi.SX.sym("wanted"), casadi.SX.sym("perceived", perceived)
+    wrench = seen[:6]
     gains: Declared = {
         **chosen.parameters,
         **parameters(model.arm),
@@ -166,7 +174,7 @@ def _make_impl(model: ArmDynamics, law: str, *, period: float, compile: bool) ->
     reach = period * p["torque_rate"]
     torque = casadi.fmin(casadi.fmax(torque, x["torque"] - reach), x["torque"] + reach)
     following = {"torque": torque, **r.state, **remembered}
-    inputs = {"measured": z, "contact_wrench": wrench, "wanted": wanted}
+    inputs = {"measured": z, "perceived": seen, "wanted": wanted}
     return _system(
         "impl",
         following,
@@ -180,14 +188,18 @@ def _make_impl(model: ArmDynamics, law: str, *, period: float, compile: bool) ->
     )
 
 
-def _make_act(arm: Arm) -> Diagram:
-    """The torque and, beside it, ``offset``, which is added; held between the limits of the joints."""
+def _make_act(arm: Arm, size: int) -> Diagram:
+    """The torque, with which the state of ``impl`` begins (``size``), and, beside it, ``offset``, which is added; held
+    between the limits of the joints.
+    """
     builder = DiagramBuilder()
     limits = np.array(arm.torques)
+    torque = builder.AddNamedSystem("torque", Demultiplexer([JOINTS, size - JOINTS]))
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(JOINTS)))
     calibrated = builder.AddNamedSystem("calibrated", Adder(2, JOINTS))
     limited = builder.AddNamedSystem("limited", Saturation(-limits, limits))
-    builder.ExportInput(calibrated.get_input_port(0), "torque")
+    builder.ExportInput(torque.get_input_port(), "controlled")
+    builder.Connect(torque.get_output_port(0), calibrated.get_input_port(0))
     builder.Connect(offset.get_output_port(), calibrated.get_input_port(1))
     builder.Connect(calibrated.get_output_port(), limited.get_input_port())
     builder.ExportOutput(limited.get_output_port(), "torque")
@@ -218,36 +230,29 @@ def _system(
     period: float,
     compile: bool,
 ) -> System:
-    """The system x_next = following(x, p, inputs), whose first state is its output.
+    """The system x_next = following(x, p, inputs), with all its state in one vector, which is its output.
 
-    Every group of a Context that Python reads and writes costs more than the arm's dynamics: all other states lie in
-    one group, ``memory``, where their addresses still name them.
+    Every group of a Context that Python reads and writes costs more than the arm's dynamics. The addresses of the state
+    are those of its parts.
     """
-    shown, *others = state
-    memory = casadi.SX.sym("memory", sum(x[other].numel() for other in others))
-    parts = casadi.vertsplit(memory, np.cumsum([0, *(x[other].numel() for other in others)]).tolist())
-    packed = [following[shown], casadi.vertcat(*(following[other] for other in others))]
-    packed = casadi.substitute(packed, [x[other] for other in others], parts)
-    update = function(
-        name,
-        {shown: x[shown], "memory": memory, **p, **inputs},
-        {f"{shown}_next": packed[0], "memory_next": packed[1]},
-    )
-    x0 = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, (value, _) in state.items()}
+    parts = [x[name] for name in state]
+    whole = casadi.SX.sym(_STATE, sum(part.numel() for part in parts))
+    ends = np.cumsum([part.numel() for part in parts]).tolist()
+    packed = casadi.vertcat(*(following[name] for name in state))
+    (packed,) = casadi.substitute([packed], parts, casadi.vertsplit(whole, [0, *ends]))
+    x0 = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value, _ in state.values()])
     system = CasadiSystem(
-        update=update,
-        state={shown: x0[shown], "memory": np.concatenate([x0[other] for other in others])},
+        update=function(name, {_STATE: whole, **p, **inputs}, {f"{_STATE}_next": packed}),
+        state={_STATE: x0},
         parameters={name: value for name, (value, _, _) in gains.items()},
         period=period,
-        units={shown: state[shown][1], **{name: unit for name, (_, unit, _) in gains.items()}},
+        units={name: unit for name, (_, unit, _) in gains.items()},
         bounds={name: bounds for name, (_, _, bounds) in gains.items()},
-        compile=compile,
+        compile=None if compile else False,
     )
-    start, named = 0, []
-    for other in others:
-        size = x0[other].size
-        shape = (size,) if size > 1 else ()
-        named.append(discrete_state(other, 1, shape=shape, start=start, unit=state[other][1]))
-        start += size
-    system.variables = (*(e for e in system.variables if e.name != "memory"), *named)
+    named = [
+        discrete_state(name, 0, shape=part.shape[:1] if part.numel() > 1 else (), start=end - part.numel(), unit=unit)
+        for part, end, (name, (_, unit)) in zip(parts, ends, state.items(), strict=True)
+    ]
+    system.variables = (*(e for e in system.variables if e.name != _STATE), *named)
     return system

@@ -56,8 +56,8 @@ class ManipulatorScenario(Scenario):
     law: str = "cartesian_impedance"
     # Of sensors, DPS and drives, in seconds.
     period: float = 0.001
-    # True has the DPS's arithmetic compiled; needs a C compiler when it runs for the first time.
-    compile: bool = False
+    # True has the DPS's arithmetic compiled where there is a C compiler; the results are the same.
+    compile: bool = True
     # False is free space.
     wall: bool = False
     # Of the wall's face from the world's origin, along x, in m; sim.env.wall.mount.pose moves it.

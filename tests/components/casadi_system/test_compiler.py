@@ -51,7 +51,7 @@ def test_compiled_computes_what_interpreted_computes(cache, kind):
     rng = np.random.default_rng(2)
     for _ in range(20):
         x, u = rng.normal(size=(2, 3))
-        np.testing.assert_allclose(_eval(machine, x, u), _eval(interpreted, x, u), rtol=1e-14)
+        np.testing.assert_array_equal(_eval(machine, x, u), _eval(interpreted, x, u))
     z = InitializeAutoDiff(rng.normal(size=6)).ravel()
     gradients = [ExtractGradient(_eval(system.ToAutoDiffXd(), z[:3], z[3:])) for system in (machine, interpreted)]
     np.testing.assert_allclose(*gradients, rtol=1e-14)
@@ -97,6 +97,16 @@ def test_a_missing_compiler_is_named_with_the_remedy(cache, monkeypatch):
     monkeypatch.setenv("CC", "no-such-cc")
     with pytest.raises(CompilerError, match="there is no 'no-such-cc': install one .* or leave out compile=True"):
         CasadiSystem(_function(), compile=True)
+
+
+@pytest.mark.parametrize("compiler", ["no-such-cc", "cc -no-such-flag"])
+def test_where_machine_code_is_only_wanted_a_function_without_it_is_interpreted(cache, monkeypatch, compiler):
+    machine = CasadiSystem(_function(), compile=None)
+    assert _runs(cache) == 1
+    monkeypatch.setenv("CC", compiler)
+    interpreted = CasadiSystem(_function(), compile=None)
+    x, u = np.random.default_rng(3).normal(size=(2, 3))
+    np.testing.assert_array_equal(_eval(interpreted, x, u), _eval(machine, x, u))
 
 
 def test_a_compiler_that_fails_leaves_nothing_behind(cache, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 import re
@@ -16,6 +17,8 @@ from pathlib import Path
 import casadi
 
 from vtbdrake.state.files import whole_file
+
+_log = logging.getLogger(__name__)
 
 # Products and sums are rounded one by one, as the interpreted function does it.
 _FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
@@ -52,6 +55,15 @@ def compiled(function: casadi.Function) -> casadi.Function:
         if not library.exists():
             _compile(source, command, library)
     return casadi.external(function.name(), str(library))
+
+
+def compiled_if_possible(function: casadi.Function) -> casadi.Function:
+    """The same function as machine code, or the function itself where that cannot be had; the log says why."""
+    try:
+        return compiled(function)
+    except (CompilerError, ValueError, OSError) as error:
+        _log.info("%s is interpreted: %s", function.name(), error)
+        return function
 
 
 def cache_folder() -> Path:

@@ -12,11 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 
-from vtbdrake.components.casadi_system.compiler import compiled
+from vtbdrake.components.casadi_system.compiler import compiled, compiled_if_possible
 
 # casadi.SX or casadi.MX, for which CasADi's functions are overloaded one by one.
 Expression = Any
 
+_TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = {
+    True: compiled,
+    None: compiled_if_possible,
+    False: lambda function: function,
+}
 _GENERATING = threading.Lock()
 
 
@@ -27,12 +32,15 @@ class Kernel:
     every thread has arrays of its own.
     """
 
-    def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool):
-        """``y`` (m, 1) is an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other."""
+    def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):
+        """``y`` (m, 1) is an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other.
+
+        ``compile`` is that of a `CasadiSystem`.
+        """
         self._name = casadi.Function.fix_name(name)
         self._arguments = list(arguments)
         self._y = y
-        self._compile = compile
+        self._translate = _TRANSLATIONS[compile]
         self._jacobian: _Buffers | None = None
         self._value = self._buffers(self._name, y)
 
@@ -66,7 +74,7 @@ class Kernel:
         function = casadi.Function(name, self._arguments, [expression])
         # A function of scalar operations cannot fail; others (a root finder, a solver) report it.
         may_fail = not function.is_a("SXFunction")
-        return _Buffers(compiled(function) if self._compile else function, may_fail)
+        return _Buffers(self._translate(function), may_fail)
 
 
 class _Buffers(threading.local):

@@ -62,7 +62,7 @@ class Model:
         time: str | None,
         units: Mapping[str, str],
         bounds: Mapping[str, tuple[float, float]],
-        compile: bool,
+        compile: bool | None,
     ) -> None:
         functions = {n: f for n, f in (("output", output), ("update", update)) if f is not None}
         if not functions:
@@ -144,7 +144,7 @@ class Model:
         names = function.name_out()
         return symbols, {n: casadi.vec(casadi.densify(v).T) for n, v in zip(names, values, strict=True)}
 
-    def _result(self, name: str, symbols: Mapping[str, Expression], y: Expression, compile: bool) -> Result:
+    def _result(self, name: str, symbols: Mapping[str, Expression], y: Expression, compile: bool | None) -> Result:
         # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
         occurring = {symbol.name() for symbol in casadi.symvar(y)}
         used = {n for n, s in symbols.items() if occurring & {entry.name() for entry in casadi.symvar(s)}}
@@ -153,7 +153,7 @@ class Model:
         shows = None
         if len(blocks) == 1 and blocks[0].source == STATE and y.numel() == self.size(blocks[0].names[0]):
             shows = blocks[0].names[0] if casadi.is_equal(y, arguments[0]) else None
-        return Result(y.numel(), blocks, Kernel(name, arguments, y, compile=compile and shows is None), shows)
+        return Result(y.numel(), blocks, Kernel(name, arguments, y, compile=compile if shows is None else False), shows)
 
 
 def _check_function(role: str, function: object) -> None:

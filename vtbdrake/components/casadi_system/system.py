@@ -68,8 +68,9 @@ def CasadiSystem_(T: type) -> type:
             time: the name of the argument that is the time (s).
             units: of states and parameters, by name; "1" if left out.
             bounds: (lower, upper) of the entries of states and parameters, by name; infinite if left out.
-            compile: evaluates machine code. The first time, it is made by the C compiler ``cc`` (or CC, from the
-                environment), and kept in ``~/.cache/vtbdrake`` (or XDG_CACHE_HOME).
+            compile: evaluates machine code, which gives the same results. The first time, it is made by the C compiler
+                ``cc`` (or CC, from the environment), and kept in ``~/.cache/vtbdrake`` (or XDG_CACHE_HOME). None does
+                so where it is possible.
 
         Raises:
             ValueError: names, sizes or arguments that do not fit together.
@@ -87,7 +88,7 @@ def CasadiSystem_(T: type) -> type:
             time: str | None = None,
             units: Mapping[str, str] | None = None,
             bounds: Mapping[str, tuple[float, float]] | None = None,
-            compile: bool = False,
+            compile: bool | None = False,
             converter: SystemScalarConverter | None = None,
         ) -> None:
             model = Model(
