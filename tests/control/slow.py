@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,8 +28,17 @@ def gated(position: np.ndarray, memory: np.ndarray, *, gate: str) -> tuple[np.nd
         return chaotic(position, memory)
 
 
-def process_number(position: np.ndarray) -> np.ndarray:
-    return np.array([os.getpid(), position[0]])
+def processes(position: np.ndarray) -> np.ndarray:
+    """Who computes, and who keeps it running."""
+    return np.array([os.getpid(), os.getppid()], dtype=float)
+
+
+def busy(position: np.ndarray) -> np.ndarray:
+    """Takes 50 ms of a processor."""
+    end = time.process_time() + 0.05
+    while time.process_time() < end:
+        position = np.sort(position)
+    return position + 1.0
 
 
 def picky(position: np.ndarray) -> np.ndarray:
@@ -44,9 +54,8 @@ class SlowScenario(Scenario):
     simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-6))
     period: float = 0.02
     latency: float = 0.01
-    # A dataclass from YAML would not hold it; the tests build it themselves.
-    part: dict[str, Any] = field(default_factory=dict)
     function: Callable[..., Any] = chaotic
+    more: dict[str, Any] = field(default_factory=lambda: {"memory": np.array([0.3, 0.6])})
 
     def interface(self) -> Interface:
         return Interface(
@@ -62,7 +71,7 @@ class SlowScenario(Scenario):
             outputs={"estimate": 2},
             period=self.period,
             latency=self.latency,
-            **self.part,
+            **self.more,
         )
         perception = builder.AddNamedSystem("perception", part)
         minus = builder.AddNamedSystem("minus", Gain(-1.0, 2))
@@ -80,10 +89,6 @@ class SlowScenario(Scenario):
         axes = builder.add("sys", "axes", DiscreteTimeIntegrator(2, PERIOD))
         builder.sim_sensor("position", axes.get_output_port())
         builder.sim_actuator("velocity", axes.get_input_port())
-
-
-def remembering(**more: Any) -> dict[str, Any]:
-    return {"memory": np.array([0.3, 0.6]), **more}
 
 
 def moving(t: float) -> Mapping[str, Any]:

@@ -150,21 +150,21 @@ class _Beside:
             self._miss(tick)
 
     def _take_in(self, kind: str, content: Any) -> None:
-        tick, self._working = self._working, None
         self._ready = kind != LOST
-        if kind in (RESULT, ERROR):
-            self.statistics.took.record(self._clock.now() - self._asked)
-        if kind == RESULT:
-            assert tick is not None
-            self._use(tick, content)
-        elif kind in (ERROR, LOST):
-            self.statistics.errors += kind == ERROR
-            self.statistics.restarts += kind == LOST
-            if content != self._trouble:
-                _log.error("the slow part %s: %s", self.path, content)
-                self._trouble = content
-            if tick is not None:
-                self._miss(tick)
+        if kind == LOST:
+            self.statistics.restarts += 1
+            self._fail(self._working, content)
+            self._working = None
+        elif kind in (RESULT, ERROR):
+            tick, answer = content
+            if tick == self._working:
+                self.statistics.took.record(self._clock.now() - self._asked)
+                self._working = None
+            if kind == RESULT:
+                self._use(tick, answer)
+            else:
+                self.statistics.errors += 1
+                self._fail(tick, answer)
 
     def _use(self, tick: int, arrays: Arrays) -> None:
         if tick in self._waiting:
@@ -175,6 +175,14 @@ class _Beside:
             memory, _ = split_memory(arrays)
             if memory:
                 self._deliver(tick, memory)
+
+    def _fail(self, tick: int | None, reason: str) -> None:
+        # What happens with every sample is told once.
+        if reason != self._trouble:
+            _log.error("the slow part %s: %s", self.path, reason)
+            self._trouble = reason
+        if tick is not None:
+            self._miss(tick)
 
     def _miss(self, tick: int) -> None:
         if tick in self._waiting:
@@ -192,15 +200,15 @@ class _Beside:
         if self._ready and self._working is None and self._waiting:
             self._working = next(iter(self._waiting))
             self._asked = self._clock.now()
-            request = {**self._waiting[self._working], **self._part.memory(self._context)}
-            if not self._companion.post(*pack(request)):
+            arrays = {**self._waiting[self._working], **self._part.memory(self._context)}
+            if not self._companion.post(*pack((self._working, arrays))):
                 _log.error("the slow part %s: its processes are gone, and nothing is computed any more", self.path)
 
     def wait(self, timeout: float) -> bool:
         end = time.monotonic() + timeout
         while (self._working is not None or not self._ready) and not self._answers:
             left = end - time.monotonic()
-            if left <= 0.0:
+            if left <= 0.0 or not self._companion.alive:
                 return False
             line = [self._companion.fileno()]
             select.select(line, line if self._companion.waiting else [], [], left)

@@ -70,7 +70,8 @@ def _pause(channel: Channel, seconds: float) -> None:
 
 
 def serve(channel: Channel, function: bytes) -> None:
-    """Computes: says that it is ready, then answers every request, arrays, by arrays or by the error, as text.
+    """Computes: says that it is ready, then answers every request (tick, arrays) by (tick, arrays) or (tick, the error
+    as text).
 
     Args:
         function: a `SlowFunction`, by cloudpickle.
@@ -78,11 +79,11 @@ def serve(channel: Channel, function: bytes) -> None:
     compute = pickle.loads(function)
     channel.send(b"".join(pack((READY, None))))
     while True:
-        request = unpack(channel.receive())
+        tick, arrays = unpack(channel.receive())
         try:
-            answer = RESULT, compute(request)
+            answer = RESULT, (tick, compute(arrays))
         except Exception:
-            answer = ERROR, traceback.format_exc()
+            answer = ERROR, (tick, traceback.format_exc())
         channel.send(b"".join(pack(answer)))
 
 
