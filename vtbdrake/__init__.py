@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from vtbdrake.control.machine import MachineProcess
     from vtbdrake.control.operation import Operation
     from vtbdrake.control.protocol import Protocol
+    from vtbdrake.control.recording.log_reader import read_log
+    from vtbdrake.control.recording.recorder import Recorder
+    from vtbdrake.control.recording.replay import replay
     from vtbdrake.control.runtime import Runtime
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
@@ -53,6 +56,7 @@ __all__ = [
     "Protocol",
     "Quality",
     "Quantile",
+    "Recorder",
     "RolloutResult",
     "Runtime",
     "Scenario",
@@ -65,6 +69,8 @@ __all__ = [
     "VirtualTestbed",
     "VirtualTestbedBuilder",
     "load_scenario",
+    "read_log",
+    "replay",
     "watch",
 ]
 
@@ -77,6 +83,9 @@ _HOMES = {
     "control.machine": ("MachineProcess",),
     "control.operation": ("Operation",),
     "control.protocol": ("Protocol",),
+    "control.recording.log_reader": ("read_log",),
+    "control.recording.recorder": ("Recorder",),
+    "control.recording.replay": ("replay",),
     "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
     "rollout": ("Constraint", "Quality", "RolloutResult"),

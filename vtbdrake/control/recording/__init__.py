@@ -13,12 +13,3 @@ boundary, each on its own channel, and what else determined the DPS on channels 
 Played back onto a bus, a log plays its commands too: ``lcm-logplayer --regexp`` chooses channels, and a hub keeps
 others out of those that it protects.
 """
-
-from vtbdrake.control.recording.control_log import ControlLog, Damage, Gap
-from vtbdrake.control.recording.log_format import LogError
-from vtbdrake.control.recording.log_reader import read_log
-from vtbdrake.control.recording.recorder import Recorder
-from vtbdrake.control.recording.replay import replay
-from vtbdrake.control.recording.replay_report import Difference, ReplayReport
-
-__all__ = ["ControlLog", "Damage", "Difference", "Gap", "LogError", "Recorder", "ReplayReport", "read_log", "replay"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import platform
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,8 @@ from vtbdrake.control.recording.log_format import VERSION, LogError, LoggedSigna
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, Signal, VirtualTestbed, load_scenario
 
+_log = logging.getLogger(__name__)
+
 TESTBED, DPS = "testbed", "dps"
 
 
@@ -24,7 +27,7 @@ class LogHeader:
 
     Attributes:
         version: of the format.
-        scenario: as `Scenario.save` writes it; empty where what ran was built by hand.
+        scenario: as `Scenario.save` writes it; empty where what ran was built by hand, or is not plain data.
         record: what identifies the scenario, see `Scenario.record`.
         target: ``testbed`` or ``dps``, which is the DPS alone.
         sense, act, commands: the signals.
@@ -61,7 +64,7 @@ class LogHeader:
         target, interface = runtime.target, runtime.target.interface
         return cls(
             scenario=_text(target.scenario) if target.scenario else "",
-            record=target.scenario.record() if target.scenario else {},
+            record=_record(target.scenario),
             target=kind_of(target),
             sense=_logged(interface.sense),
             act=_logged(interface.act),
@@ -106,7 +109,7 @@ class LogHeader:
             LogError: it cannot be found or loaded, or is another one by now.
         """
         if not self.scenario:
-            raise LogError("the log is of something that no scenario built: give what it is to be replayed with")
+            raise LogError("the log does not tell how its scenario is built: give what it is to be replayed with")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scenario.yaml"
             path.write_text(self.scenario)
@@ -124,7 +127,7 @@ class LogHeader:
         Raises:
             LogError: another one was recorded; it says what differs.
         """
-        mine = scenario.record() if scenario is not None else {}
+        mine = _record(scenario)
         keys = ["scenario"] if mine.get("scenario") != self.record.get("scenario") else sorted({*mine, *self.record})
         nothing = object()
         differing = [
@@ -153,8 +156,18 @@ def versions() -> dict[str, str]:
 def _text(scenario: Scenario) -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
-        scenario.save(path)
+        try:
+            scenario.save(path)
+        except Exception as error:  # Drake's writer refuses types in many ways, failed assertions among them.
+            _log.warning("YAML cannot hold the scenario, whoever replays the log must bring it: %r", error)
+            return ""
         return path.read_text()
+
+
+def _record(scenario: Scenario | None) -> Any:
+    """As `Scenario.record`, after the way through a file."""
+    record = scenario.record() if scenario is not None else {}
+    return json.loads(json.dumps(record, default=lambda value: getattr(value, "__qualname__", None) or repr(value)))
 
 
 def _logged(signals: Sequence[Signal]) -> tuple[LoggedSignal, ...]:

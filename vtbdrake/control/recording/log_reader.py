@@ -98,7 +98,8 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
     )
     damages.sort()
     if damages or log.gaps or log.clock_jumps or not log.closed:
-        _log.warning("%s", log)
+        # As text: whoever keeps it must not keep the file.
+        _log.warning("%s", str(log))
     return log
 
 

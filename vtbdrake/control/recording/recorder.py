@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import time
 import zlib
 from collections.abc import Callable
@@ -204,6 +205,7 @@ class Recorder:
         self._runtime.unwatch(self)
         if self._runtime.bridge.tap == self._tap:
             self._runtime.bridge.tap = self._next_tap
+        self._drain()
         self._take_losses()
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
@@ -216,6 +218,13 @@ class Recorder:
             self._missing = self._recorded - self._arrived()
         if self.lost:
             _log.error("%d of %d cycles are not in %s", self.lost, self._recorded, self.path)
+
+    def _drain(self, timeout: float = 10.0) -> None:
+        """Waits until there is room for the last frame."""
+        companion, end = self._companion, time.monotonic() + timeout
+        while companion.waiting and companion.alive and (left := end - time.monotonic()) > 0.0:
+            select.select((), (companion,), (), left)
+            companion.flush()
 
     def _arrived(self) -> int:
         try:

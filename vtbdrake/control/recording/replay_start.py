@@ -7,12 +7,10 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.cycle import SWITCH
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.log_format import LogError
-from vtbdrake.control.recording.log_header import DPS, kind_of
-from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.copying import StateCopier
-from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
-from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.testbed.switch import REAL
+from vtbdrake.control.recording.log_header import DPS, TESTBED
+from vtbdrake.state import Snapshot, SnapshotError
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake.testbed.switch import COMMAND, REAL
 
 Target = VirtualTestbed | DpsAlone
 
@@ -34,44 +32,27 @@ def begin(log: ControlLog, target: Target) -> Context:
         LogError: the log is of something else, or what it fed to the DPS came from a simulated world that is not here.
     """
     log.header.check(target.scenario)
-    if kind_of(target) == log.header.target:
-        context = target.default_context()
-        _apply(log, target, context)
-        return context
-    scenario = log.scenario if target.scenario is None else target.scenario
-    if isinstance(target, DpsAlone):
+    if isinstance(target, DpsAlone) and log.header.target == TESTBED:
         _check_real(log)
-        testbed = scenario.build()
-        context = testbed.default_context()
-        _apply(log, testbed, context)
-        return target.continue_from(testbed, context)
-    return _with_dps(log, target, scenario)
-
-
-def _with_dps(log: ControlLog, testbed: VirtualTestbed, scenario: Scenario) -> Context:
-    """A context of a testbed in which the DPS is where the DPS alone was, and the simulated world begins."""
-    alone = DpsAlone(scenario)
-    source = alone.default_context()
-    _apply(log, alone, source)
-    context = testbed.default_context()
-    copier = StateCopier(
-        alone.diagram,
-        alone.variables(),
-        testbed.diagram,
-        testbed.variables(),
-        only=lambda path: path == "dps" or path.startswith("dps."),
-    )
-    copier.copy(source, context)
-    commands = [f"u.{signal.name}" for signal in alone.interface.commands]
-    testbed.write(context, {a: alone.read(source, a) for a in commands if a in testbed.variables()})
+    context = target.default_context()
+    try:
+        if isinstance(target, DpsAlone) or log.header.target == TESTBED:
+            target.restore(context, log.start)
+        else:
+            _restore_dps(target, context, log.start)
+    except SnapshotError as error:
+        raise LogError(f"the scenario is built in another way than the one of {log.path}: {error}") from error
     return context
 
 
-def _apply(log: ControlLog, target: AddressedDiagram, context: Context) -> None:
-    try:
-        snapshots.apply(log.start, target.diagram, context, target.variables())
-    except snapshots.SnapshotError as error:
-        raise LogError(f"the scenario is built in another way than the one of {log.path}: {error}") from error
+def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> None:
+    """The DPS is where the DPS alone was; the simulated world begins."""
+    own = testbed.snapshot(context)
+    groups = {key: value for key, value in start.groups.items() if key.partition("/")[0].split(".")[0] == "dps"}
+    values = {address: value for address, value in start.values.items() if address.startswith("dps.")}
+    testbed.restore(context, Snapshot(start.time, {**own.values, **values}, {**own.groups, **groups}))
+    commands = [f"{COMMAND}{signal.name}" for signal in testbed.interface.commands]
+    testbed.write(context, {a: start[a] for a in commands if a in testbed.variables()})
 
 
 def _check_real(log: ControlLog) -> None:
