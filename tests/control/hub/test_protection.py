@@ -70,17 +70,33 @@ def test_other_channels_are_free(guarded) -> None:
     assert client.data("COMMAND_2") == [b"x", b"x"]
 
 
-def test_a_dead_owner_leaves_the_channel_free(guarded) -> None:
-    robot, successor = Client(guarded.url, "COMMAND"), Client(guarded.url)
-    with ClientProcess(guarded.url) as owner:
+def test_a_dead_owner_leaves_the_channel_free_when_its_lease_is_over(short) -> None:
+    robot, successor = Client(short.url, "COMMAND"), Client(short.url)
+    with ClientProcess(short.url) as owner:
         owner.publish(("COMMAND", "first"))
-        wait_until(lambda: state(guarded).owner is not None)
-    wait_until(lambda: state(guarded).owner is None)
+        wait_until(lambda: state(short).owner is not None)
+    wait_until(lambda: state(short).owner is None)
     successor.publish("COMMAND", b"second")
     successor.sync()
     robot.sync()
     assert robot.data("COMMAND") == [b"first", b"second"]
-    assert state(guarded).taken == 0
+    assert state(short).taken == 0
+
+
+def test_while_a_dead_owners_lease_runs_on_only_who_asks_gets_the_channel(guarded) -> None:
+    robot, other = Client(guarded.url, "COMMAND"), Client(guarded.url)
+    with ClientProcess(guarded.url) as owner:
+        owner.publish(("COMMAND", "first"))
+        wait_until(lambda: state(guarded).owner is not None)
+    wait_until(lambda: guarded.statistics().disconnected)
+    other.publish("COMMAND", b"slips in")
+    other.sync()
+    assert (state(guarded).refused, state(guarded).last_refused) == (1, client_name(other.bus.fileno()))
+    other.publish("VTB_HUB_TAKE/COMMAND")
+    other.publish("COMMAND", b"asked")
+    other.sync()
+    robot.sync()
+    assert robot.data("COMMAND") == [b"first", b"asked"]
 
 
 def test_a_frozen_owner_is_succeeded_on_request_only_and_refused_when_it_thaws(short) -> None:

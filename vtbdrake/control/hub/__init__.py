@@ -16,7 +16,8 @@ to all clients that subscribed to its channel, the publisher included.
   3. A client that wants to succeed publishes on ``VTB_HUB_TAKE/<channel>`` (the content does not matter). It becomes
      the owner if there is none, or if the owner's lease is over; otherwise the request is refused and reported. When
      the former owner thaws, it is any other client: rule 2.
-  4. When the owner's connection closes, there is no owner: rule 1.
+  4. When the owner's connection closes, its lease runs on: until it is over, only who asks for the channel gets it;
+     then it is free: rule 1. So nobody slips in while a controller is started again or its successor takes over.
 
   A time in which the hub itself was held up does not count against a lease.
 * **Status.** The hub publishes its `Statistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within

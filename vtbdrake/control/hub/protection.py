@@ -28,6 +28,7 @@ class ProtectedChannel:
         self.name = name
         self._lease = lease
         self.owner: Connection | None = None
+        self._holder: str | None = None  # the owner's name, also when it is gone
         self._renewed = -inf
         self._refused = 0
         self._last_refused: str | None = None
@@ -39,7 +40,7 @@ class ProtectedChannel:
         if client is self.owner:
             self._renewed = now
             return True
-        if self.owner is None:
+        if self.owner is None and self._is_over(now):
             self._give(client, now)
             return True
         self._refuse(client, now, "publishes on it")
@@ -48,7 +49,7 @@ class ProtectedChannel:
     def take(self, client: Connection, now: float) -> bool:
         """Whether the client, which asks for the channel, has it now."""
         if self.owner is not None and client is not self.owner:
-            if now - self._renewed <= self._lease:
+            if not self._is_over(now):
                 self._refuse(client, now, "asks for it")
                 return False
             self._taken += 1
@@ -68,33 +69,36 @@ class ProtectedChannel:
         self._renewed += seconds
 
     def statistics(self, now: float) -> ChannelStatistics:
-        owner = self.owner
+        over = self._is_over(now)
         return ChannelStatistics(
-            owner=None if owner is None else owner.name,
-            lease_over=owner is not None and now - self._renewed > self._lease,
+            owner=None if self.owner is None and over else self._holder,
+            lease_over=self.owner is not None and over,
             refused=self._refused,
             last_refused=self._last_refused,
             taken=self._taken,
         )
 
+    def _is_over(self, now: float) -> bool:
+        return now - self._renewed > self._lease
+
     def _give(self, client: Connection, now: float) -> None:
         if client is not self.owner:
-            before = "" if self.owner is None else f", until now {self.owner.name}"
+            before = "" if self.owner is None else f", until now {self._holder}"
             _log.warning("%s: its owner is %s%s", self.name, client.name, before)
-        self.owner, self._renewed = client, now
+        self.owner, self._holder, self._renewed = client, client.name, now
 
     def _refuse(self, client: Connection, now: float, what: str) -> None:
-        assert self.owner is not None
         self._refused += 1
         self._last_refused = client.name
         # An intruder may publish a thousand times a second.
         if now - self._logged >= _LOG_PERIOD:
             self._logged = now
             _log.warning(
-                "%s: refused, %s %s and its owner is %s (%d refused so far)",
+                "%s: refused, %s %s and its owner is %s%s (%d refused so far)",
                 self.name,
                 client.name,
                 what,
-                self.owner.name,
+                self._holder,
+                ", whose lease runs on" if self.owner is None else "",
                 self._refused,
             )

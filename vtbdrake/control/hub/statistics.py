@@ -12,7 +12,7 @@ class ChannelStatistics:
     """Of one protected channel.
 
     Attributes:
-        owner: the client that may publish, None if there is none.
+        owner: the client that may publish, or the one that is gone and whose lease runs on; None if there is neither.
         lease_over: whether the owner has not published for longer than its lease.
         refused: publications of others and refused requests to take the channel.
         last_refused: whose the last of them was.
