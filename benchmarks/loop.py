@@ -63,7 +63,7 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
             f"{1e6 * needed:.0f} us: answers come more than a period late; measure where less else runs"
         )
     note = (
-        f"{_percentiles(states)}; {answered} answers to {told} states; echo: {_percentiles(_histogram(echoes))}; "
+        f"{percentiles(states)}; {answered} answers to {told} states; echo: {percentiles(histogram(echoes))}; "
         f"{granted}"
     )
     echo = dict(zip((50, 99), np.percentile(echoes, (50, 99)), strict=True))
@@ -109,7 +109,7 @@ def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
         better=LOWER,
         against=f"a bare C loop at the same priority; missed in {PER} cycles: {of:g} to {to:g}",
         note="from the deadline to the end: "
-        + "; ".join(f"{name} {_percentiles(_histogram(values))}" for name, values in late.items())
+        + "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
         + f"; {granted}",
     )
 
@@ -128,7 +128,7 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
         granted = rig.granted()
     steps = {name: runtime.statistics.histograms["step"] for name, runtime in (("alone", alone), ("full", full))}
     p50 = {name: histogram.percentile(50.0) for name, histogram in steps.items()}
-    step = f"DPS: {_percentiles(steps['alone'])}"
+    step = f"DPS: {percentiles(steps['alone'])}"
     return [
         Benchmark(
             name="cycle_overhead",
@@ -137,7 +137,7 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
             goal=60e-6,
             better=LOWER,
             against=f"the DPS's own step: {1e6 * p50['alone']:.0f} us",
-            note=f"beyond the step: {_percentiles(_histogram(overheads))}; {granted}",
+            note=f"beyond the step: {percentiles(histogram(overheads))}; {granted}",
         ),
         Benchmark(
             name="strip_step_time",
@@ -146,7 +146,7 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
             goal=None,
             better=HIGHER,
             against="a step of the DPS alone; the full testbed's in the same loop over it",
-            note=f"{step}; testbed: {_percentiles(steps['full'])}",
+            note=f"{step}; testbed: {percentiles(steps['full'])}",
         ),
     ]
 
@@ -179,7 +179,7 @@ def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
             goal=None,
             better=HIGHER,
             against=f"{against}, p99 from the deadline to the end",
-            note=f"ours: {_percentiles(_histogram(ours))}; Drake: {_percentiles(_histogram(theirs))}; {granted}",
+            note=f"ours: {percentiles(histogram(ours))}; Drake: {percentiles(histogram(theirs))}; {granted}",
         ),
         Benchmark(
             name="loop_against_drake_misses",
@@ -231,13 +231,13 @@ def _await(bus: lcm.LCM) -> None:
         raise TimeoutError(f"no message came back within {TIMEOUT_MS} ms")
 
 
-def _histogram(times: list[float]) -> Histogram:
+def histogram(times: list[float]) -> Histogram:
     histogram = Histogram()
     for seconds in times:
         histogram.record(seconds)
     return histogram
 
 
-def _percentiles(times: Histogram) -> str:
+def percentiles(times: Histogram) -> str:
     p50, p90, p99 = (1e6 * times.percentile(percent) for percent in (50.0, 90.0, 99.0))
     return f"p50 {p50:.0f}, p90 {p90:.0f}, p99 {p99:.0f} us (n = {times.count})"

@@ -25,6 +25,7 @@ BENCHMARKS: Registry = {
     "loop_misses": "benchmarks.loop:loop_misses",
     "cycle_overhead": "benchmarks.loop:cycle_overhead",
     "loop_against_drake": "benchmarks.loop:loop_against_drake",
+    "slow_part_misses": "benchmarks.slow_part:slow_part_misses",
     "study_overhead_threads": "benchmarks.study:study_overhead_threads",
     "study_overhead_processes": "benchmarks.study:study_overhead_processes",
     "study_against_optuna": "benchmarks.study:study_against_optuna",

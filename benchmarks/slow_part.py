@@ -1,0 +1,86 @@
+"""What a slow part beside it does to the punctuality of the loop."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from benchmarks.loop import PER, histogram, percentiles
+from benchmarks.loop_rig import loop_rig
+from benchmarks.measure import LOWER, Benchmark
+from diagrams.manipulator import ManipulatorScenario
+from diagrams.manipulator.arm import JOINTS
+from vtbdrake.testbed import DpsAlone, SlowPart
+
+TAKES = 0.05  # s of a processor
+SAMPLE_PERIOD, LATENCY = 0.1, 0.09  # s
+
+
+def perceive(joint_position: np.ndarray) -> np.ndarray:
+    """Works on numbers for as long as a perception works on an image."""
+    end = time.process_time() + TAKES
+    found = joint_position
+    numbers = np.random.default_rng(0).normal(size=(200, 200))
+    while time.process_time() < end:
+        found = joint_position + np.abs(numbers).sum(axis=0)[:JOINTS]
+    return found
+
+
+@dataclass
+class PerceivingScenario(ManipulatorScenario):
+    """The arm, with a perception beside its control law."""
+
+    def make_dps(self) -> Diagram:
+        builder = DiagramBuilder()
+        law = builder.AddNamedSystem("law", super().make_dps())
+        part = SlowPart(
+            perceive,
+            inputs={"joint_position": JOINTS},
+            outputs={"found": JOINTS},
+            period=SAMPLE_PERIOD,
+            latency=LATENCY,
+        )
+        builder.AddNamedSystem("perception", part)
+        for k in range(law.num_input_ports()):
+            builder.ExportInput(law.get_input_port(k), law.get_input_port(k).get_name())
+        builder.ConnectInput("joint_position", part.GetInputPort("joint_position"))
+        for k in range(law.num_output_ports()):
+            builder.ExportOutput(law.get_output_port(k), law.get_output_port(k).get_name())
+        return builder.Build()
+
+
+def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
+    """Missed deadlines of the 1 kHz loop with a perception beside it that takes 50 ms of a processor every 100 ms, n,
+    and without it, m, in turns, in the full loop with hub and machine: (n + 1) / (m + 1), both for 10,000 cycles.
+
+    Raises:
+        RuntimeError: hardly a result of the perception came in time: nothing has worked beside the loop.
+    """
+    misses = {"with": 0, "without": 0}
+    late: dict[str, list[float]] = {"with": [], "without": []}
+    with loop_rig() as rig, rig.runtime(DpsAlone(PerceivingScenario())) as perceiving:
+        perceiving.slow_parts.wait(timeout=60.0)
+        runtimes = {"without": rig.runtime(DpsAlone(rig.scenario)), "with": perceiving}
+        for _ in range(rounds):
+            for name, runtime in runtimes.items():
+                misses[name] += rig.run(runtime, cycles // rounds)
+                late[name] += runtime.lateness
+        (found,) = perceiving.slow_parts.statistics.values()
+        granted = rig.granted()
+    if found.results < found.missed:
+        raise RuntimeError(f"{found.missed} results of the slow part were missing, and only {found.results} in time")
+    of, to = (misses[name] * PER / cycles for name in ("with", "without"))
+    punctuality = "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
+    return Benchmark(
+        name="slow_part_misses",
+        value=(of + 1.0) / (to + 1.0),
+        unit="1",
+        goal=2.0,
+        better=LOWER,
+        against=f"the loop without it; missed in {PER} cycles: {of:g} to {to:g}",
+        note=f"from the deadline to the end: {punctuality}; {found.results} results in time, {found.missed} missing; "
+        f"from request to answer: {percentiles(found.took)}; {granted}",
+    )
