@@ -9,14 +9,14 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from benchmarks.loop import PER, histogram, percentiles
-from benchmarks.loop_rig import loop_rig
+from benchmarks.loop_rig import PERIOD, loop_rig
 from benchmarks.measure import LOWER, Benchmark
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import JOINTS
 from vtbdrake.testbed import DpsAlone, SlowPart
 
 TAKES = 0.05  # s of a processor
-SAMPLE_PERIOD, LATENCY = 0.1, 0.09  # s
+SAMPLE_PERIOD, LATENCY = 0.1, 0.2  # s
 
 
 def perceive(joint_position: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
     and without it, m, in turns, in the full loop with hub and machine: (n + 1) / (m + 1), both for 10,000 cycles.
 
     Raises:
-        RuntimeError: hardly a result of the perception came in time: nothing has worked beside the loop.
+        RuntimeError: the perception did not come to work: there was nothing beside the loop.
     """
     misses = {"with": 0, "without": 0}
     late: dict[str, list[float]] = {"with": [], "without": []}
@@ -70,8 +70,8 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
                 late[name] += runtime.lateness
         (found,) = perceiving.slow_parts.statistics.values()
         granted = rig.granted()
-    if found.results < found.missed:
-        raise RuntimeError(f"{found.missed} results of the slow part were missing, and only {found.results} in time")
+    if found.took.count < 0.5 * cycles * PERIOD / SAMPLE_PERIOD:
+        raise RuntimeError(f"the perception has worked {found.took.count} times: measure where less else runs")
     of, to = (misses[name] * PER / cycles for name in ("with", "without"))
     punctuality = "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
     return Benchmark(
@@ -81,6 +81,6 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
         goal=2.0,
         better=LOWER,
         against=f"the loop without it; missed in {PER} cycles: {of:g} to {to:g}",
-        note=f"from the deadline to the end: {punctuality}; {found.results} results in time, {found.missed} missing; "
-        f"from request to answer: {percentiles(found.took)}; {granted}",
+        note=f"from the deadline to the end: {punctuality}; {found.results} results in time, {found.missed} missing "
+        f"({found.late} of them late); from request to answer: {percentiles(found.took)}; {granted}",
     )
