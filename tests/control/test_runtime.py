@@ -50,6 +50,20 @@ def test_on_sim_nothing_is_sent_and_the_world_is_driven():
     assert runtime.time == 2000 * PERIOD and runtime.target.read(runtime.context, "dps.ticks") == 2000.0
 
 
+@pytest.mark.parametrize("start", [0.0, 0.5, 2501 * PERIOD, 7.7])
+def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
+    dps = DpsAlone(ServoScenario())
+    context = dps.default_context()
+    context.SetTime(start)
+    clock = SimulatedClock()
+    runtime = Runtime(dps, ScriptedBridge(dps.interface, clock, still), period=PERIOD, context=context, clock=clock)
+    runtime.begin()
+    ticks = []
+    runtime.run(cycles=3000, until=lambda: ticks.append(dps.read(context, "dps.ticks")))
+    assert set(np.diff(ticks)) == {1.0}
+    assert runtime.time == pytest.approx(start + 3.0, abs=1e-12)
+
+
 @pytest.mark.parametrize("alone", [False, True])
 def test_the_machine_gets_what_the_dps_commands(alone):
     runtime, bridge, _ = switched(alone=alone, rate=0.0)

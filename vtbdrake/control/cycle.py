@@ -47,3 +47,18 @@ class Cycle(NamedTuple):
     fed: Mapping[str, Any]
     commands: Mapping[str, Any]
     verdict: Verdict
+
+
+def time_after(steps: int, *, start: float, period: float) -> float:
+    """The DPS's time after some steps, in seconds.
+
+    Where it starts at a multiple of the period, all are multiples: samples are due at those, and a rounding error off
+    them a step would have none or two of an update now and then.
+    """
+    first = round(start / period)
+    if steps and abs(first * period - start) <= _ON_GRID * period:
+        return (first + steps) * period
+    return start + steps * period
+
+
+_ON_GRID = 1e-6

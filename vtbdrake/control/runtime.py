@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.bridge import Bridge, Reception
 from vtbdrake.control.clock import Clock, WallClock
-from vtbdrake.control.cycle import RESET, WRITE, Change, Cycle
+from vtbdrake.control.cycle import RESET, WRITE, Change, Cycle, time_after
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
@@ -260,8 +260,7 @@ class Runtime:
             return None, {}
         self.initialized = True
         try:
-            # A multiple of the period, exactly: a sum would give none or two updates now and then.
-            self._simulator.AdvanceTo(self.start_time + (self.steps + 1) * self.period)
+            self._simulator.AdvanceTo(time_after(self.steps + 1, start=self.start_time, period=self.period))
             self.steps += 1
             return None, self._ports.commands(active)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.

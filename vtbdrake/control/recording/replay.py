@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vtbdrake.control.boundary import RealPorts
-from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after
 from vtbdrake.control.recording.abstract_values import abstract_values
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.digest import StateDigest
@@ -147,8 +147,7 @@ class _Replay:
                 self.record[address].append(read(context))
 
     def _time(self, steps: int) -> float:
-        # As the runtime computes it, to the last bit.
-        return self._log.header.start_time + steps * self._log.header.period
+        return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)
 
     def _step(self, i: int) -> None:
         try:
