@@ -169,6 +169,18 @@ def test_values_that_are_set_are_not_perturbed() -> None:
     assert machine(values={mass: 1.5}, perturb=0.5).read(mass) == 1.5
 
 
+def test_values_that_are_set_while_it_runs_hold_from_the_next_cycle_on() -> None:
+    mass = "sim.sys.Acrobot.lower_link.mass"
+    robot, heavy = machine(), machine(values={**PUSHED, mass: 1.5})
+    assert robot.messages() == heavy.messages()
+    robot.write({mass: 1.5})
+    assert run(robot, 5, command=0.5) == run(heavy, 5, command=0.5) != run(machine(), 5, command=0.5)
+    assert robot.perturbed == heavy.perturbed
+    with pytest.raises(ValueError, match="must lie in"):
+        robot.write({mass: -1.0})
+    assert robot.read(mass) == 1.5
+
+
 def test_delayed_state_is_that_of_earlier_cycles() -> None:
     late, prompt = run(machine(sense_delay=0.003), 20), run(machine(), 20)
     assert late == prompt[:-3]

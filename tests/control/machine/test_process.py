@@ -254,11 +254,33 @@ def test_machine_that_does_not_brake(hub: Hub) -> None:
         process.until(lambda status: status.braking)
 
 
+def test_values_are_set_while_it_runs(hub: Hub) -> None:
+    mass = "sim.sys.Acrobot.lower_link.mass"
+    listener = Listener(hub.url)
+    heavy = Machine(RobotScenario(), MachineConfig(values={**PUSHED, mass: 1.5}))
+    heavy.receive(COMMAND, torque(0.5, 1))
+    heavy.advance()
+    with MachineProcess(RobotScenario(), hub.url, lock_step=True, values=PUSHED) as process:
+        process.write({mass: 1.5})
+        with pytest.raises(MachineError, match="did you mean"):
+            process.write({"sim.sys.Acrobot.lower_link.mas": 2.0})
+        listener.command(0.5, 1)
+        assert listener.until_cycle(1)[-1:] == [data for _, data in heavy.messages()]
+
+
 def test_requests_over_lcm(hub: Hub) -> None:
     listener = Listener(hub.url)
     statuses = listener.statuses
     with MachineProcess(RobotScenario(), hub.url) as process:
-        for nonsense in (b"", b"\xff\x00", b"[1]", b'{"fault": "melt"}', b"[" * 100_000, b'{"request": []}'):
+        for nonsense in (
+            b"",
+            b"\xff\x00",
+            b"[1]",
+            b'{"fault": "melt"}',
+            b'{"set": 5}',
+            b"[" * 100_000,
+            b'{"request": []}',
+        ):
             listener.publish("VTB_MACHINE", nonsense)
         listener.publish("VTB_MACHINE", b'{"fault": "clock_jump", "seconds": 3600}')
         listener.wait(lambda heard: any(status["faults"] for status in statuses))

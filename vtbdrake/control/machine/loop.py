@@ -32,7 +32,8 @@ class MachineLoop:
     """A machine and its connection to the bus.
 
     Requests come on the config's ``control_channel``, or by ``control``, as JSON: a fault, as `Fault.to_dict` gives it
-    (``{"fault": "drop", "fraction": 0.5}``), or ``{"request": NAME}``:
+    (``{"fault": "drop", "fraction": 0.5}``), variables of its world to set (``{"set": {"sim.sys.payload.mass": 1}}``),
+    or ``{"request": NAME}``:
 
     * ``status``: nothing else;
     * ``normal``: ends all faults;
@@ -231,7 +232,7 @@ class MachineLoop:
     def _answer(self, text: bytes) -> dict[str, Any]:
         try:
             more = self._do(_parsed(text))
-        except FaultError as error:
+        except ValueError as error:
             _log.warning("request refused: %s", error)
             return {"error": str(error)}
         return {**self.machine.status().to_dict(), **more}
@@ -239,6 +240,9 @@ class MachineLoop:
     def _do(self, request: dict[str, Any]) -> dict[str, Any]:
         if "fault" in request:
             self.machine.begin(fault_from_dict(request))
+            return {}
+        if "set" in request:
+            self.machine.write(_values(request["set"]))
             return {}
         name = request.get("request")
         if name == "die":
@@ -257,8 +261,8 @@ class MachineLoop:
             }
         elif name != "status":
             raise FaultError(
-                "a request is a fault, or one of status, normal, statistics, reset statistics, die; it cannot be "
-                f"{request!r}"
+                "a request is a fault, values to set, or one of status, normal, statistics, reset statistics, die; it "
+                f"cannot be {request!r}"
             )
         return {}
 
@@ -271,3 +275,9 @@ def _parsed(text: bytes) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise FaultError(f"a request is a JSON object, not {request!r}")
     return request
+
+
+def _values(given: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise FaultError(f"what is set is given by address, unlike {given!r}")
+    return given

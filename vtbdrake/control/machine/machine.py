@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any
@@ -125,6 +126,15 @@ class Machine:
     def read(self, address: str) -> Any:
         """The value of a variable or output port of its world."""
         return self.world.read(self._context, address)
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Sets variables of its world between two cycles, by address: a tool that was changed, say.
+
+        Raises:
+            ValueError: an address is unknown, or a value impossible; nothing has changed.
+        """
+        self.world.write(self._context, values)
+        self.perturbed.update(values)
 
     # -- cycles
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -160,6 +160,14 @@ class MachineProcess:
                 raise MachineError(f"the machine did not get there in {timeout} s; it is at {status}")
         return status
 
+    def write(self, values: Mapping[str, Any]) -> MachineStatus:
+        """Sets variables of its world, by address: a tool that is changed while it runs, say.
+
+        Raises:
+            MachineError: an address is unknown, or a value impossible; nothing has changed.
+        """
+        return self._status({"set": _lists(values)})
+
     # -- what goes wrong
 
     def begin(self, *faults: Fault) -> MachineStatus:
@@ -260,5 +268,9 @@ class MachineProcess:
 
 def _plain(config: MachineConfig) -> dict[str, Any]:
     plain = asdict(config)
-    plain["values"] = {address: np.asarray(value).tolist() for address, value in config.values.items()}
+    plain["values"] = _lists(config.values)
     return plain
+
+
+def _lists(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {address: np.asarray(value).tolist() for address, value in values.items()}
