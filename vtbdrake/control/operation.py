@@ -45,6 +45,7 @@ class Operation:
             limit of its rate or acceleration.
         ready: says why the machine on the other side of a bridge is not ready to be commanded, or None.
         pace: the sensor signal that begins a cycle; the clock, if empty.
+        patience: periods without it after which the clock does.
     """
 
     period: float = 1e-3
@@ -52,6 +53,7 @@ class Operation:
     continuity: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     ready: Callable[[Bridge], str | None] = _always
     pace: str = ""
+    patience: float = 3.0
 
     def check(self, interface: Interface) -> None:
         """
@@ -90,6 +92,7 @@ class Operation:
             continuity=self.continuity,
             ready=lambda: self.ready(bridge),
             pace=self.pace or None,
+            patience=self.patience,
             **options,
         )
 
@@ -122,7 +125,7 @@ def operation_of(scenario: Scenario, *, period: float | None = None, pace: str |
 
 
 def take_over(runtime: Runtime, *, timeout: float, tell: Callable[[str], None] = lambda text: None) -> None:
-    """Runs cycles until nothing speaks against it, and then switches to real.
+    """Runs cycles until nothing speaks against it, switches to real, and does a first cycle there.
 
     Args:
         timeout: seconds after which it gives up.
@@ -149,3 +152,5 @@ def take_over(runtime: Runtime, *, timeout: float, tell: Callable[[str], None] =
         return False
 
     runtime.run(until=taken)
+    # At once: a machine in lock-step waits for a command before it says anything new.
+    runtime.cycle()

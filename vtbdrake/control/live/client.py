@@ -19,7 +19,8 @@ from vtbdrake.control.live.messages import ANSWER, GET, SET, WATCH, WATCHED, par
 
 _CONNECT_TIMEOUT = 2.0  # s
 _BURST = 1000  # messages to take in at a time
-_SLICE = 0.2  # s; longest wait for a message before looking at the clock
+_SLICE = 0.05  # s; longest wait for a message before looking at the clock
+_REPEAT = 0.5  # s after which a request is said again
 
 Values = dict[str, float | NDArray[np.float64]]
 
@@ -64,7 +65,7 @@ class ParameterClient:
             LiveError: one of them is refused.
             SilenceError: nobody answers; they may have been set or not.
         """
-        self._ask(SET, {"set": {address: np.asarray(value).tolist() for address, value in values.items()}})
+        self._ask(SET, {"set": dict(values)})
 
     def get(self, addresses: Iterable[str]) -> Values:
         """The present values of variables and vector output ports, by address.
@@ -78,13 +79,16 @@ class ParameterClient:
     def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
         self._waiting = _new_id()
         message = {"id": self._waiting, **request}
-        _publish(self._link, channel, message)
-        limit = time.monotonic() + self._timeout
+        limit, asked = time.monotonic() + self._timeout, -np.inf
         while self._waiting not in self._answers:
-            left = limit - time.monotonic()
-            if left <= 0.0:
+            now = time.monotonic()
+            if now >= limit:
                 raise _silence(self._link, self._timeout)
-            self._link.take(min(left, _SLICE), _BURST)
+            if now >= asked + _REPEAT:
+                # Who begins to serve just now has not heard it; who has, knows it by its id.
+                _publish(self._link, channel, message)
+                asked = now
+            self._link.take(_SLICE, _BURST)
         answer = self._answers.pop(self._waiting)
         if "error" in answer:
             raise LiveError(answer["error"])
@@ -126,7 +130,8 @@ def watch(
         timeout: seconds without a value after which one gives up.
 
     Yields:
-        The DPS's time in seconds, and the values by address.
+        The DPS's time in seconds, and the values by address. Where the loop lacks the time to read all of them in one
+        cycle, they are of this and the cycles before.
 
     Raises:
         BridgeError: there is no bus.
@@ -159,7 +164,7 @@ def _messages(
             if now >= renewed + lease / 3:
                 _publish(link, WATCH, request)
                 renewed = now
-            link.take(min(_SLICE, lease / 6), _BURST)
+            link.take(_SLICE, _BURST)
             while received:
                 message = received.popleft()
                 heard = time.monotonic()
@@ -201,7 +206,7 @@ class LiveWatch:
         timeout: float = 5.0,
     ) -> None:
         self._addresses = tuple(addresses)
-        self._samples: deque[tuple[float, Values]] = deque(maxlen=size)
+        self._samples: deque[tuple[float, float, Values]] = deque(maxlen=size)
         self._error: Exception | None = None
         self._stop = threading.Event()
         self._grown = threading.Condition()
@@ -214,7 +219,7 @@ class LiveWatch:
         try:
             for message in _messages(*arguments):
                 with self._grown:
-                    self._samples.append((message["time"], _arrays(message["values"])))
+                    self._samples.append((message["time"], message["since"], _arrays(message["values"])))
                     self._count += 1
                     self._grown.notify_all()
         except (LiveError, SilenceError, BridgeError) as error:
@@ -240,7 +245,9 @@ class LiveWatch:
             raise SilenceError(f"{self._count} of {count} samples came within {timeout} s")
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """``time``, shape (n,), in seconds, and by address the values, shape (n, ...); the oldest first.
+        """``time`` and ``since``, shape (n,), in seconds, and by address the values, shape (n, ...); the oldest first.
+
+        They were read between the cycles of ``since`` and ``time``: in one, if the loop had the time for it.
 
         Raises:
             LiveError, SilenceError, BridgeError: nothing more comes, because of that.
@@ -248,8 +255,8 @@ class LiveWatch:
         self._check()
         with self._grown:
             samples = list(self._samples)
-        columns = {"time": np.array([time for time, _ in samples])}
-        return columns | {a: np.array([values[a] for _, values in samples]) for a in self._addresses}
+        columns = {"time": np.array([now for now, _, _ in samples]), "since": np.array([s for _, s, _ in samples])}
+        return columns | {a: np.array([values[a] for _, _, values in samples]) for a in self._addresses}
 
     def frame(self) -> Any:
         """A pandas DataFrame of `arrays` with one column per number, over time.
@@ -263,6 +270,7 @@ class LiveWatch:
             raise ModuleNotFoundError("a frame needs pandas: pip install 'vtbdrake[dataframe]'") from error
         arrays = self.arrays()
         time = arrays.pop("time")
+        del arrays["since"]
         columns: dict[str, Any] = {}
         for address, values in arrays.items():
             flat = values.reshape(time.size, -1)

@@ -9,6 +9,7 @@ import pickle
 import select
 import struct
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
@@ -38,6 +39,7 @@ MAX_WATCHES = 16
 
 _TICK = 0.1  # s; leases are no more exact than that
 _BURST = 200  # messages to take in at a time
+_MEMORY = 1000  # requests to set and get that are known if they are said again
 _CONNECT_TIMEOUT = 2.0  # s
 
 # From the loop: the number of a request and
@@ -82,6 +84,7 @@ class Desk:
         self._link.open()
         self._tasks: dict[int, _Task] = {}
         self._numbers = 0
+        self._heard: deque[str] = deque(maxlen=_MEMORY)
         self._told = 0  # of those refused
         self._tell_next = 0.0
 
@@ -118,7 +121,11 @@ class Desk:
             RequestError: there are too many.
         """
         now = time.monotonic()
-        if isinstance(request, ReadRequest) and channel == WATCH:
+        if channel != WATCH:
+            if request.id in self._heard:
+                return
+            self._heard.append(request.id)
+        elif isinstance(request, ReadRequest):
             if self._renewed(request, now) or not request.addresses:
                 return
             if sum(task.channel == WATCH for task in self._tasks.values()) >= MAX_WATCHES:
@@ -188,6 +195,8 @@ class Desk:
         self._say(task, **outcome)
 
     def _unknown(self, address: str) -> str:
+        if address in self._addresses:
+            return f"{address} is an output port: it is read, not set"
         # Only who mistypes an address pays for Drake.
         from vtbdrake.state.variables import suggestion
 

@@ -22,6 +22,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
+from operator import methodcaller
 from typing import Any
 
 SET, GET, WATCH = "VTB_SET", "VTB_GET", "VTB_WATCH"
@@ -68,8 +69,8 @@ Request = SetRequest | ReadRequest
 
 
 def to_json(message: Any) -> bytes:
-    """The bytes of a message."""
-    return json.dumps(message, separators=(",", ":")).encode()
+    """The bytes of a message; it may hold arrays of numpy."""
+    return json.dumps(message, separators=(",", ":"), default=methodcaller("tolist")).encode()
 
 
 def parse_id(data: bytes) -> str:
@@ -107,16 +108,12 @@ def _parsed(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_LENGTH:
         raise RequestError(f"a request has at most {MAX_LENGTH} bytes, not {len(data)}")
     try:
-        message = json.loads(data, parse_constant=_no_constant)
+        message = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise RequestError(f"a request is JSON, which this is not: {error}") from None
     if not isinstance(message, dict):
         raise RequestError(f"a request is a JSON object, not {_short(message)}")
     return message
-
-
-def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is not finite")
 
 
 def _only(message: dict[str, Any], what: str, *others: str) -> Any:

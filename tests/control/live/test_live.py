@@ -1,0 +1,243 @@
+"""A running DPS is set, read and watched from outside, and goes on as if nobody looked."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+import lcm
+import numpy as np
+import pytest
+
+from tests.control.live.rig import PATIENCE, Rig, served
+from tests.control.scripted import PERIOD
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.live.client import LiveError, LiveWatch, ParameterClient, SilenceError, watch
+
+# Enough to read everything in one cycle, on a computer that is busy.
+AMPLE = {"budget": 10.0, "longest": 10.0}
+
+
+@pytest.fixture(scope="module")
+def hub() -> Iterator[Hub]:
+    with Hub(port=0) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Rig]:
+    """For tests that change nothing, on a bus of its own."""
+    with Hub(port=0) as bus, served(bus.url, **AMPLE) as (rig, _):
+        yield rig
+
+
+def asked(url: str, method: str, argument: Any) -> Any:
+    with ParameterClient(url, timeout=PATIENCE) as client:
+        return getattr(client, method)(argument)
+
+
+def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[tuple[float, dict[str, Any]]]:
+    return list(islice(watch(url, addresses, timeout=PATIENCE, **options), count))
+
+
+# -- set and get
+
+
+def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:
+    with served(hub.url) as (rig, _):
+        rig.during(asked, hub.url, "set", {"dps.gain": 3.0, "u.target": [0.2, -0.1]})
+        rig.runtime.cycle()
+        [(k, change)] = [(k, change) for k, cycle in enumerate(rig.cycles) for change in cycle.changes[:1] if k > 1]
+        assert change == ("write", {"dps.gain": 3.0, "u.target": [0.2, -0.1]})
+        position = np.array(rig.cycles[k].fed["position"])
+        assert np.array_equal(rig.cycles[k].commands["velocity"], 3.0 * (np.array([0.2, -0.1]) - position))
+        assert not np.array_equal(rig.cycles[k - 1].commands["velocity"], rig.cycles[k].commands["velocity"])
+
+
+def test_what_is_read_is_what_is_there(shared: Rig) -> None:
+    found = shared.during(asked, shared.url, "get", ["dps.gain", "u.target", "u.target[1]", "real.act.velocity"])
+    assert (found["dps.gain"], found["u.target[1]"]) == (5.0, 0.0)
+    assert np.array_equal(found["u.target"], [0.0, 0.0])
+    assert any(np.array_equal(found["real.act.velocity"], cycle.commands.get("velocity")) for cycle in shared.cycles)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"dps.gian": 1.0}, "no variable and no output port 'dps.gian'; did you mean dps.gain or"),
+        ({"dps.gain": 1.0, "dps.nothing[3]": 1.0}, "'dps.nothing[3]'"),
+        ({"dps.gain": -1.0}, "must lie in"),
+        ({"dps.gain": [1.0, 2.0]}, "shape"),
+        ({"u.target": [[1.0], [2.0, 3.0]]}, ""),
+        ({"dps.velocity": 1.0, "dps.gain": float("nan")}, "the value of dps.gain is a finite number"),
+        ({"time": 1.0}, "time is not written"),
+        ({"real.act.velocity": [1.0, 1.0]}, "real.act.velocity is an output port"),
+    ],
+)
+def test_what_cannot_be_set_is_refused_with_the_reason(shared: Rig, values: dict[str, Any], reason: str) -> None:
+    with pytest.raises(LiveError) as error:
+        shared.during(asked, shared.url, "set", values)
+    assert reason in str(error.value)
+    assert not any(change.kind == "write" for cycle in shared.cycles for change in cycle.changes)
+
+
+def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
+    bus, answers = lcm.LCM(hub.url), []
+    bus.subscribe("VTB_SET_ANSWER", lambda _, data: answers.append(json.loads(data)))
+    with served(hub.url) as (rig, service):
+        rig.during(asked, hub.url, "get", ["dps.gain"])  # The companion listens.
+        for data in (b"", b"\x00\xff", b" " * 100_000, b'{"id": "me", "set": {"x": Infinity}}', b'{"id": "me"}'):
+            bus.publish("VTB_SET", data)
+        rig.until(lambda: service.refused == 5)
+        while len(answers) < 5:
+            assert bus.handle_timeout(round(1e3 * PATIENCE))
+        assert [answer["id"] for answer in answers] == ["", "", "", "me", "me"]
+        assert all(answer["error"] for answer in answers)
+        assert rig.during(asked, hub.url, "get", ["dps.gain"]) == {"dps.gain": 5.0}
+    assert rig.runtime.guards.latched == ()
+
+
+def test_a_flood_of_requests_costs_the_loop_one_a_cycle(hub: Hub) -> None:
+    bus = lcm.LCM(hub.url)
+    with served(hub.url) as (rig, service):
+        rig.during(asked, hub.url, "get", ["dps.gain"])
+        before = len(rig.cycles)
+        for k in range(300):
+            bus.publish("VTB_SET", json.dumps({"id": f"me{k}", "set": {"dps.gain": k}}).encode())
+        rig.until(lambda: service.refused > 0)
+        assert all(len(cycle.changes) <= 1 for cycle in rig.cycles[before:])
+
+
+def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> None:
+    rate = 2.0
+    with served(hub.url, rate=rate) as (rig, _):
+        rig.during(asked, hub.url, "set", {"u.target": [0.2, -0.2], "dps.gain": 4.0})
+        rig.until(lambda: abs(rig.sent[-1][0]) > 0.1)
+    assert rig.runtime.guards.latched == ()
+    assert np.abs(np.diff(rig.sent, axis=0)).max() <= rate * PERIOD * (1.0 + 1e-9)
+
+
+def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
+    with ParameterClient(hub.url, timeout=0.1) as client, pytest.raises(SilenceError, match="nobody has answered"):
+        client.get(["dps.gain"])
+
+
+# -- watch
+
+
+def test_values_watched_are_those_of_their_cycle(shared: Rig) -> None:
+    seen = shared.during(watched, shared.url, ["dps.velocity", "real.act.velocity", "dps.ticks"], 50)
+    by_time = {cycle.time: cycle.commands for cycle in shared.cycles}
+    for t, values in seen:
+        assert np.array_equal(values["dps.velocity"], by_time[t]["velocity"])
+        assert np.array_equal(values["real.act.velocity"], by_time[t]["velocity"])
+    assert np.diff([values["dps.ticks"] for _, values in seen]).tolist() == [1.0] * 49
+
+
+def test_one_may_watch_every_so_many_cycles(shared: Rig) -> None:
+    seen = shared.during(watched, shared.url, ["dps.ticks"], 5, every=7)
+    assert np.diff([values["dps.ticks"] for _, values in seen]).tolist() == [7.0] * 4
+
+
+def test_beyond_the_budget_values_are_read_in_turns_and_that_is_told(hub: Hub) -> None:
+    addresses = ["dps.ticks", "dps.gain", "dps.velocity", "u.target"]
+    bus, seen = lcm.LCM(hub.url), []
+    bus.subscribe("VTB_WATCHED/me", lambda _, data: seen.append(json.loads(data)))
+    with served(hub.url, budget=1e-9) as (rig, service):
+        rig.during(asked, hub.url, "get", ["dps.gain"])
+        bus.publish("VTB_WATCH", json.dumps({"id": "me", "watch": addresses}).encode())
+        rig.until(lambda: service.watches == 1)
+        rig.until(lambda: bus.handle_timeout(0) > 0 and len(seen) >= 5)
+    # One value a cycle, so a round takes four cycles.
+    assert all(m["time"] - m["since"] == pytest.approx(3 * PERIOD) for m in seen)
+    assert all(m["values"]["dps.ticks"] == round(m["since"] / PERIOD) for m in seen)
+
+
+def test_nobody_waits_for_ever_while_others_watch_more_than_there_is_time_for(hub: Hub) -> None:
+    with served(hub.url, budget=1e-9) as (rig, service):
+        with LiveWatch(hub.url, ["dps.ticks", "dps.gain"], timeout=PATIENCE) as first:
+            rig.until(lambda: service.watches == 1)
+            seen = rig.during(watched, hub.url, ["u.target", "dps.velocity"], 5)
+            rig.during(first.wait, 5, timeout=PATIENCE)
+        assert len(seen) == 5
+
+
+def test_what_takes_too_long_to_read_is_not_read_again(hub: Hub) -> None:
+    with served(hub.url, budget=1e-9, longest=1e-9) as (rig, service):
+        with pytest.raises(LiveError, match=r"dps.ticks takes .* ms to be read"):
+            rig.during(watched, hub.url, ["dps.ticks"], 1)
+        assert service.watches == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [("dps.velocty", "did you mean dps.velocity"), ("u.target[2]", "no variable"), ("dps", "no variable")],
+)
+def test_unknown_addresses_are_not_watched(shared: Rig, address: str, reason: str) -> None:
+    with pytest.raises(LiveError, match=reason):
+        shared.during(watched, shared.url, ["dps.ticks", address], 1)
+
+
+def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
+    bus = lcm.LCM(hub.url)
+    with served(hub.url) as (rig, service):
+        rig.during(asked, hub.url, "get", ["dps.gain"])
+        bus.publish("VTB_WATCH", json.dumps({"id": "me", "watch": ["dps.gain"], "lease": 0.2}).encode())
+        rig.until(lambda: service.watches == 1)
+        rig.until(lambda: service.watches == 0)
+        # One that renews his lease stays.
+        with LiveWatch(hub.url, ["dps.ticks"], lease=0.3, timeout=PATIENCE) as live:
+            end = time.monotonic() + 1.0
+            rig.until(lambda: time.monotonic() > end)
+            assert service.watches == 1
+        rig.until(lambda: service.watches == 0)
+        assert live.arrays()["time"].size > 0
+
+
+def test_commands_are_the_same_to_the_last_bit_whether_watched_or_not(hub: Hub) -> None:
+    addresses = ["real.act.velocity", "dps.seen"]
+    with served(hub.url) as (rig, _), LiveWatch(hub.url, addresses, timeout=PATIENCE) as live:
+        rig.during(live.wait, 100, timeout=PATIENCE)
+    alone = Rig()
+    while len(alone.bridge.sent) < len(rig.bridge.sent):
+        alone.runtime.cycle()
+        alone.runtime.clock.wait_until(alone.runtime.clock.now() + PERIOD)
+    assert np.array_equal(alone.sent, rig.sent)
+    assert np.ptp(rig.sent) > 0.1
+
+
+def test_the_newest_values_are_kept_to_be_plotted(hub: Hub) -> None:
+    with (
+        served(hub.url, **AMPLE) as (rig, _),
+        LiveWatch(hub.url, ["dps.ticks", "dps.velocity"], size=20, timeout=PATIENCE) as live,
+    ):
+        rig.during(live.wait, 50, timeout=PATIENCE)
+        arrays = live.arrays()
+        frame = live.frame()
+    assert arrays["dps.velocity"].shape == (20, 2)
+    assert np.array_equal(arrays["dps.ticks"], np.round(arrays["time"] / PERIOD))
+    assert np.array_equal(arrays["time"], arrays["since"])
+    assert list(frame.columns) == ["dps.ticks", "dps.velocity[0]", "dps.velocity[1]"]
+    assert frame.index.name == "time" and (frame["dps.velocity[1]"].size >= 20)
+
+
+def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
+    with served(hub.url) as (rig, _):
+        live = LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE)
+        rig.during(live.wait, 5, timeout=PATIENCE)
+    live.close()
+    assert live.arrays()["dps.ticks"].size >= 5
+
+
+def test_the_loop_goes_on_when_the_companion_is_gone(hub: Hub) -> None:
+    with served(hub.url) as (rig, service):
+        with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
+            rig.during(live.wait, 5, timeout=PATIENCE)
+            service._companion.kill()
+            rig.until(lambda: service.watches == 0)
+        before = len(rig.bridge.sent)
+        rig.until(lambda: len(rig.bridge.sent) > before + 10)
+    assert rig.runtime.guards.latched == ()

@@ -1,0 +1,45 @@
+"""Two axes that are a machine: they speak the iiwa messages, and say how their DPS is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+
+from drake import lcmt_scope
+
+from tests.control.scripted import PERIOD, ServoScenario
+from vtbdrake.control.lcm_types import iiwa_command, iiwa_status
+from vtbdrake.control.lcm_vectors import vector_map
+from vtbdrake.control.operation import Operation
+from vtbdrake.control.protocol import Protocol
+from vtbdrake.testbed import Interface
+
+COMMAND = "IIWA_COMMAND"
+PATIENCE = 60.0  # s for whatever has to happen
+
+
+@dataclass
+class ServoMachineScenario(ServoScenario):
+    """In lock-step nothing but the machine begins a cycle; sensor signals stay fresh on a computer that is busy."""
+
+    max_age: float = PATIENCE
+
+    def interface(self) -> Interface:
+        interface = super().interface()
+        return replace(interface, sense=[replace(signal, max_age=self.max_age) for signal in interface.sense])
+
+    def protocol(self) -> Protocol:
+        return Protocol(
+            sense=[iiwa_status({"position": "joint_position_measured", "speed": "joint_velocity_estimated"})],
+            act=[iiwa_command({"velocity": "joint_torque"})],
+            commands=[vector_map("TARGET", lcmt_scope, {"target": "value"})],
+        )
+
+    def operation(self) -> Operation:
+        return Operation(
+            period=PERIOD,
+            guards={"max_missed": inf},
+            continuity={"velocity": ("speed", 5.0)},
+            pace="position",
+            patience=PATIENCE / PERIOD,
+        )
