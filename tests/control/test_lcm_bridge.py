@@ -26,6 +26,7 @@ from vtbdrake.control.hub import STATUS_CHANNEL, Hub
 from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.lcm_connections import TcpqConnection
 from vtbdrake.control.lcm_maps import LcmMap
+from vtbdrake.control.lcm_ownership import Ownership
 from vtbdrake.control.lcm_vectors import vector_map
 from vtbdrake.testbed import Interface, Signal
 
@@ -363,6 +364,39 @@ def test_frozen_owner_of_a_protected_channel_is_succeeded_only_on_request() -> N
                 peer.lcm.handle_timeout(20)
             positions = [command(data)[0][0] for channel, data in peer.heard if channel == "IIWA_COMMAND"]
             assert positions[:2] == [1.0, 3.0]
+
+
+def test_bridge_whose_commands_the_hub_refuses_counts_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        Hub(port=0, protect=["IIWA_COMMAND"], lease=300.0) as hub,
+        closing(bridge(hub.url)) as first,
+        closing(bridge(hub.url)) as second,
+    ):
+        first.open()
+        second.open()
+
+        def both_publish() -> bool:
+            for arm in (first, second):
+                arm.poll()
+                arm.publish({"position": np.full(7, 1.0)})
+            return second.sent["position"].withheld.get("refused", 0) >= 3
+
+        first.publish({"position": np.full(7, 1.0)})
+        wait(first, lambda: hub.statistics().protected["IIWA_COMMAND"].owner is not None)
+        assert wait(second, both_publish)
+        assert first.sent["position"].withheld == {}
+        [record] = [record for record in caplog.records if "refused by the hub" in record.message]
+        assert hub.statistics().protected["IIWA_COMMAND"].owner in record.message
+
+
+@pytest.mark.parametrize("status", [b"", b"{}", b"[]", b"\xff", b'{"protected": {"IIWA_COMMAND": 1}}'])
+def test_what_is_no_status_of_a_hub_is_told_and_changes_nothing(
+    status: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    ownership = Ownership(["IIWA_COMMAND"], lambda: "127.0.0.1:1")
+    ownership.take("VTB_HUB", status)
+    assert ownership.foreign == frozenset()
+    assert "no status" in caplog.text
 
 
 def test_only_a_hub_can_be_asked_for_channels() -> None:

@@ -7,14 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, Reception
-from vtbdrake.control.hub.tcpq import TAKE_PREFIX
+from vtbdrake.control.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
 from vtbdrake.control.lcm_connections import Handler
 from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.lcm_maps import LcmMap
+from vtbdrake.control.lcm_ownership import Ownership
 from vtbdrake.control.lcm_routes import CommandWatch, Inlet, Outlet, Transmission
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.testbed import Interface, Signal
 
+_HUB = "tcpq://"
 _OPEN_TO_ALL = ("udpm://", "mpudpm://")
 
 
@@ -108,6 +110,9 @@ class LcmBridge(Bridge):
         self._watches = {map.channel: CommandWatch(on_alarm) for map in act} if watch else {}
         handlers: dict[str, Handler] = {inlet.channel: self._tapped(inlet) for inlet in self._inlets}
         handlers |= {channel: watch.take for channel, watch in self._watches.items()}
+        self._ownership = Ownership([map.channel for map in act], lambda: self._link.name)
+        if url.startswith(_HUB):
+            handlers[STATUS_CHANNEL] = self._ownership.take
         self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
 
     @property
@@ -157,9 +162,12 @@ class LcmBridge(Bridge):
             watch = self._watches.get(outlet.channel)
             if watch is not None:
                 watch.expect(data)
-            sent = self._link.publish(outlet.channel, data)
-            outlet.count(sent)
-            if sent and self.tap is not None:
+            problem = "" if self._link.publish(outlet.channel, data) else "no bus"
+            if not problem and outlet.channel in self._ownership.foreign:
+                # It has left all the same: the hub lets it pass as soon as the channel is free.
+                problem = "refused"
+            outlet.count(problem)
+            if problem != "no bus" and self.tap is not None:
                 self.tap(outlet.channel, data)
 
     def _tapped(self, inlet: Inlet) -> Handler:
@@ -176,7 +184,7 @@ class LcmBridge(Bridge):
         Raises:
             ValueError: the bus has no hub.
         """
-        if not self.url.startswith("tcpq://"):
+        if not self.url.startswith(_HUB):
             raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to take over")
         for outlet in self._outlets:
             self._link.publish(TAKE_PREFIX + outlet.channel, b"")

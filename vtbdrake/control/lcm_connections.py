@@ -20,6 +20,7 @@ from vtbdrake.control.hub.tcpq import (
     ProtocolError,
     Reader,
     Record,
+    address_name,
     publication,
 )
 
@@ -34,7 +35,13 @@ _HEAD = 12  # bytes of a publication beside its channel and its data
 
 
 class Connection(ABC):
-    """One connection. Its calls do not wait. After an OSError it is of no use any more."""
+    """One connection. Its calls do not wait. After an OSError it is of no use any more.
+
+    Attributes:
+        name: under which a hub knows it; None where there is no hub.
+    """
+
+    name: str | None = None
 
     @abstractmethod
     def fileno(self) -> int:
@@ -116,6 +123,7 @@ class TcpqConnection(Connection):
         self._socket = socket.create_connection(tcpq_address(url), timeout)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.name = address_name(self._socket.getsockname())
             self._greet()
             for channel in handlers:
                 name = _literally(channel).encode()

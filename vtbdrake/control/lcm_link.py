@@ -97,6 +97,11 @@ class LcmLink:
     def connected(self) -> bool:
         return self._current() is not None
 
+    @property
+    def name(self) -> str | None:
+        """Under which a hub knows the present connection; None if there is no connection, or no hub."""
+        return None if self._connection is None else self._connection.name
+
     def _current(self) -> Connection | None:
         if self._search is not None:
             self._connection = self._search.result()

@@ -100,7 +100,8 @@ class Transmission:
         count: how many commands left.
         withheld: how many did not, by the reason: ``size``, ``not finite``, ``limits``, ``incomplete`` (its message
             cannot go without another signal), ``companion`` (another signal of its message was at fault), ``encode``,
-            ``no bus`` (it is lost, or takes nothing at present).
+            ``no bus`` (it is lost, or takes nothing at present), ``refused`` (its hub protects the channel for somebody
+            else; counted from when the hub has said so).
     """
 
     count: int = 0
@@ -145,13 +146,13 @@ class Outlet:
             self._transmissions[name].withhold(faults.get(name, "companion"))
         return None
 
-    def count(self, sent: bool) -> None:
-        """Counts what became of the last message."""
+    def count(self, problem: str) -> None:
+        """Counts what became of the last message: it left, if there was no problem."""
         for name in self._named:
-            if sent:
-                self._transmissions[name].count += 1
+            if problem:
+                self._transmissions[name].withhold(problem)
             else:
-                self._transmissions[name].withhold("no bus")
+                self._transmissions[name].count += 1
 
 
 class CommandWatch:
