@@ -48,7 +48,11 @@ class Runtime:
         clock: the wall clock by default; a `SimulatedClock` makes tests deterministic.
         guards: limits, watchdogs and fallbacks; by default those that follow from the interface.
         pace: by default the clock; the name of a sensor signal lets every message of it begin a cycle (lock-step with
-            the machine), or the clock, where none comes for ``patience`` periods.
+            the machine), or the clock, where none comes for ``patience`` periods. Where the machine tells a cycle in
+            several messages, name a signal of the last one: a cycle begins with the first message that has the signal,
+            and steps with the values that the later ones had a cycle ago.
+        patience: in periods, see ``pace``. It has to cover the machine's jitter, and be shorter than the sensor
+            signals' largest ages, so that a silent machine is noticed by a cycle.
         continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more.
         ready: says why the machine is not ready to be commanded, or None.
