@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, System
 from tests.control.recording.servo import Servo
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.scripted import Servo as ServoSystem
-from tests.control.slow import SlowScenario, chaotic, moving, picky, remembering
+from tests.control.slow import SlowScenario, chaotic, picky
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.log_format import LogError
@@ -213,7 +213,7 @@ def test_another_scenario_is_refused_and_told(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="rate: 0.0 in the log, 2.0 here"):
         replay(log, DpsAlone(ServoScenario(rate=2.0)))
     with pytest.raises(LogError, match="scenario: '.*ServoScenario' in the log, '.*SlowScenario' here"):
-        replay(log, DpsAlone(SlowScenario(part=remembering())))
+        replay(log, DpsAlone(SlowScenario()))
 
 
 def test_another_version_of_the_scenario_is_refused_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,18 +248,23 @@ def test_another_version_of_a_library_is_told(tmp_path: Path, monkeypatch: pytes
 # -- slow parts
 
 
+def rushing(t: float) -> Mapping[str, list[float]]:
+    return {"position": [np.sin(300.0 * t), np.cos(170.0 * t)]}
+
+
 @pytest.mark.parametrize("function", [chaotic, picky], ids=["results", "missing results"])
 def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[..., object]) -> None:
     """And not computed anew: those that were missing are missing again."""
-    part = remembering() if function is chaotic else {}
-    scenario = SlowScenario(part=part, function=function, period=0.004, latency=0.003)
+    more: dict[str, object] = {} if function is picky else {"memory": np.array([0.3, 0.6])}
+    scenario = SlowScenario(function=function, period=0.004, latency=0.003, more=more)
     clock = SimulatedClock()
-    bridge = ScriptedBridge(scenario.interface(), clock, moving)
+    bridge = ScriptedBridge(scenario.interface(), clock, rushing)
     runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock)
     runtime.cycle()
     runtime.switch("real")
     with Recorder(runtime, tmp_path / "run.lcm", digest_period=PERIOD):
         for _ in range(60):
+            clock.advance(PERIOD)
             runtime.slow_parts.wait(60.0)
             runtime.cycle()
     runtime.close()
@@ -268,7 +273,6 @@ def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[.
     missing = [change for change in results if len(change.values["dps.perception"]) == 1]
     assert len(results) >= 14 and (len(missing) > 3) == (function is picky)
 
-    silent = SlowScenario(part=part, function=function, period=0.004, latency=0.003)
-    report = replay(log, DpsAlone(silent))
+    report = replay(log, DpsAlone(scenario))
     assert report.identical and report.digests == 60, report
     assert len(np.unique(report.commands["velocity"], axis=0)) > 10

@@ -1,0 +1,247 @@
+"""Reading logs: whole ones, and all kinds of damage."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.control.recording.servo import Servo
+from tests.control.scripted import PERIOD
+from vtbdrake.control.recording.control_log import ControlLog
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
+from vtbdrake.control.recording.log_events import LogEvents
+from vtbdrake.control.recording.log_format import EVENT, SYNC, LogError
+from vtbdrake.control.recording.log_reader import read_log
+from vtbdrake.control.recording.recorder import Recorder
+from vtbdrake.control.recording.replay import replay
+
+ROOT = Path(__file__).resolve().parents[3]
+CYCLES = 20
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A log with changes, faults and digests."""
+    path = tmp_path_factory.mktemp("log") / "run.lcm"
+    servo = Servo()
+    with Recorder(servo.runtime, path, digest_period=5 * PERIOD):
+        servo.runtime.run(cycles=CYCLES // 2)
+        servo.runtime.write({"u.target": [0.1, 0.2], "dps.trouble": 1.0})
+        servo.runtime.run(cycles=CYCLES // 2)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def reference(whole: bytes, tmp_path: Path) -> ControlLog:
+    (tmp_path / "whole.lcm").write_bytes(whole)
+    return read_log(tmp_path / "whole.lcm")
+
+
+def ends(log: ControlLog) -> list[int]:
+    """Of the cycles' events, in bytes."""
+    return [end for *_, end in log.events.on("VTB_CYCLE")]
+
+
+def read(tmp_path: Path, content: bytes) -> ControlLog:
+    path = tmp_path / "damaged.lcm"
+    path.write_bytes(content)
+    return read_log(path)
+
+
+def assert_same(log: ControlLog, reference: ControlLog, rows: list[int]) -> None:
+    """The log has these rows of the reference, and nothing else."""
+    assert log.numbers.tolist() == reference.numbers[rows].tolist()
+    for name in ("times", "now", "utimes", "ok"):
+        assert np.array_equal(getattr(log, name), getattr(reference, name)[rows])
+    for name in ("fed", "commands", "sent"):
+        for signal_name, values in getattr(log, name).items():
+            assert np.array_equal(values, getattr(reference, name)[signal_name][rows], equal_nan=True)
+
+
+def test_a_cycle_is_what_its_lcm_type_says(reference: ControlLog) -> None:
+    for i, message in enumerate(reference.events.on("VTB_CYCLE")):
+        cycle = lcmt_vtb_cycle.decode(reference.events.data(*message[2:]))
+        assert (cycle.number, cycle.time, cycle.now, cycle.ok, cycle.utime) == (
+            reference.numbers[i], reference.times[i], reference.now[i], reference.ok[i], reference.utimes[i],
+        )  # fmt: skip
+        assert np.array_equal(cycle.fed, [*reference.fed["position"][i], *reference.fed["speed"][i]])
+        assert np.array_equal(cycle.sent, reference.sent["velocity"][i])
+        assert cycle.source[1] == reference.sources["speed"][i]
+
+
+def test_a_log_that_ends_anywhere_is_read_up_to_there(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    bounds = ends(reference)
+    begin = reference.events.on("VTB_STATE")[0][3]
+    cuts = sorted({*random.Random(0).sample(range(begin, len(whole)), 60), *bounds, *(b - 1 for b in bounds)})
+    for cut in cuts:
+        log = read(tmp_path, whole[:cut])
+        complete = sum(bound <= cut for bound in bounds)
+        assert_same(log, reference, list(range(complete)))
+        assert not log.closed
+        torn = cut not in [end for name in log.events._places for *_, end in log.events.on(name)]
+        assert [damage.what for damage in log.damages] == ["the file ends in the middle of an event"] * torn
+        assert not torn or log.damages[0].offset < cut
+
+
+def test_a_damaged_byte_costs_its_cycle_and_no_other(
+    whole: bytes, reference: ControlLog, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bounds = ends(reference)
+    begin = reference.events.on("VTB_STATE")[0][3]
+    chosen = random.Random(1)
+    for place in chosen.sample(range(begin, bounds[-1]), 150):
+        content = bytearray(whole)
+        content[place] ^= 1 << chosen.randrange(8)
+        log = read(tmp_path, bytes(content))
+        hit = next(i for i, bound in enumerate(bounds) if place < bound)
+        assert_same(log, reference, [i for i in range(CYCLES) if i != hit])
+        number = reference.numbers[hit]
+        assert log.gaps == [(number, number)]
+        assert f"missing: cycles {number} to {number}" in caplog.text
+        caplog.clear()
+
+
+def test_a_hole_is_told_and_read_beyond(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    bounds = ends(reference)
+    log = read(tmp_path, whole[: bounds[3] + 50] + whole[bounds[6] + 70 :])
+    assert_same(log, reference, [0, 1, 2, 3, *range(8, CYCLES)])
+    assert log.gaps == [(reference.numbers[4], reference.numbers[7])]
+    assert log.damages[0].offset == bounds[3] and log.closed
+
+
+def test_a_replay_ends_at_a_gap_and_says_so(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    bounds = ends(reference)
+    report = replay(read(tmp_path, whole[: bounds[5]] + whole[bounds[6] :]))
+    assert report.outcome == "identical" and not report.identical
+    assert report.cycles == 6 and "the log lacks cycles 7 to 7" in report.ended
+
+
+def test_what_follows_in_a_log_that_was_not_closed_is_not_known(
+    whole: bytes, reference: ControlLog, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = read(tmp_path, whole[: ends(reference)[9]])
+    assert not log.closed and not log.damages and len(log) == 10
+    assert "the recorder was not closed" in caplog.text
+    assert replay(log).identical
+
+
+def test_cycles_lost_at_the_end_of_a_closed_log_are_a_gap(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    bounds = ends(reference)
+    log = read(tmp_path, whole[: bounds[14]] + whole[bounds[-1] :])
+    assert log.closed and log.gaps == [(reference.numbers[15], reference.numbers[-1])]
+
+
+def test_a_cycle_that_comes_twice_counts_once(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    bounds = ends(reference)
+    log = read(tmp_path, whole[: bounds[5]] + whole[bounds[2] :])
+    assert_same(log, reference, list(range(CYCLES)))
+    assert [damage.what for damage in log.damages] == [f"cycle {n} follows cycle 6" for n in (4, 5, 6)]
+
+
+def shifted(content: bytes, reference: ControlLog, first: int, seconds: float) -> bytes:
+    """The log with other times of day from a cycle on, as if the clock had been set; checksums as they should be."""
+    import zlib
+
+    data = bytearray(content)
+    begin = 0
+    for i, (_, _, start, end) in enumerate(reference.events.on("VTB_CYCLE")):
+        if i >= first:
+            utime = int(reference.utimes[i] + 1e6 * seconds)
+            data[start + 8 : start + 16] = utime.to_bytes(8, "big")
+            size = int.from_bytes(data[end - 8 : end - 4], "big")
+            begin = end - size
+            data[end - 4 : end] = zlib.crc32(data[begin : end - 4]).to_bytes(4, "big")
+    return bytes(data)
+
+
+@pytest.mark.parametrize("seconds", [3600.0, -3600.0])
+def test_a_jump_of_the_clock_is_told_and_does_not_matter(
+    whole: bytes, reference: ControlLog, tmp_path: Path, seconds: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = read(tmp_path, shifted(whole, reference, 7, seconds))
+    assert list(log.clock_jumps) == [7] and not log.damages and not log.gaps
+    assert f"the clock jumps at cycle {reference.numbers[7]}" in caplog.text
+    assert replay(log).identical
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 something else", bytes(5000)], ids=["empty", "short", "zeros"])
+def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(LogError, match="is no log of a control loop: it has no event on VTB_LOG"):
+        read(tmp_path, content)
+
+
+def test_a_log_of_other_software_is_refused(tmp_path: Path) -> None:
+    event = EVENT.pack(SYNC, 0, 1, 4, 3) + b"POSEabc"
+    with pytest.raises(LogError, match="no event on VTB_LOG"):
+        read(tmp_path, 5 * event)
+
+
+def test_damage_at_the_beginning_is_told(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    for channel in ("VTB_LOG", "VTB_STATE"):
+        _, _, begin, end = reference.events.on(channel)[0]
+        for place in random.Random(2).sample(range(begin - EVENT.size - len(channel), end - 4), 25):
+            content = bytearray(whole)
+            content[place] ^= 0x04
+            try:
+                log = read(tmp_path, bytes(content))
+            except LogError as error:
+                assert "cannot be used" in str(error) or "no event on VTB_LOG" in str(error)
+            else:
+                # In the event's number or time, or where a zip file says nothing.
+                assert log.header == reference.header and not log.start.compare(reference.start)
+
+
+def test_a_log_of_another_version_is_refused(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    import zlib
+
+    _, _, begin, end = reference.events.on("VTB_LOG")[0]
+    content = bytearray(whole)
+    at = whole.index(b'"version": 1', begin)
+    content[at + 11 : at + 12] = b"7"
+    text = content[begin + 20 : end - 5]
+    content[end - 4 : end] = zlib.crc32(text).to_bytes(4, "big")
+    with pytest.raises(LogError, match="the log has the format 7, this version of vtbdrake reads 1"):
+        read(tmp_path, bytes(content))
+
+
+def test_events_inside_an_event_whose_length_is_wrong_are_found(tmp_path: Path) -> None:
+    def event(number: int, length: int) -> bytes:
+        return EVENT.pack(SYNC, number, 5, 1, length) + b"A" + bytes(20)
+
+    path = tmp_path / "events"
+    path.write_bytes(event(0, 20) + event(1, 60) + event(2, 20) + event(3, 20))
+    events = LogEvents(path)
+    assert [number for number, *_ in events.on("A")] == [0, 2, 3]
+    assert events.damages == [(49, "no event")]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from tests.control.recording.servo import Servo
+from vtbdrake.control.recording.recorder import Recorder
+
+servo = Servo()
+recorder = Recorder(servo.runtime, Path(sys.argv[1]))
+servo.runtime.run(cycles=500)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_killed_loop_leaves_what_it_had_recorded(tmp_path: Path) -> None:
+    """The process that writes notices, and writes what has reached it."""
+    path = tmp_path / "run.lcm"
+    done = subprocess.run([sys.executable, "-c", KILLED, path], cwd=ROOT, capture_output=True, timeout=120)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    # It held the other end of this pipe, too: the end of its output is the end of both processes.
+    log = read_log(path)
+    assert not log.closed and not log.gaps and not log.damages
+    assert len(log) == 500 and os.path.getsize(path) == len(log.events.content)
+    assert replay(log).identical
