@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -85,6 +85,7 @@ class Comparison:
         # Rows that have to be there before a window can be predicted, after its end.
         self._wait = max(0, max(predictor.ages) - config.horizon)
         self._rows: dict[int, Array] = {}
+        self._nothing = rows.empty(1)[0]
         self._newest: int | None = None
         self._next = 0
         self._settled = 0
@@ -109,17 +110,17 @@ class Comparison:
 
     def _restart(self, index: int) -> None:
         """Begins anew with the first window all of whose rows come from here on."""
-        horizon = self._config.horizon
-        if self._newest is not None:
-            self.skipped += max(0, (index - self._next) // horizon)
+        horizon, before = self._config.horizon, self._next
         self._rows.clear()
         self._next = -(-(index + (self._config.delay if self._twin else 0)) // horizon) * horizon
+        if self._newest is not None:
+            self.skipped += max(0, (self._next - before) // horizon)
         self._settled = -self._config.settle
         self._started = False
 
     def _window(self, s: int) -> Window | None:
         try:
-            sums, counts, whole = self._compare(s)
+            differences, whole = self._compare(s)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             _log.warning("a prediction failed, and begins anew: %s", error)
             self.failed += 1
@@ -134,43 +135,31 @@ class Comparison:
         if not whole:
             self.skipped += 1
             return None
+        known = ~np.isnan(differences)
         with np.errstate(invalid="ignore"):
-            return Window(float(self._rows[s + self._config.horizon][TIME]), sums / counts)
+            mean = np.where(known, differences, 0.0).sum(axis=0) / known.sum(axis=0)
+        return Window(float(self._rows[s + self._config.horizon][TIME]), mean)
 
-    def _compare(self, s: int) -> tuple[Array, Array, bool]:
-        """Sums and counts of the differences, and whether all rows were there that it takes."""
-        whole = self._believe(s)
-        sums, counts = np.zeros(self.layout.size), np.zeros(self.layout.size)
-        for j in range(s, s + self._config.horizon):
-            commanded, told = self._rows.get(j - self._config.delay), self._rows.get(j + 1)
-            acting = self._commands(commanded if self._twin else told)
-            whole &= told is not None and len(acting) == len(self._where.command)
-            predicted = self._predictor.step(acting)
-            if told is None:
-                continue
-            for name, value in predicted.items():
-                self._add(f"sense.{name}", told[self._where.sense[name]] - value, sums, counts)
-            if commanded is not None:
-                for name, place in self._where.reported.items():
-                    self._add(f"act.{name}", told[place] - commanded[self._where.command[name]], sums, counts)
-        return sums, counts, whole
+    def _compare(self, s: int) -> tuple[Array, bool]:
+        """The differences (horizon, all residuals), and whether all was there that it takes."""
+        where, periods = self._where, range(s, s + self._config.horizon)
+        commanded = self._block(j - self._config.delay for j in periods)
+        told = self._block(j + 1 for j in periods)
+        acting = commanded[:, where.commanded] if self._twin else told[:, where.reports]
+        clear = ~np.isnan(acting).any(axis=1)
+        whole = self._believe(s) and bool(clear.all() and not np.isnan(told[:, INDEX]).any())
+        predicted = [self._predictor.step(u if given else None) for u, given in zip(acting, clear, strict=True)]
+        sense = told[:, where.sensed] - np.array(predicted)
+        return np.hstack((sense, told[:, where.reports] - commanded[:, where.compared])), whole
 
-    def _add(self, signal: str, difference: Array, sums: Array, counts: Array) -> None:
-        known = ~np.isnan(difference)
-        place = self.layout.places[signal]
-        sums[place][known] += difference[known]
-        counts[place][known] += 1.0
-
-    def _commands(self, row: Array | None) -> dict[str, Any]:
-        if row is None:
-            return {}
-        places = self._where.command if self._twin else self._where.reported
-        return {name: row[place] for name, place in places.items() if not np.isnan(row[place]).any()}
+    def _block(self, indices: Iterable[int]) -> Array:
+        """Rows by index; NaN where there is none."""
+        return np.array([self._rows.get(i, self._nothing) for i in indices])
 
     def _believe(self, s: int) -> bool:
         """Sets the predicted world to what was believed of instant s; whether all of it is known."""
         if not self._started and s in self._rows:
-            self._predictor.restart(float(self._rows[s][TIME]) - self._config.period)
+            self._predictor.restart(round(self._rows[s][TIME] / self._config.period) - 1)
             self._started = True
         known = self._started
         for age, addresses in self._predictor.ages.items():

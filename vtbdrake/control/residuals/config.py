@@ -23,14 +23,15 @@ class ResidualConfig:
     A scenario that has its own has a method ``residuals`` that returns it.
 
     Attributes:
+        scenario: of the predicted world; None is that of the loop's target. It has the latencies of the sensors, and
+            none of what happens in them by chance.
         period: of the machine's cycles and the DPS's, in seconds.
         horizon: of a prediction, in periods: so often it begins anew from the belief.
         delay: periods from the instant of a sample until the command that answers it acts, beyond a machine's that is
             answered at once and obeys at once.
         settle: windows that are predicted but not judged at first, and after a gap: what the belief does not say (the
             currents of drives, samples in transit) follows from the commands alone, after some time.
-        values: of variables of the predicted world, by address: a world without noise, say, with the payload that the
-            machine is thought to carry.
+        values: of variables of the predicted world, by address: the payload that the machine is thought to carry, say.
         tolerance: by signal (``sense.<name>``, ``act.<name>``), what a residual's scale is at least, for all entries or
             each; persistent residuals below half of it are no finding.
         allowance: k of `Cusum`, in scales.
@@ -40,6 +41,7 @@ class ResidualConfig:
         ValueError: a value is out of its range.
     """
 
+    scenario: Scenario | None = None
     period: float = 1e-3
     horizon: int = 10
     delay: int = 0

@@ -18,7 +18,6 @@ from vtbdrake.control.residuals.config import SHADOW, ResidualConfig, check_mode
 from vtbdrake.control.residuals.predictor import Predictor
 from vtbdrake.control.residuals.rows import Array, RowLayout, Sampler
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.testbed import Scenario
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +41,7 @@ class ResidualMonitor:
         runtime: the loop, not running yet.
         mode: ``shadow``: what the machine reports acts on it, and the DPS's commands are compared with that; ``twin``:
             what the DPS sends acts on it.
-        scenario: of the predicted world; by default that of the runtime's target.
-        config: by default what the scenario's method ``residuals`` says, see `ResidualConfig`.
+        config: by default what the method ``residuals`` of the target's scenario says, see `ResidualConfig`.
         calibration: what residuals are like in nominal operation; without it, tolerances have to say.
         learn: no alarms: residuals are taken down, for `calibrate`.
         aside: False does it all in the loop's own process and thread, in which the loop waits for it: for tests,
@@ -67,7 +65,6 @@ class ResidualMonitor:
         runtime: Runtime,
         mode: str,
         *,
-        scenario: Scenario | None = None,
         config: ResidualConfig | None = None,
         calibration: Calibration | None = None,
         learn: bool = False,
@@ -75,10 +72,13 @@ class ResidualMonitor:
         memory: int = 60_000,
     ) -> None:
         check_mode(mode)
-        scenario = scenario or runtime.target.scenario
+        own = runtime.target.scenario
+        self.config = config = config or (residuals_of(own) if own is not None else ResidualConfig())
+        scenario = config.scenario or own
         if scenario is None:
-            raise ValueError("the loop's target was not built by a scenario: say which one predicts, scenario=")
-        self.config = config = config or residuals_of(scenario)
+            raise ValueError(
+                "the loop's target was not built by a scenario: say which one predicts, by ResidualConfig.scenario"
+            )
         if config.period != runtime.period:
             raise ValueError(
                 f"residuals with a period of {config.period} s do not fit a loop of {runtime.period} s: give "

@@ -13,12 +13,15 @@ from pydrake.systems.analysis import InitializeParams
 from vtbdrake.testbed import Scenario, WorldAlone
 from vtbdrake.testbed.belief import Belief
 
+Array = NDArray[np.float64]
+
 
 class Predictor:
     """A world that runs along with a machine, under the same commands, and is set to the belief again and again.
 
     What the belief does not cover (drives, samples in transit) goes on from window to window: it is state that follows
-    from the commands.
+    from the commands. A discrete plant with sampled output ports goes on showing the state before, until its next step;
+    where sensors look at that very instant, choose ``use_sampled_output_ports: false``.
 
     Args:
         scenario: of the machine.
@@ -55,23 +58,27 @@ class Predictor:
             age: tuple(dict.fromkeys(address for belief in beliefs for address in belief.of))
             for age, beliefs in self._beliefs.items()
         }
-        self._read = {signal.name: world.reader(f"sense.{signal.name}") for signal in world.interface.sense}
+        self._sensors = [world.diagram.GetOutputPort(f"sense.{signal.name}") for signal in world.interface.sense]
+        ends = np.cumsum([0, *(signal.size or 0 for signal in world.interface.act)]).tolist()
+        self._actuators = {s.name: slice(*ends[k : k + 2]) for k, s in enumerate(world.interface.act)}
         self.forget()
 
     def forget(self) -> None:
         """Begins with a new context: everything as by default."""
         self._context = self._world.default_context()
         self._world.write(self._context, self._values)
+        self._feed = self._world.feed(self._context)
         self._simulator = self._world.simulator(self._context)
         self._simulator.Initialize()
-        self.restart(0.0)
+        self.restart(0)
 
-    def restart(self, time: float) -> None:
-        """Goes on from what it is, at another time (s)."""
-        self._context.SetTime(time)
+    def restart(self, period: int) -> None:
+        """Goes on from what it is at another time, the begin of a period that is counted from 0."""
+        # Multiples, as those of the machine: what is due at an instant would be missed by a rounding error before it.
+        self._context.SetTime(period * self._period)
         # Without events: they belong to the beginning of a world.
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
-        self._t0, self._steps = time, 0
+        self._now = period
 
     def believe(self, age: int, estimates: Mapping[str, Any]) -> None:
         """Sets what beliefs of this age are about.
@@ -86,17 +93,21 @@ class Predictor:
             values[belief.target] = np.clip(value, *variable.bounds)
         self._world.write(self._context, values)
 
-    def step(self, commands: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
-        """One period on, under new commands (others last); says what the sensors show then, by signal.
+    def step(self, command: Array | None) -> Array:
+        """One period on; says what the sensors show then, all signals one after another.
+
+        Args:
+            command: of all actuator signals, one after another; None holds the last one.
 
         Raises:
             RuntimeError: the simulation failed.
         """
-        for name, value in commands.items():
-            self._world.command(self._context, name, value)
-        self._simulator.AdvanceTo(self._t0 + (self._steps + 1) * self._period)
-        self._steps += 1
-        return {name: read(self._context) for name, read in self._read.items()}
+        if command is not None:
+            for name, place in self._actuators.items():
+                self._feed(name, command[place])
+        self._simulator.AdvanceTo((self._now + 1) * self._period)
+        self._now += 1
+        return np.concatenate([port.Eval(self._context) for port in self._sensors])
 
 
 def _periods(belief: Belief, period: float) -> int:

@@ -29,6 +29,9 @@ class RowLayout:
         command: by actuator signal, what the DPS commanded.
         reported: by actuator signal, what the machine says acted on it in the period before the sample.
         estimates: by address, what the DPS believes.
+        sensed: where all of ``sense`` is, one signal after another.
+        commanded: indices of all of ``command``.
+        reports: indices of all of ``reported``; ``compared`` are those of the commands that they are reports of.
         width: entries of a row.
     """
 
@@ -40,6 +43,10 @@ class RowLayout:
         self.command = self._place(actuators)
         self.reported = self._place({name: size for name, size in actuators.items() if name in reported})
         self.estimates = self._place(estimates)
+        self.sensed = slice(2, 2 + sum(signal.size or 0 for signal in interface.sense))
+        self.commanded = _indices(self.command.values())
+        self.reports = _indices(self.reported.values())
+        self.compared = _indices(self.command[name] for name in self.reported)
 
     def _place(self, sizes: Mapping[str, int]) -> dict[str, slice]:
         places = {}
@@ -116,3 +123,7 @@ class Sampler:
                 for place, read in estimates:
                     row[place] = np.ravel(read(self._runtime.context))
         return True
+
+
+def _indices(places: Iterable[slice]) -> list[int]:
+    return [k for place in places for k in range(place.start, place.stop)]
