@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Any
 
 from pydrake.systems.framework import Context
@@ -46,6 +47,7 @@ class Operation:
         ready: says why the machine on the other side of a bridge is not ready to be commanded, or None.
         pace: the sensor signal that begins a cycle; the clock, if empty.
         patience: periods without it after which the clock does.
+        aging: False lets sensor values be of any age, where time stands still between two messages.
     """
 
     period: float = 1e-3
@@ -54,6 +56,7 @@ class Operation:
     ready: Callable[[Bridge], str | None] = _always
     pace: str = ""
     patience: float = 3.0
+    aging: bool = True
 
     def check(self, interface: Interface) -> None:
         """
@@ -77,7 +80,19 @@ class Operation:
                 )
 
     def _guards(self, interface: Interface) -> Guards:
+        if not self.aging:
+            interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
         return Guards(interface, self.period, **self.guards)
+
+    def in_lock_step(self, signal: str, *, wait: float = 60.0) -> Operation:
+        """The same with a machine in lock-step, which waits for the command before it goes on: every message of a
+        sensor signal begins a cycle, however long it takes to come.
+
+        Args:
+            signal: in the last message of the machine's cycle, so that all the others are there.
+            wait: seconds after which a cycle begins without it.
+        """
+        return replace(self, pace=signal, patience=wait / self.period, aging=False)
 
     def runtime(
         self, target: DpsAlone | VirtualTestbed, bridge: Bridge, *, context: Context | None = None, **options: Any
