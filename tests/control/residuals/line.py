@@ -94,12 +94,16 @@ class Line(Ear):
             self.machine.receive(outlet.channel, data)
 
 
-def loop(target: VirtualTestbed | DpsAlone, bridge: Bridge, period: float, **values: Any) -> Runtime:
+def loop(
+    target: VirtualTestbed | DpsAlone, bridge: Bridge, period: float, *, begin: bool = True, **values: Any
+) -> Runtime:
     """A runtime on a clock of its own, whose sensors never grow old; ``values`` of variables by address."""
     context = target.default_context()
     target.write(context, values)
     guards = Guards(target.interface, period, max_missed=inf)
     runtime = Runtime(target, bridge, period=period, context=context, clock=SimulatedClock(), guards=guards)
+    if not begin:
+        return runtime
     if isinstance(target, DpsAlone):
         runtime.begin()
     for signal in target.interface.act:

@@ -9,7 +9,7 @@ from collections import deque
 from math import inf, prod
 
 from vtbdrake.control.companion import Companion
-from vtbdrake.control.cycle import Cycle
+from vtbdrake.control.cycle import SWITCH, Cycle
 from vtbdrake.control.residuals.alarm import Alarm, Judge
 from vtbdrake.control.residuals.calibration import Calibration, calibrate
 from vtbdrake.control.residuals.check import Report, ResidualCheck, serve
@@ -139,6 +139,8 @@ class ResidualMonitor:
         """A watcher's: takes down one cycle."""
         if not self._open:
             return
+        if self._filled and any(change.kind == SWITCH for change in cycle.changes):
+            self._begin_block()
         if self._filled == 0 and not self._sampler.listens():
             return
         self._filled += self._sampler.fill(self._block[self._filled], cycle)

@@ -1,0 +1,184 @@
+"""Residuals beside a loop, made by another process."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.control.residuals.line import Ear, Line, Together, loop
+from tests.control.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
+from vtbdrake.control.residuals import ResidualConfig, ResidualMonitor, residuals_of
+from vtbdrake.testbed import DpsAlone
+
+TOLERANCE = {"sense.position": 1e-4, "sense.velocity": 1e-3, "act.torque": 1e-3}
+CONFIG = ResidualConfig(period=PERIOD, tolerance=TOLERANCE)
+SCENARIO = DrivenPendulum()
+PATIENCE = 60.0  # s
+
+
+def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -> None:
+    """Cycles, without haste, until so many windows are known to the loop."""
+    end = time.monotonic() + PATIENCE
+    while len(monitor.history) < count:
+        assert time.monotonic() < end, "no residuals come back"
+        together.run(10)
+        assert monitor._companion is not None
+        select.select((monitor._companion,), (), (), 0.05)
+
+
+def test_other_process_finds_what_the_own_one_does() -> None:
+    together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+    own = ResidualMonitor(together.driver, "twin", config=CONFIG, aside=False)
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as other:
+        assert other.running
+        together.run(305)
+    own.close()
+    assert not other.running
+    assert own.alarms
+    assert list(other.alarms) == list(own.alarms)
+    assert [w.time for w in other.history] == [w.time for w in own.history]
+    np.testing.assert_array_equal([w.residual for w in other.history], [w.residual for w in own.history])
+
+
+def test_newest_residuals_are_known_while_the_loop_runs() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor.newest is None
+        wait_for_windows(monitor, together, 10)
+        assert monitor.newest is not None
+        assert {name: value.shape for name, value in monitor.newest.items()} == dict.fromkeys(TOLERANCE, (1,))
+
+
+def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor._companion is not None
+        together.run(100)
+        os.kill(monitor._companion.pid, signal.SIGKILL)
+        os.waitid(os.P_PID, monitor._companion.pid, os.WEXITED | os.WNOWAIT)
+        together.run(200)
+        assert together.driver.cycles == 300
+        assert not monitor.running
+        assert monitor.dropped > 0
+        assert "residuals" in caplog.text
+        assert "is gone" in caplog.text
+
+
+def test_process_that_is_stopped_leaves_windows_out() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor._companion is not None
+        wait_for_windows(monitor, together, 10)
+        os.kill(monitor._companion.pid, signal.SIGSTOP)
+        together.run(2000)
+        os.kill(monitor._companion.pid, signal.SIGCONT)
+        before = monitor.history[-1].time
+        wait_for_windows(monitor, together, len(monitor.history) + 10)
+        assert monitor.skipped >= 50
+        assert monitor.history[-1].time > before
+        assert not monitor.alarms
+
+
+def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
+    together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
+    assert together.shadow is not None
+    config = replace(CONFIG, settle=0)
+    monitor = ResidualMonitor(together.shadow, "shadow", config=config, aside=False)
+    together.run(105)
+    together.shadow.switch(sense="sim")
+    together.run(95)
+    together.shadow.switch(sense="real")
+    together.run(105)
+    monitor.close()
+    times = np.array([window.time for window in monitor.history]) / PERIOD
+    np.testing.assert_allclose(times, [*range(11, 92, 10), *range(211, 302, 10)])
+    np.testing.assert_allclose([window.residual for window in monitor.history], 0.0, atol=1e-12)
+
+
+def test_idle_dps_is_not_compared() -> None:
+    line = Line(SCENARIO, machine(SCENARIO))
+    runtime = loop(DpsAlone(SCENARIO), line, PERIOD, begin=False)
+    monitor = ResidualMonitor(runtime, "twin", config=CONFIG, aside=False)
+    for _ in range(200):
+        runtime.cycle()
+    monitor.close()
+    assert not monitor.history
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_testbed_without_a_belief_is_refused(aside: bool) -> None:
+    scenario = DrivenPendulum(believes=False)
+    together = Together(scenario, machine(scenario))
+    with pytest.raises(ValueError, match=r"DrivenPendulum does not declare .* residuals need a belief"):
+        ResidualMonitor(together.driver, "twin", config=CONFIG, aside=aside)
+
+
+def test_unknown_variable_of_the_predicted_world_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    config = replace(CONFIG, values={"sim.sys.Pendulum.arm_com.mas": 1.0})
+    with pytest.raises(ValueError, match="arm_com.mass"):
+        ResidualMonitor(together.driver, "twin", config=config)
+
+
+def test_shadow_of_a_machine_that_reports_nothing_is_refused() -> None:
+    ear = Ear(SCENARIO)
+    ear.reported = {}
+    shadow = loop(SCENARIO.build(mode="shadow"), ear, PERIOD)
+    with pytest.raises(ValueError, match="does not report torque"):
+        ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+
+
+def test_other_mode_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match="shadow, twin, not of 'real'"):
+        ResidualMonitor(together.driver, "real", config=CONFIG)
+
+
+def test_other_period_than_the_loops_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match=r"0.001 s do not fit a loop of 0.05 s"):
+        ResidualMonitor(together.driver, "twin")
+
+
+def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
+    scenario = DrivenPendulum(sampled=True)
+    together = Together(scenario, machine(scenario))
+    together.driver.period = 0.04
+    with pytest.raises(ValueError, match=r"0.05 s old, which is no whole number of periods of 0.04 s"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, period=0.04), aside=False)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"period": 0.0}, "period of residuals is positive"),
+        ({"horizon": 0}, "horizon of residuals is a whole number from 1"),
+        ({"delay": 0.5}, "delay of residuals is a whole number from 0"),
+        ({"false_alarm_interval": float("nan")}, "false_alarm_interval of residuals is positive"),
+        ({"tolerance": {"sense.position": -1.0}}, "tolerance of sense.position"),
+    ],
+)
+def test_impossible_config_is_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ResidualConfig(**fields)  # type: ignore[arg-type]
+
+
+def test_scenario_may_say_what_its_residuals_are_made_with() -> None:
+    class Own(DrivenPendulum):
+        def residuals(self) -> ResidualConfig:
+            return CONFIG
+
+    class Wrong(DrivenPendulum):
+        def residuals(self) -> dict[str, float]:
+            return {}
+
+    assert residuals_of(Own()) is CONFIG
+    assert residuals_of(SCENARIO) == ResidualConfig()
+    with pytest.raises(ValueError, match=r"Wrong.residuals\(\) returns a ResidualConfig"):
+        residuals_of(Wrong())
