@@ -53,6 +53,11 @@ def test_ideal_drive_gives_what_is_commanded() -> None:
     np.testing.assert_array_equal(torques(3), [[8.0, -4.0]] * 3)
 
 
+def test_a_command_that_is_no_number_is_not_mistaken_for_one() -> None:
+    shown = torques(3, u=lambda k: [8.0, np.nan], limit=10.0, rate=1e4)
+    np.testing.assert_array_equal(shown, [[8.0, np.nan]] * 3)
+
+
 def test_current_loop_is_a_first_order_lag() -> None:
     tau = 0.004
     t = (np.arange(30) + 1) * PERIOD  # m_k is the value at the end of the period in which r_k is held

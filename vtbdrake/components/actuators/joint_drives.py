@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from math import expm1, inf
+from math import inf
 from typing import TYPE_CHECKING
 
+import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    NumericParameterIndex,
-    ValueProducer,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from vtbdrake.components.casadi_system.kernel import Expression, Kernel
 from vtbdrake.state import Element, discrete_state, parameter
 
 if TYPE_CHECKING:
@@ -106,7 +99,6 @@ class JointDrives(LeafSystem):
         self._max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
         self._period, self._n = float(period), n
-        self._velocities = np.array([plant.num_positions() + joint.velocity_start() for joint in joints], dtype=int)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
@@ -115,14 +107,11 @@ class JointDrives(LeafSystem):
         # One group for all that nobody else reads: every group costs more than the arithmetic.
         memory = self.DeclareDiscreteState(np.tile(before, 2 + self._max_delay))
         values = [*np.concatenate(list(entries.values())), float(time_constant), float(delay)]
-        parameters = NumericParameterIndex(self.DeclareNumericParameter(BasicVector(values)))
+        parameters = self.DeclareNumericParameter(BasicVector(values))
         self._torque, self._memory, self._parameters = int(torque), int(memory), int(parameters)
         self.variables = tuple(self._elements())
-        self._settings = self.DeclareCacheEntry(
-            "settings",
-            ValueProducer(allocate=lambda: Value(object()), calc=self._calc_settings),
-            {self.numeric_parameter_ticket(parameters)},
-        )
+        velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
+        self._kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
     def _elements(self) -> Iterator[Element]:
@@ -138,46 +127,44 @@ class JointDrives(LeafSystem):
         if self._max_delay:
             yield discrete_state("in_transit", self._memory, start=2 * n, shape=(self._max_delay, n), unit="N m")
 
-    def _calc_settings(self, context: Context, settings: Value) -> None:
-        n = self._n
-        values = context.get_numeric_parameter(self._parameters).value()
-        limit, rate, viscous, coulomb, coulomb_velocity = np.array(values[: 5 * n]).reshape(5, n)
-        time_constant, delay = values[5 * n :].tolist()
-        gain = -expm1(-self._period / time_constant) if time_constant > 0.0 else 1.0
-        # A velocity of 0 makes the friction a step.
-        width = np.maximum(coulomb_velocity, _TINY)
-        reach = rate * self._period
-        settings.set_value(_Settings(-limit, limit, reach, gain, viscous, coulomb, width, round(delay)))
-
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
-        settings: _Settings = self._settings.Eval(context)
-        u = self._command.Eval(context)
-        v = self._state_port.Eval(context)[self._velocities]
+        values = context.get_numeric_parameter(self._parameters).value()
         memory = context.get_discrete_state(self._memory).value()
-        motor, last, line = memory[:n], memory[n : 2 * n], memory[2 * n :]
-        delayed = line[(settings.delay - 1) * n : settings.delay * n] if settings.delay else u
-        reference = np.minimum(np.maximum(delayed, settings.lower), settings.upper)
-        reference = np.minimum(np.maximum(reference, last - settings.reach), last + settings.reach)
-        motor = motor + settings.gain * (reference - motor)
-        friction = settings.viscous * v + settings.coulomb * np.tanh(v / settings.width)
-        following = (motor, reference, u, line[:-n]) if self._max_delay else (motor, reference)
-        state.set_value(self._torque, motor - friction)
-        state.set_value(self._memory, np.concatenate(following))
+        u, x = self._command.Eval(context), self._state_port.Eval(context)
+        line = memory[2 * n :]
+        delay = round(float(values[-1])) if self._max_delay else 0
+        delayed = line[(delay - 1) * n : delay * n] if delay else u
+        y = self._kernel.value((values, memory[: 2 * n], delayed, x))
+        state.set_value(self._torque, y[:n])
+        state.set_value(self._memory, np.concatenate((y[n:], u, line[:-n])) if self._max_delay else y[n:])
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """The parameters of `JointDrives`, as they are used."""
+def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
+    """[torque; m_k; r_k] of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
 
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    reach: NDArray[np.float64]
-    gain: float
-    viscous: NDArray[np.float64]
-    coulomb: NDArray[np.float64]
-    width: NDArray[np.float64]
-    delay: int
+    ``velocities`` are those of the joints in [q; v], of ``states`` entries.
+    """
+    n = len(velocities)
+    values, memory = casadi.SX.sym("values", 5 * n + 2), casadi.SX.sym("memory", 2 * n)
+    u, x = casadi.SX.sym("u", n), casadi.SX.sym("x", states)
+    limit, rate, viscous, coulomb, coulomb_velocity = casadi.vertsplit(values[: 5 * n], n)
+    motor, last = casadi.vertsplit(memory, n)
+    reach = rate * period
+    reference = _held(_held(u, -limit, limit), last - reach, last + reach)
+    # 1 where the time constant is 0.
+    gain = -casadi.expm1(-period / values[5 * n])
+    following = motor + gain * (reference - motor)
+    v = x[velocities]
+    # A velocity of 0 makes the friction a step.
+    friction = viscous * v + coulomb * casadi.tanh(v / casadi.fmax(coulomb_velocity, _TINY))
+    y = casadi.vertcat(following - friction, following, reference)
+    return Kernel("drives", [values, memory, u, x], y, compile=False)
+
+
+def _held(value: Expression, lower: Expression, upper: Expression) -> Expression:
+    """Between the limits; NaN, which fmin and fmax would pass over, stays what it is."""
+    return casadi.if_else(value > upper, upper, casadi.if_else(value < lower, lower, value))
 
 
 def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:

@@ -192,7 +192,7 @@ class ErrorStage:
 
     def _remembers(self, context: Context) -> bool:
         """Whether there may be samples in transit, or the walk has led away from zero."""
-        return self._longest > 0 or bool(np.count_nonzero(context.get_discrete_state(self._memory).value()))
+        return self._longest > 0 or any(context.get_discrete_state(self._memory).value().tolist())
 
     def _shown(
         self,
