@@ -14,7 +14,7 @@ from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.control.scripted import PERIOD, ScriptedBridge
-from tests.control.slow import SlowScenario, busy, chaotic, gated, moving, picky, processes
+from tests.control.slow import SlowScenario, busy, chaotic, deadly, gated, moving, picky, processes
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.cycle import RESULT
 from vtbdrake.control.runtime import Runtime
@@ -179,6 +179,18 @@ def test_a_process_that_dies_is_replaced():
         assert another != pid and same == keeper
         assert real.read("missed") == real.counts.missed
         assert real.runtime.time == pytest.approx(len(real.cycles) * PERIOD)
+
+
+def test_a_sample_that_kills_its_process_is_missing_and_does_not_kill_the_next(caplog):
+    settings = {"function": deadly, "period": 0.3, "latency": 0.25, "more": {"patience": 4.0}}
+    with loop(sensors=lambda t: {"position": [t - 0.1, 0.0]}, **settings) as real:
+        real.run_patiently(2)
+        assert real.counts.restarts == 1 and real.counts.missed == 1
+        assert real.wait()
+        real.run_patiently(580)
+        assert (real.counts.restarts, real.counts.missed, real.counts.results) == (1, 1, 1)
+        assert real.read("valid") == 1.0 and real.read("missed") == 1.0
+    assert any("died (exit code 7)" in record.getMessage() for record in caplog.records)
 
 
 def test_without_its_processes_everything_is_missing_and_the_loop_goes_on():

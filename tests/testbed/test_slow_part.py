@@ -146,6 +146,7 @@ def test_an_event_that_is_repeated_after_an_exception_elsewhere_changes_nothing(
         def __init__(self):
             super().__init__()
             self.left = 3
+            self.variables = ()
             self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.update)
 
         def update(self, context, state):
@@ -159,11 +160,14 @@ def test_an_event_that_is_repeated_after_an_exception_elsewhere_changes_nothing(
     builder.AddNamedSystem("part", part)
     builder.AddNamedSystem("sulks", Sulks())
     builder.Connect(source.get_output_port(), part.GetInputPort("t"))
-    simulator = Simulator(builder.Build())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
     simulator.AdvanceTo(PERIOD)
     for _ in range(3):
         with pytest.raises(RuntimeError, match="not now"):
             simulator.AdvanceTo(0.26)
+    kept = snapshots.take(diagram, simulator.get_context(), collect(diagram)).groups
+    assert kept["part/abstract/0/ticks"].tolist() == [[1, 0]]
     simulator.AdvanceTo(0.26)
     # The results of the samples at 0, ..., 0.2.
     assert part.GetOutputPort("y").Eval(part.GetMyContextFromRoot(simulator.get_context())) == [5.0]
