@@ -36,6 +36,8 @@ from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone, Scenario
 
+_log = logging.getLogger(__name__)
+
 PRIORITY = 75
 MOST_FAULTS = 20
 """As many are printed in the end."""
@@ -67,6 +69,7 @@ MOST_FAULTS = 20
     help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it; 0 for ordinary scheduling.",
 )
 @click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set and watch.")
+@click.option("--record", callback=output(".lcm"), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay.")
 @click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the loop's timing: .json.")
 def run_dps(
     scenario: Scenario,
@@ -80,6 +83,7 @@ def run_dps(
     wait: float,
     priority: int,
     live: bool,
+    record: Path | None,
     statistics: Path | None,
 ) -> None:
     """Run the DPS of a scenario on its machine, without its simulated world, until Ctrl-C.
@@ -114,6 +118,8 @@ def run_dps(
         stack.callback(bridge.close)
         if live:
             stack.enter_context(LiveService(runtime, url))
+        if record is not None:
+            _record(stack, runtime, record)
         stack.enter_context(_patient_logs())
         real_time = stack.enter_context(RealTime(priority=priority or None))
         click.echo(real_time)
@@ -134,15 +140,22 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
         FailedError: the machine was not ready.
     """
     try:
-        take_over(runtime, timeout=wait, tell=lambda text: click.echo(f"waiting: {text}"))
-        click.echo(f"commanding from t = {number(runtime.time)} s on")
+        take_over(runtime, timeout=wait, tell=lambda text: _log.info("waiting: %s", text))
+        _log.info("the DPS commands; its time is %s s", number(runtime.time))
         runtime.run(seconds=seconds)
         runtime.send_fallback("the time is up")
     except SwitchRefusedError as error:
         raise FailedError(f"not switched to the machine {one_line(error)}") from error
     except KeyboardInterrupt:
         # The runtime has said its farewell.
-        click.echo("interrupted")
+        _log.info("interrupted")
+
+
+def _record(stack: ExitStack, runtime: Runtime, path: Path) -> None:
+    from vtbdrake.control.recording.recorder import Recorder
+
+    recorder = stack.enter_context(Recorder(runtime, path))
+    stack.callback(lambda: click.echo(f"recorded to {path}; {recorder.lost} frames lost"))
 
 
 @contextmanager
@@ -154,6 +167,7 @@ def _patient_logs() -> Iterator[None]:
     listener = QueueListener(lines, handler)
     ours, root = QueueHandler(lines), logging.getLogger()
     root.addHandler(ours)
+    _log.setLevel(logging.INFO)
     listener.start()
     try:
         yield

@@ -1,0 +1,211 @@
+"""The DPS alone, run from the command line against a machine in another process."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from diagrams.manipulator import ManipulatorScenario
+from tests.cli.program import ROOT, run
+from tests.control.scripted import PERIOD
+from tests.control.servo_machine import PATIENCE, ServoMachineScenario
+from tests.control.test_loop import Ear
+from vtbdrake.cli import main
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.operation import operation_of
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.state import Snapshot
+
+SERVO = "tests.control.servo_machine:ServoMachineScenario"
+CYCLES = 60
+# What a robot has no use for, by the beginnings of the modules' names.
+USELESS = ("pydrake.geometry", "pydrake.multibody", "pydrake.systems.sensors", "pydrake.visualization", "matplotlib")
+FAR = ("--set", "u.target=[0.1,-0.05]", "--set", "dps.gain=0.01")
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    with Hub(port=0) as running:
+        yield running
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """``vtbdrake run`` in a process of its own, which tells in its last line what it had imported."""
+    program = (
+        "import sys; from vtbdrake.cli import main\n"
+        "try: main(prog_name='vtbdrake')\n"
+        "finally: print(*sorted(sys.modules))"
+    )
+    command = [sys.executable, "-u", "-c", program, "run", *map(str, arguments), "--priority", "0"]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ask(*arguments: object) -> Result:
+    """Another command, in this process."""
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], prog_name="vtbdrake")
+
+
+def snapshot_in_motion(path: Path) -> Snapshot:
+    """Of the whole testbed, where its DPS has been at work for a while."""
+    testbed = ServoMachineScenario().build()
+    simulator = testbed.simulator()
+    testbed.write(simulator.get_mutable_context(), {"u.target": [0.1, -0.05], "dps.gain": 3.0})
+    simulator.AdvanceTo(0.05)
+    snapshot = testbed.snapshot(simulator.get_context())
+    snapshot.save(path)
+    return snapshot
+
+
+def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
+    scenario = ServoMachineScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.restore(context, snapshot)
+    bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
+    runtime = operation_of(scenario).runtime(testbed, bridge, context=context)
+    with MachineProcess(scenario, hub.url, lock_step=True):
+        bridge.open()
+        ear = Ear(hub.url)
+        while not all(reception.count for reception in bridge.sensed.values()):
+            assert bridge.poll(PATIENCE)
+        runtime.switch("real")
+        runtime.cycle()
+        runtime.run(cycles=CYCLES - 1)
+        ear.listen(lambda: len(ear.torques) >= 2 * CYCLES)
+        bridge.close()
+    return ear.torques[: 2 * CYCLES]
+
+
+def test_it_commands_what_the_whole_testbed_would_and_carries_nothing_of_a_world(tmp_path: Path) -> None:
+    snapshot = snapshot_in_motion(tmp_path / "s")
+    with Hub(port=0) as hub:
+        expected = commands_of_the_whole_testbed(hub, snapshot)
+    with Hub(port=0) as hub, MachineProcess(ServoMachineScenario(), hub.url, lock_step=True):
+        ear = Ear(hub.url)
+        with start(SERVO, "--url", hub.url, "--snapshot", tmp_path / "s") as program:
+            ear.listen(lambda: len(ear.torques) >= 2 * CYCLES)
+            program.send_signal(signal.SIGINT)
+            output, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    assert ear.torques[: 2 * CYCLES] == expected
+    assert np.ptp(expected) > 0.05
+    modules = output.splitlines()[-1].split()
+    assert [module for module in modules if module.startswith(USELESS)] == []
+    assert not {"vtbdrake.rollout", "vtbdrake.optimization", "vtbdrake.visualization", "scipy"} & set(modules)
+    assert "the DPS commands; its time is 0.051 s" in errors
+    assert "SCHED_FIFO" not in output and "locked memory: " in output
+    assert "deadlines missed" in output
+
+
+def test_the_arm_is_run_without_its_plant() -> None:
+    program = (
+        "import sys; from diagrams.manipulator import ManipulatorScenario as S; import vtbdrake.cli.run;"
+        "from vtbdrake.testbed import DpsAlone; from vtbdrake.control.operation import operation_of;"
+        "operation_of(S()); DpsAlone(S()); print(*sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    # Its DPS knows the links' inertias, and these bring pydrake.multibody.tree with them.
+    useless = {"pydrake.multibody.plant", "pydrake.multibody.parsing", *USELESS[2:]}
+    assert useless & set(found.stdout.split()) == set()
+    assert operation_of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_in_the_end_the_fallback_goes_out_once(hub: Hub, ending: signal.Signals) -> None:
+    with MachineProcess(ServoMachineScenario(rate=0.0), hub.url):
+        ear = Ear(hub.url)
+        with start(SERVO, "--field", "rate=0.0", "--url", hub.url, *FAR, "--no-live") as program:
+            ear.listen(lambda: len(ear.torques) >= 40)
+            program.send_signal(ending)
+            _, errors = program.communicate(timeout=PATIENCE)
+        heard = np.array(ear.listen()).reshape(-1, 2)
+    assert program.returncode == 0, errors
+    # No velocity; before that the DPS is on its way.
+    assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+
+
+def test_it_ends_when_the_time_is_up_and_writes_what_it_measured_and_recorded(hub: Hub, tmp_path: Path) -> None:
+    files = ("--statistics", tmp_path / "s.json", "--record", tmp_path / "log.lcm")
+    with MachineProcess(ServoMachineScenario(), hub.url):
+        ear = Ear(hub.url)
+        with start(SERVO, "--url", hub.url, "--seconds", 0.2, "--no-live", *files, *FAR) as program:
+            output, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    told = LoopStatistics.from_dict(json.loads((tmp_path / "s.json").read_text()))
+    assert told.period == PERIOD
+    # One command in each cycle but those before the machine spoke, and the farewell.
+    assert told.cycles + 1 >= len(ear.listen()) / 2 > 1
+    assert f"recorded to {tmp_path / 'log.lcm'}; 0 frames lost" in output
+    assert (tmp_path / "log.lcm").stat().st_size > 0
+
+
+def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:
+    with MachineProcess(ServoMachineScenario(), hub.url), start(SERVO, "--url", hub.url, *FAR) as program:
+        try:
+            patience = ("--url", hub.url, "--timeout", PATIENCE)
+            before = ask("get", "dps.gain", "u.target", *patience)
+            changed = ask("set", "dps.gain=0.5", "u.target=[0.2,0.1]", *patience)
+            after = ask("watch", "dps.gain", "u.target", "--every", 5, "--count", 3, *patience)
+            refused = ask("set", "dps.gian=1", *patience)
+        finally:
+            program.send_signal(signal.SIGTERM)
+            _, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    assert before.stdout == "dps.gain = 0.01\nu.target = [0.1, -0.05]\n"
+    assert (changed.exit_code, changed.stdout, changed.stderr) == (0, "", "")
+    lines = [json.loads(line) for line in after.stdout.splitlines()]
+    assert [(line["dps.gain"], line["u.target"]) for line in lines] == [(0.5, [0.2, 0.1])] * 3
+    assert refused.exit_code == 1
+    assert refused.stderr.startswith("Error: there is no variable") and "did you mean dps.gain" in refused.stderr
+
+
+def test_a_machine_that_does_not_speak_is_waited_for_and_then_given_up(hub: Hub) -> None:
+    with start(SERVO, "--url", hub.url, "--wait", 1.0, "--no-live", "--pace", "") as program:
+        _, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 1
+    assert "waiting: " in errors
+    last = errors.splitlines()[-1]
+    assert last.startswith("Error: not switched to the machine after 1.0 s: ")
+    assert "position" in last and "speed" in last
+
+
+def another_snapshot(folder: Path) -> Path:
+    testbed = ServoMachineScenario(rate=7.0).build()
+    testbed.snapshot(testbed.default_context()).save(folder / "other")
+    return folder / "other"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "options", "code", "message"),
+    [
+        ("tests.testbeds:AcrobotScenario", (), 2, "does not say what its machine speaks"),
+        ("tests.cli.careless:CarelessScenario", (), 2, "CarelessScenario cannot be run on its machine: the actuator"),
+        (SERVO, ("--set", "dps.gian=1"), 2, "did you mean dps.gain"),
+        (SERVO, ("--field", "rtae=1"), 2, "no field 'rtae'"),
+        (SERVO, ("--field", "rate=fast"), 2, "takes a value of type float"),
+        (SERVO, ("--pace", "posture"), 2, "paced by a sensor signal (position, speed), not by 'posture'"),
+        (SERVO, ("--period", "0"), 2, "positive"),
+        (SERVO, ("--url", "tcpq://127.0.0.1:1"), 1, "no LCM bus at tcpq://127.0.0.1:1"),
+        (SERVO, ("--snapshot", "none.vtb"), 2, "none.vtb: No such file"),
+        (SERVO, ("--snapshot", another_snapshot), 2, "of another scenario (rate: 7.0 there, 2.0 here)"),
+    ],
+)
+def test_bad_input_is_one_line(
+    hub: Hub, tmp_path: Path, scenario: str, options: tuple[object, ...], code: int, message: str
+) -> None:
+    given = [option(tmp_path) if callable(option) else option for option in options]
+    program = run("run", scenario, "--url", hub.url, *given)
+    assert program.returncode == code, program.stderr
+    assert program.stderr.startswith("Error: ")
+    assert program.stderr.count("\n") == 1
+    assert message in program.stderr
