@@ -99,8 +99,11 @@ class SlowParts:
             beside.send()
 
     def wait(self, timeout: float) -> bool:
-        """Waits, between two cycles, until every process has something to say; whether they did within ``timeout``
-        seconds. For a loop on a simulated clock, which leaves no time to compute.
+        """Waits until every process has something to say, at first that it is ready; whether they all had within
+        ``timeout`` seconds.
+
+        To be called before the first cycle, where no result is to be missing; and between any two of a loop on a
+        simulated clock, which leaves no time to compute.
         """
         return all([beside.wait(timeout) for beside in self._beside])
 
