@@ -201,6 +201,8 @@ def _echo(url: str) -> Iterator[lcm.LCM]:
     with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
         try:
             _await(bus)
+            # It stands for a machine, which has another processor than the controller that starts it.
+            os.sched_setaffinity(process.pid, range(os.cpu_count() or 1))
             with suppress(PermissionError):  # Then nobody has it; `Rig.granted` tells.
                 os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
             yield bus

@@ -21,8 +21,11 @@ from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
-HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 80, 75, 70
+HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 72, 75, 70
 """Of SCHED_FIFO; the second is the controller's, the bare C loop's and the echo's."""
+
+# Hub and controller share a processor, so that a command need not wake up another one. The others are the machine's.
+CPUS = {max(os.sched_getaffinity(0))}
 
 PERIOD = 1e-3  # s
 WARM_UP = 200  # cycles before each round that do not count
@@ -117,13 +120,13 @@ def _priority(pid: int) -> str:
 def loop_rig() -> Iterator[Rig]:
     """Hub and machine run within; this thread is a real-time one, as far as the system grants it."""
     scenario = ManipulatorScenario()
-    with Hub(port=0, priority=HUB_PRIORITY) as hub:
+    with Hub(port=0, priority=HUB_PRIORITY, cpus=CPUS) as hub:
         bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
         machine_process = MachineProcess(scenario, hub.url, priority=MACHINE_PRIORITY, period=PERIOD, values=FRICTION)
         with machine_process as machine:
             bridge.open()
             try:
-                with RealTime(priority=PRIORITY) as real_time:
+                with RealTime(priority=PRIORITY, cpus=CPUS) as real_time:
                     yield Rig(scenario, hub, machine, bridge, real_time)
             finally:
                 bridge.close()

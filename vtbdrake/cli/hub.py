@@ -69,6 +69,14 @@ _SIZE = click.IntRange(min=1)
     metavar="N",
     help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it.",
 )
+@click.option(
+    "--cpu",
+    "cpus",
+    type=int,
+    multiple=True,
+    metavar="N",
+    help="A processor to run on, where the system grants it; may be given several times.",
+)
 def run_hub(
     host: str,
     port: int,
@@ -78,6 +86,7 @@ def run_hub(
     max_queue: int,
     patience: float,
     priority: int,
+    cpus: tuple[int, ...],
 ) -> None:
     """Relay LCM messages over TCP, where multicast does not work, until Ctrl-C.
 
@@ -97,6 +106,7 @@ def run_hub(
         max_queue=max_queue * MEBIBYTE,
         patience=patience,
         priority=priority,
+        cpus=cpus,
     )
     server = HubServer(config)
     click.echo(server.url)

@@ -127,6 +127,17 @@ def test_it_runs_in_a_thread_for_clients_of_other_processes() -> None:
     server.close()
 
 
+def test_hub_runs_on_the_processors_that_it_is_told() -> None:
+    cpu = max(os.sched_getaffinity(0))
+    with Hub(port=0, cpus=[cpu]) as hub:
+        assert os.sched_getaffinity(hub.pid) == {cpu}
+
+
+def test_hub_that_is_told_processors_that_are_not_there_runs_on_any() -> None:
+    with Hub(port=0, cpus=[1023]) as hub:
+        assert os.sched_getaffinity(hub.pid) == os.sched_getaffinity(0)
+
+
 def test_real_time_scheduling_is_asked_for_and_not_insisted_on() -> None:
     attempt = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))"
     granted = subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode == 0

@@ -226,6 +226,7 @@ class TestLease:
         ({"max_message": 0}, "max_message lies between 1 and"),
         ({"max_clients": 0}, "max_clients lies between 1 and inf"),
         ({"priority": 100}, "priority lies between 0 and 99"),
+        ({"cpus": [-1]}, "processors have the numbers"),
     ],
 )
 def test_config_out_of_range(fields, message: str) -> None:

@@ -24,6 +24,9 @@ to all clients that subscribed to its channel, the publisher included.
   10 ms when the owner of a channel changes or something is refused. Clients have the names of their sockets,
   ``127.0.0.1:41234``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.
 
+* **Beside a control loop** it does best on the loop's own processor (``cpus``), at a lower ``priority``. On another
+  one, every command that leaves has to wake that up, and at a higher priority the hub interrupts the cycle that sends.
+
 It listens on loopback unless another address is asked for by name; there, whoever reaches the address is a client.
 """
 

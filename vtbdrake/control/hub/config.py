@@ -29,6 +29,7 @@ class HubConfig:
     patience: float = 5.0  # s after which a client that does not greet, or does not read, is disconnected
     status_period: float = 1.0  # s between messages on the status channel
     priority: int = 0  # of SCHED_FIFO, 1 to 99, where the system grants it; 0: ordinary scheduling
+    cpus: Sequence[int] = ()  # processors to run on, where the system grants them; empty: any
 
     def __post_init__(self) -> None:
         if isinstance(self.protect, str):
@@ -40,6 +41,9 @@ class HubConfig:
             if not 0 < len((TAKE_PREFIX + channel).encode()) - len(TAKE_PREFIX) <= MAX_CHANNEL - len(TAKE_PREFIX):
                 limit = MAX_CHANNEL - len(TAKE_PREFIX)
                 raise ValueError(f"a protected channel has a name of 1 to {limit} bytes, unlike {channel!r}")
+        object.__setattr__(self, "cpus", tuple(self.cpus))
+        if any(not isinstance(cpu, int) or cpu < 0 for cpu in self.cpus):
+            raise ValueError(f"processors have the numbers 0, 1, ..., unlike {self.cpus!r}")
         ranges: dict[str, tuple[float, float]] = {
             "port": (0, 65535),
             "max_message": (1, 256 * MEBIBYTE),  # LCM_MAX_MESSAGE_SIZE

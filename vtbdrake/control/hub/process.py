@@ -12,7 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
@@ -149,6 +149,8 @@ def serve(server: HubServer) -> None:
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, lambda *_: server.stop())
+    if server.config.cpus:
+        _ask_for_processors(server.config.cpus)
     if server.config.priority:
         _ask_for_priority(server.config.priority)
     # The hub makes no cycles.
@@ -157,6 +159,13 @@ def serve(server: HubServer) -> None:
     gc.disable()
     with _logging_elsewhere():
         server.serve_forever()
+
+
+def _ask_for_processors(cpus: Sequence[int]) -> None:
+    try:
+        os.sched_setaffinity(0, cpus)
+    except OSError:
+        _log.warning("the system does not grant the processors %s; the hub runs on any", ", ".join(map(str, cpus)))
 
 
 def _ask_for_priority(priority: int) -> None:
