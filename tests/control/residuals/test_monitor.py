@@ -55,6 +55,22 @@ def test_newest_residuals_are_known_while_the_loop_runs() -> None:
         assert {name: value.shape for name, value in monitor.newest.items()} == dict.fromkeys(TOLERANCE, (1,))
 
 
+def test_arrays_show_how_an_alarm_came_about() -> None:
+    together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert {name: value.shape for name, value in monitor.arrays().items()} == {
+            "time": (0,),
+            **dict.fromkeys(TOLERANCE, (0, 1)),
+        }
+        together.run(305)
+    alarm, table = monitor.alarms[0], monitor.arrays()
+    entry = monitor.layout.places[alarm.signal].start + alarm.entry
+    begin = int(np.argmax(table["statistic"][:, entry] > alarm.threshold))
+    assert table["statistic"].shape == (len(monitor.history), monitor.layout.size)
+    assert table["statistic"][begin, entry] == alarm.statistic
+    assert (table["time"][begin], table[alarm.signal][begin, alarm.entry]) == (alarm.began, alarm.residual)
+
+
 def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixture) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
@@ -142,7 +158,7 @@ def test_other_mode_is_refused() -> None:
 
 def test_other_period_than_the_loops_is_refused() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
-    with pytest.raises(ValueError, match=r"0.001 s do not fit a loop of 0.05 s"):
+    with pytest.raises(ValueError, match=r"0.001 s do not fit a loop of 0.1 s"):
         ResidualMonitor(together.driver, "twin")
 
 
@@ -150,7 +166,7 @@ def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
     scenario = DrivenPendulum(sampled=True)
     together = Together(scenario, machine(scenario))
     together.driver.period = 0.04
-    with pytest.raises(ValueError, match=r"0.05 s old, which is no whole number of periods of 0.04 s"):
+    with pytest.raises(ValueError, match=r"0.1 s old, which is no whole number of periods of 0.04 s"):
         ResidualMonitor(together.driver, "twin", config=replace(CONFIG, period=0.04), aside=False)
 
 

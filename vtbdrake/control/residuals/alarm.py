@@ -56,6 +56,9 @@ class Judge:
     threshold of `Cusum` follows from the mean time between false alarms that is wanted, of all entries together. An
     alarm ends when its sum is down at half of the threshold.
 
+    Attributes:
+        statistic: the larger sum of each entry, after the last window.
+
     Raises:
         CalibrationError: the calibration is of other signals or windows.
         ValueError: a tolerance is of an unknown signal, or of another size; a residual has neither.
@@ -82,6 +85,7 @@ class Judge:
         windows = config.false_alarm_interval / config.window
         threshold = threshold_for(windows * layout.size, config.allowance)
         self._cusum = Cusum(layout.size, threshold=threshold, allowance=config.allowance)
+        self.statistic = np.zeros(layout.size)
         self._on: dict[int, Alarm] = {}
 
     @property
@@ -98,7 +102,7 @@ class Judge:
     def take(self, window: Window) -> list[Alarm]:
         """The alarms that begin and end with this window; those that begin, the loudest first."""
         z = (window.residual - self.mean) / self.scale
-        statistic = self._cusum.take(z)
+        self.statistic = statistic = self._cusum.take(z)
         changed = []
         for k, alarm in list(self._on.items()):
             if statistic[k] <= 0.5 * self.threshold:

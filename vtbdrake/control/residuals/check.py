@@ -49,8 +49,11 @@ class ResidualCheck:
 
     def take(self, rows: Array) -> Report:
         """What further rows (n, width of a `RowLayout`), in order, bring."""
-        windows = self._comparison.take(rows)
-        alarms = [alarm for window in windows for alarm in self._judge.take(window)] if self._judge else []
+        windows, alarms = self._comparison.take(rows), []
+        if self._judge:
+            for k, window in enumerate(windows):
+                alarms += self._judge.take(window)
+                windows[k] = window._replace(statistic=self._judge.statistic)
         compared = self._comparison
         return Report(windows, alarms, compared.skipped, compared.failed, compared.error)
 

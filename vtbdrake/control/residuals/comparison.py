@@ -23,10 +23,12 @@ class Window(NamedTuple):
         time: of the DPS at its end, in seconds.
         residual: mean of measured less predicted over its samples, all signals one after another; NaN where there was
             no sample.
+        statistic: of each entry, what an alarm compares with its threshold; None where nobody judges.
     """
 
     time: float
     residual: Array
+    statistic: Array | None = None
 
 
 class ResidualLayout:

@@ -8,6 +8,8 @@ import select
 from collections import deque
 from math import inf, prod
 
+import numpy as np
+
 from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import SWITCH, Cycle
 from vtbdrake.control.residuals.alarm import Alarm, Judge
@@ -193,6 +195,16 @@ class ResidualMonitor:
             return None
         residual = self.history[-1].residual
         return {name: residual[place] for name, place in self.layout.places.items()}
+
+    def arrays(self) -> dict[str, Array]:
+        """The windows that are remembered, the oldest first: ``time``, shape (n,), in seconds; by signal the residuals,
+        (n, entries); and, unless it learns, ``statistic``, of all entries of all signals, (n, size of `layout`)."""
+        windows = list(self.history)
+        residuals = np.array([window.residual for window in windows]).reshape(-1, self.layout.size)
+        table = {"time": np.array([window.time for window in windows])}
+        table |= {name: residuals[:, place] for name, place in self.layout.places.items()}
+        judged = [window.statistic for window in windows if window.statistic is not None]
+        return table | {"statistic": np.array(judged)} if judged else table
 
     def active(self) -> list[Alarm]:
         """The alarms that last."""
