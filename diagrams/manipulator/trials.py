@@ -71,7 +71,7 @@ class Trial:
         return self.done
 
     def _command(self, motion: int) -> None:
-        self._target.write(self._context, {"u.motion": float(motion)})
+        self._runtime.write({"u.motion": float(motion)})
 
     @property
     def done(self) -> bool:
