@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from pydrake.systems.framework import Context
 
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after
@@ -117,7 +118,8 @@ class _Replay:
         self.digests: list[tuple[int, bytes]] = []
         self.errors: dict[int, str] = {}
         self.record: dict[str, list[Any]] = {address: [] for address in record}
-        self._active: list[str] = []
+        self._now, self._next = self._time(self._steps), self._time(self._steps + 1)
+        self._outputs: list[tuple[Callable[[Context], Any], np.ndarray | None, np.ndarray]] = []
         self._look()
 
     def run(self) -> None:
@@ -140,7 +142,7 @@ class _Replay:
                 self._apply(change)
             if not self._idle:
                 self._step(i)
-            self.times[i] = self._time(self._steps)
+            self.times[i] = self._now
             if i in digests:
                 self.digests.append((i, self._digest()))
             for address, read in self._readers.items():
@@ -151,18 +153,28 @@ class _Replay:
 
     def _step(self, i: int) -> None:
         try:
-            self._simulator.AdvanceTo(self._time(self._steps + 1))
+            self._simulator.AdvanceTo(self._next)
             self._steps += 1
-            for name, value in self._ports.commands(self._active).items():
-                if name in self.commands:
-                    self.commands[name][i] = value
-                self.commanded[name][i] = True
+            self._now, self._next = self._next, self._time(self._steps + 1)
+            for evaluate, values, there in self._outputs:
+                value = evaluate(self._context)
+                if values is not None:
+                    values[i] = value
+                there[i] = True
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            # As it may have done in the loop, which then went on: the comparison tells.
+            # As it may have done in the loop, which then had no command and went on: the comparison tells.
             self.errors[int(self._log.numbers[i])] = f"{type(error).__name__}: {error}"
+            for _, values, there in self._outputs:
+                there[i] = False
+                if values is not None:
+                    values[i] = np.nan
 
     def _look(self) -> None:
-        self._active = [] if self._idle else self._ports.active()
+        """Looks which signals the DPS commands."""
+        self._outputs = [
+            (self._target.diagram.GetOutputPort(f"real.act.{name}").Eval, self.commands.get(name), self.commanded[name])
+            for name in ([] if self._idle else self._ports.active())
+        ]
 
     # -- changes
 

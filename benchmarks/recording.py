@@ -1,0 +1,131 @@
+"""What it costs the loop to be recorded and watched, and how quickly its log is replayed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.loop_rig import PERIOD, Rig, loop_rig
+from benchmarks.measure import HIGHER, LOWER, Benchmark, seconds, spread
+from vtbdrake.control.live.service import LiveService
+from vtbdrake.control.recording.control_log import ControlLog
+from vtbdrake.control.recording.log_reader import read_log
+from vtbdrake.control.recording.recorder import Recorder
+from vtbdrake.control.recording.replay import replay
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import DpsAlone
+
+WATCHED = ("dps.impl.torque", "dps.env.joint_position", "dps.env.contact_wrench")
+PATIENCE = 30.0  # s, until somebody watches
+
+_WATCH = """
+import sys
+from vtbdrake.control.live.client import watch
+for _ in watch(sys.argv[1], sys.argv[2:], every=10):
+    pass
+"""
+
+
+def recording_cost(cycles: int = 10_000, rounds: int = 20) -> list[Benchmark]:
+    """Lateness of the 1 kHz loop, from each deadline to the end of its cycle, with a recorder and a live watch from
+    another process, over that without both, in turns: the ratio of the 99th percentiles; and, printed, that of misses.
+
+    Raises:
+        RuntimeError: the recorder lost something: what was measured is not what it costs.
+        TimeoutError: the other process does not watch.
+    """
+    late: dict[bool, list[float]] = {True: [], False: []}
+    overheads: dict[bool, list[float]] = {True: [], False: []}
+    missed = {True: 0, False: 0}
+    with TemporaryDirectory() as folder, loop_rig() as rig:
+        runtime = rig.runtime(DpsAlone(rig.scenario))
+        for i in range(rounds):
+            # Who begins changes, so that what else this computer does meets both alike.
+            for on in (True, False) if i % 2 else (False, True):
+                with ExitStack() as stack:
+                    if on:
+                        _watch_and_record(stack, rig, runtime, Path(folder) / f"{i}.lcm")
+                    missed[on] += rig.run(runtime, cycles // rounds)
+                    late[on] += runtime.lateness
+                    overheads[on] += runtime.overheads
+        granted = rig.granted()
+    p99 = {on: float(np.percentile(values, 99.0)) for on, values in late.items()}
+    more = 1e6 * (np.median(overheads[True]) - np.median(overheads[False]))
+    return [
+        Benchmark(
+            name="recording_cost",
+            value=p99[True] / p99[False],
+            unit="1",
+            goal=1.2,
+            better=LOWER,
+            against=f"the loop without recorder and watch: p99 {1e6 * p99[False]:.0f} us late",
+            note=f"with both {1e6 * p99[True]:.0f} us; the cycle takes {more:.0f} us more (p50); {granted}",
+        ),
+        Benchmark(
+            name="recording_misses",
+            value=(missed[True] + 1.0) / (missed[False] + 1.0),
+            unit="1",
+            goal=None,
+            better=LOWER,
+            against=f"the loop without recorder and watch; misses (+ 1) in {cycles} cycles each",
+            note=f"{missed[True]} with both, {missed[False]} without",
+        ),
+    ]
+
+
+def _watch_and_record(stack: ExitStack, rig: Rig, runtime: Runtime, path: Path) -> None:
+    service = stack.enter_context(LiveService(runtime, rig.hub.url))
+    watcher = stack.enter_context(subprocess.Popen([sys.executable, "-c", _WATCH, rig.hub.url, *WATCHED]))
+    stack.callback(watcher.kill)
+    # Who asks is answered by a loop that runs.
+    runtime.run(until=lambda: service.watches > 0, seconds=PATIENCE)
+    if not service.watches:
+        raise TimeoutError(f"nobody watches after {PATIENCE} s")
+    recorder = stack.enter_context(Recorder(runtime, path))
+    stack.callback(_check_complete, recorder)
+
+
+def _check_complete(recorder: Recorder) -> None:
+    recorder.close()
+    if recorder.lost:
+        raise RuntimeError(f"the recorder lost {recorder.lost} cycles")
+
+
+def replay_rtf(simulated: float = 10.0, repeats: int = 5) -> Benchmark:
+    """Seconds of the loop per second of replaying its log with the DPS alone, the file's reading included. The log is
+    that of the arm on the machine, with the bridge's messages; the replay has to be identical.
+
+    Raises:
+        RuntimeError: the replay was not.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.lcm"
+        with loop_rig() as rig:
+            runtime = rig.runtime(DpsAlone(rig.scenario))
+            with Recorder(runtime, path):
+                rig.run(runtime, round(simulated / PERIOD))
+        target = DpsAlone(rig.scenario)
+        logs: list[ControlLog] = []
+        reading = np.array([seconds(lambda: logs.append(read_log(path))) for _ in range(repeats)])
+        took = np.array([seconds(lambda: _replay(path, target)) for _ in range(repeats)])
+        duration = len(logs[0]) * PERIOD
+    return Benchmark(
+        name="replay_rtf",
+        value=duration / float(np.median(took)),
+        unit="1",
+        goal=20.0,
+        better=HIGHER,
+        against=f"real time: {duration:.3g} s of the arm's DPS at 1 kHz in {spread(took)}",
+        note=f"reading alone {spread(reading)}",
+    )
+
+
+def _replay(path: Path, target: DpsAlone) -> None:
+    report = replay(path, target)
+    if not report.identical:
+        raise RuntimeError(f"the replay is not identical: {report}")

@@ -1,0 +1,67 @@
+"""Logs from the command line: replayed and exported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+
+from tests.cli.program import run
+from tests.control.recording.servo import Servo
+from vtbdrake.control.recording.recorder import Recorder
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    servo = Servo()
+    path = tmp_path_factory.mktemp("log") / "run.lcm"
+    with Recorder(servo.runtime, path):
+        servo.runtime.run(cycles=20)
+    return path
+
+
+def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "velocity.csv"
+    program = run("replay", path, "--record", "dps.velocity", "--out", out)
+    assert program.returncode == 0, program.stderr
+    assert "20 cycles replayed, 0 digests of the state: identical" in program.stdout
+    table = pandas.read_csv(out)
+    assert len(table) == 20 and table["t"].is_monotonic_increasing
+    assert np.ptp(table["dps.velocity[0]"]) > 0.0
+
+
+def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
+    assert "identical" in run("replay", path, "--on", "testbed").stdout
+    program = run("replay", path, "--set", "dps.gain=1.5")
+    assert program.returncode == 0 and "not compared" in program.stdout
+
+
+def test_a_damaged_log_is_replayed_up_to_the_damage_and_told(path: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.lcm"
+    damaged.write_bytes(path.read_bytes()[:-300])
+    program = run("replay", damaged)
+    assert program.returncode == 0 and "identical" in program.stdout
+    assert "the file ends in the middle of an event" in program.stderr
+
+
+def test_export_writes_every_format(path: Path, tmp_path: Path) -> None:
+    for suffix in (".csv", ".parquet", ".mcap"):
+        out = tmp_path / f"run{suffix}"
+        program = run("export", path, out)
+        assert program.returncode == 0 and "20 cycles of 0.001 s" in program.stdout, program.stderr
+        assert out.stat().st_size > 1000
+
+
+def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "no.lcm").write_text("no")
+    for arguments, told in [
+        (("replay", tmp_path / "no.lcm"), "is no log of a control loop"),
+        (("replay", tmp_path / "nowhere.lcm"), "No such file"),
+        (("replay", path, "--record", "dps.gain"), "give both or neither"),
+        (("export", path, tmp_path / "run.xls"), "ends in .csv or .mcap or .parquet"),
+    ]:
+        program = run(*arguments)
+        assert program.returncode == 2 and told in program.stderr
+        assert len(program.stderr.splitlines()) == 1

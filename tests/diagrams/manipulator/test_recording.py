@@ -1,0 +1,74 @@
+"""The arm on the machine, recorded and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diagrams.manipulator.laws import LAWS
+from diagrams.manipulator.motions import CIRCLE, SWING
+from diagrams.manipulator.safety import CONTINUITY, arm_guards
+from diagrams.manipulator.scenario import ManipulatorScenario
+from vtbdrake.control.hub import Hub
+from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.protocol import protocol_of
+from vtbdrake.control.recording.log_reader import read_log
+from vtbdrake.control.recording.recorder import Recorder
+from vtbdrake.control.recording.replay import replay
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import DpsAlone
+
+PATIENCE = 60.0  # s
+CYCLES = 300
+
+
+@pytest.fixture(scope="module")
+def hub() -> Iterator[Hub]:
+    with Hub(port=0) as running:
+        yield running
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path, law: str) -> None:
+    """By the DPS alone, as it was recorded, and in the whole testbed; against a machine with other parameters."""
+    scenario = ManipulatorScenario(law=law)
+    bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
+    runtime = Runtime(
+        DpsAlone(scenario),
+        bridge,
+        guards=arm_guards(scenario, aging=False, max_missed=inf),
+        pace="wrench",
+        patience=PATIENCE / scenario.period,
+        continuity=CONTINUITY,
+    )
+    path = tmp_path / "run.lcm"
+    with (
+        Recorder(runtime, path, digest_period=0.02),
+        MachineProcess(scenario, hub.url, lock_step=True, perturb=0.05, seed=3, noise={"joint_velocity": 1e-3}),
+    ):
+        bridge.open()
+        for _ in range(round(PATIENCE)):
+            if all(reception.count for reception in bridge.sensed.values()):
+                break
+            bridge.poll(1.0)
+        runtime.switch("real")
+        runtime.write({"u.motion": float(SWING)})
+        runtime.cycle()
+        runtime.run(cycles=CYCLES // 2 - 1)
+        runtime.write({"u.motion": float(CIRCLE)})
+        runtime.run(cycles=CYCLES // 2)
+        bridge.close()
+    assert not runtime.guards.latched
+    log = read_log(path)
+    assert len(log) == CYCLES and len(np.unique(log.commands["joint_torque"], axis=0)) > 0.9 * CYCLES
+
+    for target in (None, scenario.build()):
+        report = replay(log, target, record=["dps.impl.motion", "u.motion"])
+        assert report.identical and report.cycles == CYCLES and report.digests == 15, report
+        assert np.array_equal(report.commands["joint_torque"], log.commands["joint_torque"])
+        assert SWING in report.record["dps.impl.motion"]
+        assert set(report.record["u.motion"].ravel()) == {SWING, CIRCLE}
