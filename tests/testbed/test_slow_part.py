@@ -291,6 +291,17 @@ def test_of_a_late_result_only_the_memory_is_taken():
     assert rig.read("y") == pytest.approx(40.1)
 
 
+def test_what_was_handed_in_does_not_change_any_more():
+    rig = Rig(latency=0.03, outputs={"y": np.zeros(1)})
+    rig.advance(0.01)
+    result = {"y": np.array([4.0])}
+    rig.part.deliver(rig.context, 0, result)
+    result["y"][:] = 5.0
+    rig.advance(0.04)
+    shown = rig.part.GetOutputPort("y").Eval(rig.part.GetMyContextFromRoot(rig.context))
+    assert shown == [4.0] and not shown.flags.writeable
+
+
 @pytest.mark.parametrize(
     ("arrays", "told"),
     [

@@ -82,10 +82,19 @@ def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, 
         except (ValueError, TypeError, AttributeError) as error:
             raise SlowPartError(f"{name}: {error}") from error
         for part, value in parts.items():
-            array = np.array(value)
-            array.flags.writeable = False
-            arrays[f"{name}.{part}" if part else name] = array
+            arrays[f"{name}.{part}" if part else name] = _own(value)
     return arrays
+
+
+def kept(arrays: Arrays) -> dict[str, np.ndarray]:
+    """The arrays, as `encode` makes them; those that cannot be changed are not copied."""
+    return {name: _own(array) if array.flags.writeable else array for name, array in arrays.items()}
+
+
+def _own(value: np.ndarray) -> np.ndarray:
+    array = np.array(value)
+    array.flags.writeable = False
+    return array
 
 
 def decode(arrays: Arrays, name: str, codec: Codec) -> Any:

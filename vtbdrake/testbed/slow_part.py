@@ -14,7 +14,16 @@ from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, S
 from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.systems import leaves
-from vtbdrake.testbed.slow_function import MEMORY, Arrays, SlowFunction, SlowPartError, decode, encode, split_memory
+from vtbdrake.testbed.slow_function import (
+    MEMORY,
+    Arrays,
+    SlowFunction,
+    SlowPartError,
+    decode,
+    encode,
+    kept,
+    split_memory,
+)
 from vtbdrake.testbed.slow_progress import DONE, PROGRESS_CODEC, WAITING, Progress, Work
 
 MOST_UNDER_WAY = 16
@@ -206,7 +215,7 @@ class SlowPart(LeafSystem):
         """
         self._check_result(arrays)
         own = self.GetMyMutableContextFromRoot(context)
-        own.SetAbstractState(self._progress, self._read(own).having(tick, arrays))
+        own.SetAbstractState(self._progress, self._read(own).having(tick, kept(arrays)))
 
     def _check_result(self, arrays: Arrays) -> None:
         memory, outputs = split_memory(arrays)
