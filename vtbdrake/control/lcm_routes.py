@@ -53,7 +53,7 @@ class Inlet:
         now = time.monotonic()
         try:
             sent, values, numbers = self._read(data)
-            reason = self._order(sent, now)
+            reason = "" if sent > self._last else self._order(sent, now)
         except MalformedError as error:
             reason = error.reason
         except (Exception, SystemExit):  # a failed assertion in Drake's C++ is a SystemExit
@@ -62,15 +62,11 @@ class Inlet:
             for reception in self._receptions.values():
                 reception.reject(reason)
             return
-        good = numbers is not None and within(self._lower, numbers, self._upper)
-        accepted = good
-        for name, reception in self._receptions.items():
-            if not good:
-                reason = self._ranges[name].check(values[name]) if name in values else "missing"
-                if reason:
-                    reception.reject(reason)
-                    continue
-                accepted = True
+        if numbers is not None and within(self._lower, numbers, self._upper):
+            accepted = self._receptions
+        else:
+            accepted = self._sorted_out(values)
+        for name, reception in accepted.items():
             reception.value = values[name]
             reception.arrived = now
             reception.sent = sent
@@ -82,9 +78,20 @@ class Inlet:
             if isfinite(sent):
                 self._last = sent
 
+    def _sorted_out(self, values: Mapping[str, Any]) -> dict[str, Reception]:
+        """The receptions of those values that can be accepted; the others count theirs as rejected."""
+        accepted = {}
+        for name, reception in self._receptions.items():
+            reason = self._ranges[name].check(values[name]) if name in values else "missing"
+            if reason:
+                reception.reject(reason)
+            else:
+                accepted[name] = reception
+        return accepted
+
     def _order(self, sent: float, now: float) -> str:
-        """Why a message of this time is not to be believed; empty if it is."""
-        if sent > self._last or not isfinite(sent):
+        """Why a message that is no newer than the last one is not to be believed; empty if it is."""
+        if not isfinite(sent):
             return ""
         if sent == self._last:
             return "duplicate"
