@@ -63,8 +63,7 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
             f"{1e6 * needed:.0f} us: answers come more than a period late; measure where less else runs"
         )
     note = (
-        f"{percentiles(states)}; {answered} answers to {told} states; echo: {percentiles(histogram(echoes))}; "
-        f"{granted}"
+        f"{percentiles(states)}; {answered} answers to {told} states; echo: {percentiles(histogram(echoes))}; {granted}"
     )
     echo = dict(zip((50, 99), np.percentile(echoes, (50, 99)), strict=True))
     return [
