@@ -188,7 +188,8 @@ def test_killed_hub_is_noticed_by_the_next_poll_and_its_successor_found() -> Non
         os.kill(hub.pid, signal.SIGKILL)
         hub.close()  # waits until it is gone
         assert arm.connected
-        assert arm.poll() == 0
+        while arm.poll():  # what the hub still said
+            pass
         assert not arm.connected
         arm.publish({"position": np.zeros(7)})
         assert arm.sent["position"].withheld == {"no bus": 1}
