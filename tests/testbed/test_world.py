@@ -38,6 +38,22 @@ def test_world_with_the_commands_of_the_dps_moves_as_in_the_testbed() -> None:
         np.testing.assert_array_equal(world.read(own, "plant.state"), expected[k])
 
 
+def test_fed_commands_act_as_those_that_are_given_one_by_one() -> None:
+    world = WorldAlone(SCENARIO)
+    contexts = [world.default_context(), world.default_context()]
+    simulators = [world.simulator(context) for context in contexts]
+    feed = world.feed(contexts[1])
+    for k in range(20):
+        torque = np.array([np.sin(k)])
+        world.command(contexts[0], "torque", torque)
+        feed("torque", torque)
+        for simulator in simulators:
+            simulator.AdvanceTo((k + 1) * STEP)
+        one, other = (world.read(context, "plant.state") for context in contexts)
+        np.testing.assert_array_equal(one, other)
+    assert np.any(one != 0.0)
+
+
 def test_variables_of_the_world_have_the_addresses_of_the_testbed() -> None:
     everything = SCENARIO.build().variables()
     assert list(WorldAlone(SCENARIO).variables()) == [a for a in everything if a.startswith("sim.") or a == "time"]
@@ -74,6 +90,15 @@ class PoseScenario(Scenario):
         builder.add("sys", "mirror", relay)
         builder.sim_actuator("commanded", relay.get_input_port())
         builder.sim_sensor("seen", relay.get_output_port())
+
+
+def test_abstract_commands_can_be_fed() -> None:
+    world = WorldAlone(PoseScenario())
+    context = world.default_context()
+    feed = world.feed(context)
+    for x in (1.0, 2.0, 3.0):
+        feed("commanded", RigidTransform([x, 0.0, 0.0]))
+        assert world.read(context, "sense.seen").translation()[0] == -x
 
 
 def test_abstract_signals_pass() -> None:

@@ -139,6 +139,25 @@ def test_drift_is_the_sum_of_independent_steps() -> None:
     np.testing.assert_allclose(y, np.cumsum(steps, axis=0), atol=1e-13)
 
 
+def test_errors_that_are_set_while_time_runs_hold_from_the_next_sample_on() -> None:
+    sensor = Constant(ErrorModel())
+    simulator = Simulator(sensor)
+    before = advance(sensor, simulator, range(3))
+    set_element(sensor, simulator.get_mutable_context(), "bias", [0.5, -1.0])
+    after = advance(sensor, simulator, range(3, 6))
+    np.testing.assert_array_equal(before, [[0.37, 0.37]] * 3)
+    np.testing.assert_allclose(after, [[0.87, -0.63]] * 3, atol=1e-15)
+
+
+def test_a_walk_goes_on_being_shown_when_the_drift_ends() -> None:
+    sensor = Constant(ErrorModel(drift=0.2, seed=3))
+    simulator = Simulator(sensor)
+    last = advance(sensor, simulator, range(10))[-1]
+    set_element(sensor, simulator.get_mutable_context(), "drift", [0.0, 0.0])
+    np.testing.assert_array_equal(advance(sensor, simulator, range(10, 13)), [last] * 3)
+    assert np.all(last != 0.37)
+
+
 ALL = ErrorModel(noise=0.1, bias=0.2, drift=0.3, quantization=0.01, latency=2, dropout=0.2, seed=11)
 
 
@@ -156,6 +175,11 @@ def test_copy_continues_with_the_same_bytes() -> None:
     other = Simulator(sensor, copied)
     other.Initialize(InitializeParams(suppress_initialization_events=True))
     assert advance(sensor, other, range(30, 80)).tobytes() == original.tobytes()
+
+
+def test_no_two_samples_of_a_stream_are_the_same_draw() -> None:
+    draws = [normal_noise(3, seed=1, stream=1, tick=tick) for tick in range(2000)]
+    assert np.unique(draws).size == 6000
 
 
 def test_channels_of_a_stream_are_independent() -> None:

@@ -101,6 +101,10 @@ class _Settings:
         found = (self.noise, self.bias, self.drift, self.quantization)
         return not self.latency and not self.dropout and all(values is None for values in found)
 
+    def __deepcopy__(self, memo: object) -> _Settings:
+        # Clones of a Context share it.
+        return self
+
 
 def _unless_zero(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.array(values) if values.any() else None
