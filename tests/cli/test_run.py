@@ -115,7 +115,7 @@ def test_the_arm_is_run_without_its_plant() -> None:
     )
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     # Its DPS knows the links' inertias, and these bring pydrake.multibody.tree with them.
-    useless = {"pydrake.multibody.plant", "pydrake.multibody.parsing", *USELESS[2:]}
+    useless = {"pydrake.multibody.plant", "pydrake.multibody.parsing", "scipy.optimize", *USELESS[2:]}
     assert useless & set(found.stdout.split()) == set()
     assert operation_of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
 

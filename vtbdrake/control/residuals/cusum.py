@@ -6,7 +6,6 @@ from math import expm1
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 Array = NDArray[np.float64]
 
@@ -28,6 +27,9 @@ def threshold_for(length: float, allowance: float) -> float:
     """The threshold with which `run_length` is ``length``; 0 if it is longer anyway."""
     if run_length(0.0, allowance) >= length:
         return 0.0
+    # Forty megabytes, which who only runs the DPS does without.
+    from scipy.optimize import brentq
+
     largest = 300.0 / allowance  # where run_length is beyond any length
     return float(brentq(lambda h: np.log(run_length(h, allowance) / length), 0.0, largest))
 
