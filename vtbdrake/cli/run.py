@@ -68,6 +68,12 @@ MOST_FAULTS = 20
     metavar="N",
     help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it; 0 for ordinary scheduling.",
 )
+@click.option(
+    "--lock-memory/--no-lock-memory",
+    default=True,
+    show_default=True,
+    help="Keep memory from being paged out, all of it: what is never used becomes resident, too.",
+)
 @click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set and watch.")
 @click.option("--record", callback=output(".lcm"), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay.")
 @click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the loop's timing: .json.")
@@ -82,6 +88,7 @@ def run_dps(
     seconds: float | None,
     wait: float,
     priority: int,
+    lock_memory: bool,
     live: bool,
     record: Path | None,
     statistics: Path | None,
@@ -121,7 +128,7 @@ def run_dps(
         if record is not None:
             _record(stack, runtime, record)
         stack.enter_context(_patient_logs())
-        real_time = stack.enter_context(RealTime(priority=priority or None))
+        real_time = stack.enter_context(RealTime(priority=priority or None, lock_memory=lock_memory))
         click.echo(real_time)
         _run(runtime, wait=wait, seconds=seconds)
     click.echo(runtime.statistics)
