@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vtbdrake.control.recording.log_reader import read_log
     from vtbdrake.control.recording.recorder import Recorder
     from vtbdrake.control.recording.replay import replay
+    from vtbdrake.control.residuals import ResidualMonitor
     from vtbdrake.control.runtime import Runtime
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
@@ -57,6 +58,7 @@ __all__ = [
     "Quality",
     "Quantile",
     "Recorder",
+    "ResidualMonitor",
     "RolloutResult",
     "Runtime",
     "Scenario",
@@ -86,6 +88,7 @@ _HOMES = {
     "control.recording.log_reader": ("read_log",),
     "control.recording.recorder": ("Recorder",),
     "control.recording.replay": ("replay",),
+    "control.residuals": ("ResidualMonitor",),
     "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
     "rollout": ("Constraint", "Quality", "RolloutResult"),
