@@ -18,7 +18,7 @@ from vtbdrake.control.protocol import Protocol
 from vtbdrake.state import discrete_state
 from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
 
-PERIOD = 0.05
+PERIOD = 0.1
 PAYLOAD, MASS = "sim.sys.Pendulum.arm_com.mass", 0.5
 
 

@@ -57,10 +57,10 @@ def test_payload_that_is_5_percent_heavier_is_found_in_shadow_and_twin() -> None
     together.run(500)
     for monitor in monitors.values():
         alarm = monitor.alarms[0]
-        assert alarm.signal == "sense.velocity"
-        assert alarm.began < 5.0
+        assert alarm.signal in ("sense.position", "sense.velocity")
+        assert alarm.began < 10 * CONFIG.window
         assert alarm.statistic > alarm.threshold
-        assert abs(alarm.residual) > alarm.scale == nominal().deviation["sense.velocity"][0]
+        assert abs(alarm.residual) > alarm.scale == nominal().deviation[alarm.signal][0]
 
 
 def test_shadow_and_twin_of_one_machine_see_the_same() -> None:
@@ -121,7 +121,7 @@ def test_an_hour_of_nominal_operation_raises_no_alarm() -> None:
     monitor = ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=nominal(), aside=False)
     together.run(round(3600.0 / PERIOD))
     assert not monitor.alarms
-    assert len(monitor.history) == 17_999
+    assert len(monitor.history) == 3599
     assert monitor.skipped == monitor.failed == 0
 
 

@@ -150,7 +150,7 @@ class Comparison:
         acting = commanded[:, where.commanded] if self._twin else told[:, where.reports]
         clear = ~np.isnan(acting).any(axis=1)
         whole = self._believe(s) and bool(clear.all() and not np.isnan(told[:, INDEX]).any())
-        predicted = [self._predictor.step(u if given else None) for u, given in zip(acting, clear, strict=True)]
+        predicted = [self._predictor.step(u if given else None) for u, given in zip(acting, clear.tolist(), strict=True)]
         sense = told[:, where.sensed] - np.array(predicted)
         return np.hstack((sense, told[:, where.reports] - commanded[:, where.compared])), whole
 

@@ -1,0 +1,115 @@
+"""The arm beside its model: nothing parts them but what has changed, and that is found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from diagrams.manipulator import ManipulatorScenario
+from diagrams.manipulator.motions import CIRCLE
+from tests.control.residuals.line import Together
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.control.machine.config import MachineConfig
+from vtbdrake.control.machine.machine import Machine
+from vtbdrake.control.residuals import ResidualMonitor
+
+TOOL = "sim.sys.arm.tool.mass"
+MASS = 0.4  # kg
+# What `ResidualMonitor.calibrate` says of 8 s of the circle with the noise below; means are not far from zero.
+DEVIATION = {
+    "sense.joint_position": 1.2e-5,
+    "sense.joint_velocity": 1.1e-3,
+    "sense.joint_torque_measured": 0.04,
+    "sense.wrench": 0.04,
+    "act.joint_torque": 0.02,
+}
+
+
+def noisy(latency: int = 0) -> ManipulatorScenario:
+    names = ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
+    noise = dict(zip(names, (1e-5, 1e-3, 0.1, 0.1), strict=True))
+    errors = {name: ErrorModel(noise=std, latency=latency, seed=k) for k, (name, std) in enumerate(noise.items())}
+    return ManipulatorScenario(law="joint_impedance", **errors)
+
+
+def together_with(scenario: ManipulatorScenario, **values: Any) -> Together:
+    machine = Machine(scenario, MachineConfig(values=values))
+    return Together(scenario, machine, shadowing=scenario, values={"u.motion": float(CIRCLE)})
+
+
+def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:
+    assert together.shadow is not None
+    loops = {"twin": together.driver, "shadow": together.shadow}
+    return {mode: ResidualMonitor(loop, mode, aside=False, **options) for mode, loop in loops.items()}
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        ManipulatorScenario(law="cartesian_impedance"),
+        ManipulatorScenario(
+            law="admittance",
+            position_errors=ErrorModel(latency=1),
+            velocity_errors=ErrorModel(latency=3),
+            torque_errors=ErrorModel(latency=2),
+        ),
+    ],
+    ids=lambda scenario: scenario.law,
+)
+def test_perfect_model_leaves_nothing_whatever_the_latencies(scenario: ManipulatorScenario) -> None:
+    together = together_with(scenario)
+    both = monitors(together, config=replace(scenario.residuals(), settle=1), learn=True)
+    together.run(150)
+    for monitor in both.values():
+        assert len(monitor.history) == 13
+        assert monitor.skipped == monitor.failed == 0
+        np.testing.assert_allclose([window.residual for window in monitor.history], 0.0, atol=1e-9)
+
+
+@pytest.fixture(scope="module", params=[0, 2], ids="latency {}".format)
+def nominal_and_heavy(request: pytest.FixtureRequest) -> Iterator[dict[str, Mapping[str, ResidualMonitor]]]:
+    scenario = noisy(request.param)
+    found = {}
+    for name, mass in (("nominal", MASS), ("heavy", 1.05 * MASS)):
+        together = together_with(scenario, **{TOOL: mass})
+        found[name] = monitors(together, config=replace(scenario.residuals(), tolerance=DEVIATION))
+        together.run(600)
+    yield found
+
+
+@pytest.mark.parametrize("mode", ["twin", "shadow"])
+def test_payload_that_is_5_percent_heavier_is_found_in_a_tenth_of_a_second(
+    nominal_and_heavy: dict[str, Mapping[str, ResidualMonitor]], mode: str
+) -> None:
+    monitor = nominal_and_heavy["heavy"][mode]
+    alarm = monitor.alarms[0]
+    # The wrist's sensor carries 20 g more, all of it along its x at home.
+    assert (alarm.signal, alarm.entry) == ("sense.wrench", 3)
+    assert alarm.residual == pytest.approx(0.05 * MASS * 9.81, abs=0.1)
+    settled = monitor.config.settle * monitor.config.window
+    assert settled < alarm.began < settled + 0.1
+
+
+@pytest.mark.parametrize("mode", ["twin", "shadow"])
+def test_nominal_arm_raises_no_alarm(nominal_and_heavy: dict[str, Mapping[str, ResidualMonitor]], mode: str) -> None:
+    monitor = nominal_and_heavy["nominal"][mode]
+    assert not monitor.alarms
+    assert len(monitor.history) == 59 - monitor.config.settle
+    assert np.abs([window.residual for window in monitor.history]).max() > 0.01
+
+
+def test_sensor_that_drifts_is_named() -> None:
+    scenario = noisy()
+    together = together_with(scenario)
+    both = monitors(together, config=replace(scenario.residuals(), tolerance=DEVIATION))
+    machine = together.line.machine
+    for k in range(500):
+        bias = np.array([0.0, 0.0, 0.0, 0.0, 0.5e-3 * k, 0.0])  # half a newton per second
+        machine.world.write(machine._context, {"sim.sense.wrench.bias": bias})
+        together.run(1)
+    for monitor in both.values():
+        assert {(alarm.signal, alarm.entry) for alarm in monitor.alarms} == {("sense.wrench", 4)}
