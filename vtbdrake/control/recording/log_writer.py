@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import time
 from typing import NamedTuple
 
 from vtbdrake.control.companion import Channel
+
+PAUSE = 0.02
+"""Seconds between two looks whether there is something to write; the line holds more than comes meanwhile."""
 
 
 class Loss(NamedTuple):
@@ -29,7 +33,7 @@ def write_log(channel: Channel, path: str) -> None:
     end, lost = os.fstat(file).st_size, 0
     try:
         while True:
-            frame = channel.receive()
+            frame = _next(channel)
             try:
                 _write(file, frame)
                 end += len(frame)
@@ -42,6 +46,15 @@ def write_log(channel: Channel, path: str) -> None:
         pass
     finally:
         os.close(file)
+
+
+def _next(channel: Channel) -> bytes:
+    """The next frame. Nobody waits at the line for it: to wake him up would cost the loop more than all the rest."""
+    while True:
+        try:
+            return channel.receive(0.0)
+        except TimeoutError:
+            time.sleep(PAUSE)
 
 
 def _write(file: int, data: bytes) -> None:

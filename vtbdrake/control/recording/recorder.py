@@ -128,8 +128,9 @@ class Recorder:
     def __call__(self, cycle: Cycle) -> None:
         """Records a cycle; the runtime calls it."""
         utime = self._utime()
-        for message in change_events(cycle.changes, cycle.number, utime):
-            self._add(CHANGE, message.encode(), utime)
+        if cycle.changes:
+            for message in change_events(cycle.changes, cycle.number, utime):
+                self._add(CHANGE, message.encode(), utime)
         faults = cycle.verdict.faults
         if faults or self._faults:
             self._note(cycle, utime)
