@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.control.bridge import Reception
@@ -353,7 +353,6 @@ def test_signal_whose_unit_does_not_tell_needs_a_fallback() -> None:
 events = st.sampled_from(["go", "go", "go", "nan", "size", "raise", "silent", "loud", "missed", "reset", "wild"])
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(events, st.integers(1, 40)), max_size=25))
 def test_whatever_happens_what_goes_out_is_finite_and_within_all_limits(script: list[tuple[str, int]]) -> None:
     loop = Loop(TORQUE, POSITION, fallback={"torque": Brake("velocity", gain=3.0)})

@@ -50,7 +50,6 @@ limited = st.one_of(positive, st.just(inf))
 entry = st.one_of(st.floats(-5.0, 5.0), st.floats(allow_nan=False, allow_infinity=False))
 
 
-@settings(deadline=None)
 @given(
     rate=limited,
     acceleration=st.one_of(st.floats(1.0, 1e4), st.just(inf)),
@@ -84,7 +83,6 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
             before, step_before = sent, step
 
 
-@settings(deadline=None)
 @given(
     acceleration=st.floats(50.0, 1e4),
     upper=st.floats(0.01, 0.5),
@@ -101,7 +99,7 @@ def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int
         position, step = sent, sent - position
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(acceleration=st.floats(100.0, 1e4), upper=st.floats(0.01, 0.2), excess=st.floats(1e-6, 0.02))
 def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
     acceleration: float, upper: float, excess: float
@@ -121,7 +119,6 @@ def test_command_at_the_last_place_to_stop_passes_without_rounding() -> None:
     assert one.limit([-1e-300]).item() == -1e-300
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-0.999, 0.999), min_size=1, max_size=60))
 def test_sequence_that_can_go_on_for_ever_passes_unchanged(shares: list[float]) -> None:
     rate, acceleration, bound = 0.5, 20.0, 0.002

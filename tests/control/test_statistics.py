@@ -8,7 +8,7 @@ from math import ceil, isnan, nan
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.control.statistics import Histogram, Level, LoopStatistics, Threshold
@@ -38,7 +38,6 @@ def test_percentiles_are_those_of_numpy_within_a_bin(resolution: float, seed: in
         assert exact * (1 - 1e-9) <= histogram.percentile(percent) <= bound
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(1e-6, 10.0), min_size=1, max_size=50), st.integers(0, 1000))
 def test_percentile_of_any_durations_is_above_the_true_one_by_a_bin_at_most(
     durations: list[float], permille: int

@@ -114,7 +114,7 @@ def _record(dps_factory, sense, act, samples, mode):
 finite = st.floats(-10.0, 10.0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data(), discrete=st.booleans())
 def test_any_linear_dps_gives_identical_bytes_from_either_side(data, discrete):
     matrix = st.lists(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=2), min_size=2, max_size=2).map(np.array)
@@ -135,7 +135,7 @@ def test_any_linear_dps_gives_identical_bytes_from_either_side(data, discrete):
     assert _record(dps, sense, act, samples, "sim") == _record(dps, sense, act, samples, "real")
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(poses=st.lists(st.lists(finite, min_size=8, max_size=8), min_size=2, max_size=5))
 def test_abstract_signals_give_identical_bytes_from_either_side(poses):
     samples = [{"pose": RigidTransform(RollPitchYaw(v[:3]), v[3:6]), "range": np.array(v[6:])} for v in poses]

@@ -26,6 +26,7 @@ from vtbdrake.rollout.worker import answer
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
+    from distributed.client import ClosedClientError
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("rollouts on a Dask cluster need: pip install 'vtbdrake[cluster]'") from error
 
@@ -117,9 +118,11 @@ class DaskExecutor(Executor):
                 self._client.cancel(list(flying))
 
     def _submit(self, name: str, index: int, point: Parameters) -> Future[bytes]:
-        return self._client.submit(
-            roll_on_dask, name, index, dict(point), self._time_limit, key=f"rollout-{uuid.uuid4().hex}", pure=False
-        )
+        key = f"rollout-{uuid.uuid4().hex}"
+        try:
+            return self._client.submit(roll_on_dask, name, index, dict(point), self._time_limit, key=key, pure=False)
+        except ClosedClientError as error:
+            raise _given_up(error) from error
 
     def _tell(self, blob: Blob) -> str:
         """The name under which the workers know the task; sent once."""
@@ -142,7 +145,10 @@ class DaskExecutor(Executor):
         if self._limit is not None:
             return self._limit
         if time.monotonic() >= self._counted + _SIZE_PERIOD:
-            self._threads = sum(self._client.nthreads().values())
+            try:
+                self._threads = sum(self._client.nthreads().values())
+            except OSError as error:
+                raise _given_up(error) from error
             self._counted = time.monotonic()
         return max(2, 2 * self._threads)
 
@@ -168,10 +174,14 @@ def _connected(address: str | None) -> Client:
         raise WorkerError(f"no Dask scheduler answers at {address}: start one with `dask scheduler`") from error
 
 
+def _given_up(error: BaseException) -> WorkerError:
+    return WorkerError(f"the Dask scheduler has given up rollouts, or is gone: {error}")
+
+
 def _error(outcome: Any) -> BaseException | None:
     """What went wrong, on Dask's side or in the rollout. The status of a future may change after its outcome came."""
     if isinstance(outcome, BaseException):
-        return WorkerError(f"the Dask scheduler has given up rollouts, or is gone: {outcome}")
+        return _given_up(outcome)
     error = outcome[1] if isinstance(outcome, tuple) else pickle.loads(outcome)[1]
     return error if isinstance(error, BaseException) else None
 

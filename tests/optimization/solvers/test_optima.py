@@ -58,7 +58,9 @@ def test_global_solvers_find_the_value_of_branin(name):
     assert -best.values[0] == pytest.approx(BRANIN.lowest, abs=0.1 if name == "TPE" else 2e-3)
 
 
-@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *sorted(WITH_CONSTRAINTS)])
+@pytest.mark.parametrize(
+    "name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *sorted(WITH_CONSTRAINTS)]
+)
 def test_under_a_constraint_it_finds_the_kkt_point_and_keeps_the_constraint(name):
     options = {"tolerance": 1e-5} if name == "differential-evolution" else {}
     solver, best = solve(name, CONSTRAINED, violations=half_plane, limit=4000, **options)
