@@ -76,7 +76,7 @@ def test_excerpt_reads_the_numbers_that_lcm_gen_wrote() -> None:
 def test_layout_tells_where_lcm_gen_writes_a_field() -> None:
     message = status(5, position=0.5, torque=-2.0)
     place = Layout(message).at["joint_torque_measured"]
-    data = struct.unpack_from(f">{place.count}{place.code}", message.encode(), place.offset)
+    data = struct.unpack_from(f">{place.size}{place.code}", message.encode(), place.offset)
     assert data == tuple(message.joint_torque_measured)
 
 

@@ -194,7 +194,7 @@ class _Form:
             for field in map.fields[name]:
                 place = layout.at[field.path]
                 blanks.append(_blank(place, begin, integer=field.integer))
-                begin += place.count
+                begin += place.size
             self._blanks.append((name, blanks))
 
     def fill(self, values: Mapping[str, Any], utime: int) -> bytes:
@@ -214,8 +214,8 @@ class _Form:
 
 
 def _blank(place: Place, begin: int, *, integer: bool) -> _Blank:
-    write = struct.Struct(f">{place.count}{place.code}").pack_into
-    return _Blank(write, place.offset, slice(begin, begin + place.count), integer)
+    write = struct.Struct(f">{place.size}{place.code}").pack_into
+    return _Blank(write, place.offset, slice(begin, begin + place.size), integer)
 
 
 class _VectorWriter:

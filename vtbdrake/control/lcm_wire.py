@@ -78,17 +78,17 @@ class Place(NamedTuple):
 
     Attributes:
         offset: of the first, in bytes.
-        count: how many there are.
+        size: how many there are.
         code: their type, as `struct` calls it.
     """
 
     offset: int
-    count: int
+    size: int
     code: str
 
     @property
     def end(self) -> int:
-        return self.offset + self.count * struct.calcsize(f">{self.code}")
+        return self.offset + self.size * struct.calcsize(f">{self.code}")
 
 
 class Layout:
@@ -108,7 +108,6 @@ class Layout:
             TypeError: the type holds more than numbers and one-dimensional arrays of numbers.
         """
         kind = type(message)
-        self.example: bytes = message.encode()
         self.at: dict[str, Place] = {}
         end = _FINGERPRINT
         lengths: set[str] = set()
@@ -120,6 +119,7 @@ class Layout:
             self.at[name] = Place(end, count, FORMATS[typename])
             end = self.at[name].end
         self.lengths = tuple(name for name in kind.__slots__ if name in lengths)
+        self.example: bytes = message.encode()
 
 
 class Excerpt:
@@ -138,9 +138,9 @@ class Excerpt:
         self.at: dict[str, slice] = {}
         for name, place in layout.at.items():
             if name in layout.lengths or name in fields:
-                code += f"{place.offset - end}x{place.count}{place.code}"
-                self.at[name] = slice(count, count + place.count)
-                end, count = place.end, count + place.count
+                code += f"{place.offset - end}x{place.size}{place.code}"
+                self.at[name] = slice(count, count + place.size)
+                end, count = place.end, count + place.size
         self.size = len(layout.example)
         self.unpack = struct.Struct(f"{code}{self.size - end}x").unpack
         self.fixed = itemgetter(0, *(self.at[name].start for name in layout.lengths))

@@ -105,11 +105,12 @@ class CommandGuard:
         # c, s, x and w of above, which the compiled check of all entries at once reads and writes in place.
         self._wanted, self._sent, self._step_before, self._step = (np.zeros(self._size) for _ in range(4))
         self._passes = np.zeros(1)
+        self._buffer: Any
         self._buffer, self._look = _passing(self._limits).buffer()
         for index, array in enumerate((self._wanted, self._sent, self._step_before)):
-            self._buffer.set_arg(index, memoryview(array))
+            self._buffer.set_arg(index, array.data)
         for index, array in enumerate((self._passes, self._step)):
-            self._buffer.set_res(index, memoryview(array))
+            self._buffer.set_res(index, array.data)
 
     @property
     def last_sent(self) -> NDArray[np.float64] | None:
