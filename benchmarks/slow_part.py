@@ -62,7 +62,8 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
     misses = {"with": 0, "without": 0}
     late: dict[str, list[float]] = {"with": [], "without": []}
     with loop_rig() as rig, rig.runtime(DpsAlone(PerceivingScenario())) as perceiving:
-        perceiving.slow_parts.wait(timeout=60.0)
+        if not perceiving.slow_parts.wait(timeout=60.0):
+            raise RuntimeError("the perception does not come to its start: measure where less else runs")
         runtimes = {"without": rig.runtime(DpsAlone(rig.scenario)), "with": perceiving}
         for _ in range(rounds):
             for name, runtime in runtimes.items():
