@@ -82,6 +82,18 @@ def test_what_waits_is_sent_before_it_ends():
     assert companion.take() == [b"10000000"]
 
 
+def test_a_long_frame_goes_piece_by_piece():
+    companion = Companion(sum_up, name="sum")
+    waiting = []
+    companion.post(bytes(1 << 20))
+    while companion.waiting:
+        waiting.append(companion.waiting)
+        companion.flush()
+    assert companion.close() == 0
+    assert companion.take() == [b"1048576"]
+    assert np.diff(waiting, prepend=1 << 20).min() >= -(1 << 18)
+
+
 def test_a_full_backlog_drops_and_counts_and_does_not_wait():
     companion = Companion(fall_asleep, name="sleeper", backlog=1 << 20)
     accepted = [companion.post(bytes(1 << 16)) for _ in range(200)]
