@@ -1,50 +1,127 @@
-"""How a DPS is run on its machine."""
+"""How a DPS is run on its machine: what the scenario says of it, what is missing, and when it takes over."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.control.servo_machine import ServoMachineScenario
+from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.operation import Operation, take_over
+from vtbdrake.control.fallback import Hold
+from vtbdrake.control.operation import Operation, OperationError, operation_of, take_over
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.testbed import DpsAlone
 
-OPERATION = Operation(period=PERIOD, continuity={"velocity": ("speed", 5.0)})
-PAUSE = 1.0
+CONTINUITY = {"velocity": ("speed", 5.0)}
 
 
-def waking_up(t: float) -> Mapping[str, Any]:
-    """Nothing is sensed before the end of a pause, longer than any signal may be old."""
-    return {} if t < PAUSE else {"position": [0.05, 0.0], "speed": [0.0, 0.0]}
+@dataclass
+class Told(ServoScenario):
+    """Says what it is given to say."""
+
+    def operation(self) -> Any:
+        return self.given
+
+    given: Any = None
 
 
-def make(operation: Operation) -> tuple[Runtime, ScriptedBridge, SimulatedClock]:
-    dps, clock = DpsAlone(ServoScenario()), SimulatedClock()
-    bridge = ScriptedBridge(dps.interface, clock, waking_up)
-    return operation.runtime(dps, bridge, clock=clock), bridge, clock
+def told(operation: Any, **fields: Any) -> Told:
+    scenario = Told(**fields)
+    scenario.given = operation
+    return scenario
 
 
-def test_in_lock_step_a_message_begins_a_cycle_however_late_it_comes() -> None:
-    runtime, _, clock = make(OPERATION.in_lock_step("position"))
-    runtime.run(cycles=1)
-    assert clock.now() == pytest.approx(PAUSE, abs=2 * PERIOD)
+class Machine:
+    """What a bridge leads to: still, after some seconds of silence."""
+
+    def __init__(self, operation: Operation, *, speaks_after: float = 0.0) -> None:
+        scenario = told(operation)
+        self.clock = SimulatedClock()
+
+        def sensors(t: float) -> dict[str, Any]:
+            return {"position": [0.05, 0.0], "speed": [0.3, 0.0]} if t >= speaks_after else {}
+
+        self.bridge = ScriptedBridge(scenario.interface(), self.clock, sensors)
+        self.runtime: Runtime = operation.runtime(DpsAlone(scenario), self.bridge, clock=self.clock)
+        self.lines: list[str] = []
+
+    def take_over(self, *, timeout: float = 10.0) -> None:
+        take_over(self.runtime, timeout=timeout, tell=self.lines.append)
 
 
-def test_in_lock_step_nobody_waits_for_ever() -> None:
-    runtime, _, clock = make(OPERATION.in_lock_step("position", wait=0.5))
-    runtime.run(cycles=1)
-    assert clock.now() == pytest.approx(0.5, abs=2 * PERIOD)
+def test_a_scenario_need_not_say_anything_where_defaults_will_do() -> None:
+    operation = operation_of(ServoScenario(rate=0.0))
+    assert (operation.period, operation.continuity, operation.pace) == (1e-3, {}, "")
 
 
-@pytest.mark.parametrize(("operation", "latched"), [(OPERATION.in_lock_step("position"), False), (OPERATION, True)])
-def test_in_lock_step_nothing_grows_old(operation: Operation, latched: bool) -> None:
-    runtime, bridge, clock = make(operation)
-    take_over(runtime, timeout=2 * PAUSE)
-    bridge.sensors = lambda t: {}
-    clock.advance(PAUSE)
-    runtime.cycle()
-    assert bool(runtime.guards.latched) == latched
+def test_a_limit_of_a_rate_has_to_depart_from_something_measured() -> None:
+    with pytest.raises(OperationError) as error:
+        operation_of(ServoScenario(rate=2.0))
+    assert "continuity={'velocity': (sensor signal, largest difference)}" in str(error.value)
+    assert "a method operation() that returns an Operation" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("operation", "reason"),
+    [
+        ({"period": 1e-3}, "returns a vtbdrake.control.operation.Operation, not {'period': 0.001}"),
+        (Operation(continuity={"velocity": ("velocity", 1.0)}), "not from 'velocity' to 'velocity'"),
+        (Operation(continuity={"speed": ("speed", 1.0)}), "not from 'speed' to 'speed'"),
+        (Operation(continuity=CONTINUITY, guards={"fallback": {"torque": Hold()}}), "fallback is given for torque"),
+    ],
+)
+def test_what_does_not_fit_the_signals_is_refused(operation: Any, reason: str) -> None:
+    with pytest.raises(OperationError) as error:
+        operation_of(told(operation))
+    assert reason in str(error.value)
+
+
+def test_period_and_pace_may_be_chosen() -> None:
+    operation = operation_of(ServoMachineScenario(), period=0.002, pace="speed")
+    assert (operation.period, operation.pace) == (0.002, "speed")
+    assert operation.continuity == ServoMachineScenario().operation().continuity
+
+
+def test_the_guards_are_those_that_are_asked_for() -> None:
+    machine = Machine(Operation(continuity=CONTINUITY, guards={"fallback": {"velocity": Hold()}}))
+    machine.take_over()
+    machine.runtime.run(cycles=20)
+    last = machine.bridge.sent[-1][1]["velocity"]
+    machine.runtime.send_fallback("because")
+    assert np.array_equal(machine.bridge.sent[-1][1]["velocity"], last)
+    assert np.any(last != 0.0)
+
+
+def test_a_machine_is_commanded_as_soon_as_it_speaks_from_what_is_measured() -> None:
+    machine = Machine(Operation(continuity=CONTINUITY), speaks_after=0.5)
+    machine.take_over()
+    assert machine.clock.now() == pytest.approx(0.5, abs=2 * PERIOD)
+    machine.runtime.run(cycles=1)
+    [(_, first)] = machine.bridge.sent
+    # A cycle's worth of the rate limit away from the measured speed; the DPS wants less.
+    assert first["velocity"] == pytest.approx([0.3 - 2.0 * PERIOD, 0.0])
+    assert "position" in machine.lines[0]
+
+
+def test_a_machine_that_is_not_ready_is_waited_for() -> None:
+    def ready(bridge: Bridge) -> str | None:
+        return None if bridge.sensed["position"].count > 2500 else "its brakes are on"
+
+    machine = Machine(Operation(continuity=CONTINUITY, ready=ready))
+    machine.take_over()
+    assert machine.clock.now() == pytest.approx(2.5, abs=2 * PERIOD)
+    # At once, and then every second.
+    assert machine.lines == ["the machine is not ready: its brakes are on"] * 3
+
+
+def test_one_does_not_wait_for_ever() -> None:
+    machine = Machine(Operation(continuity=CONTINUITY, ready=lambda bridge: "its brakes are on"))
+    with pytest.raises(SwitchRefusedError, match=r"after 1\.5 s: the machine is not ready: its brakes are on"):
+        machine.take_over(timeout=1.5)
+    assert machine.bridge.sent == []

@@ -140,7 +140,7 @@ def operation_of(scenario: Scenario, *, period: float | None = None, pace: str |
 
 
 def take_over(runtime: Runtime, *, timeout: float, tell: Callable[[str], None] = lambda text: None) -> None:
-    """Runs cycles until nothing speaks against it, switches to real, and does a first cycle there.
+    """Runs cycles until nothing speaks against it, and switches to real; `Runtime.run` goes on from there.
 
     Args:
         timeout: seconds after which it gives up.
@@ -167,5 +167,6 @@ def take_over(runtime: Runtime, *, timeout: float, tell: Callable[[str], None] =
         return False
 
     runtime.run(until=taken)
-    # At once: a machine in lock-step waits for a command before it says anything new.
-    runtime.cycle()
+    if runtime.pace is not None:
+        # At once: a machine in lock-step waits for a command before it says anything new.
+        runtime.cycle()
