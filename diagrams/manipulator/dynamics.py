@@ -46,7 +46,7 @@ class ArmDynamics:
         axes, origins = [], []
         for k in range(JOINTS):
             p = p + self.arm.offsets[k] * R[:, 2]
-            axes.append(R @ _sparse(np.array(self.arm.axes[k], dtype=float)))
+            axes.append(R @ self._axis(k))
             origins.append(p)
             R = R @ self._rotation(k, q[k])
         p = p + self.arm.tip_offset * R[:, 2]
@@ -59,7 +59,7 @@ class ArmDynamics:
         omega, alpha, acceleration = (casadi.SX.zeros(3) for _ in range(3))
         for k in range(JOINTS):
             acceleration += _turned(omega, alpha, self.arm.offsets[k] * R[:, 2])
-            turn = v[k] * (R @ _sparse(np.array(self.arm.axes[k], dtype=float)))
+            turn = v[k] * (R @ self._axis(k))
             alpha += casadi.cross(omega, turn)
             omega += turn
             R = R @ self._rotation(k, q[k])
@@ -82,8 +82,7 @@ class ArmDynamics:
         rotations, forces, moments = [], [], []
         for k, (mass, com, inertia) in enumerate(self._bodies):
             R = self._rotation(k, q[k])
-            offset = _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
-            axis = _sparse(np.array(self.arm.axes[k], dtype=float))
+            offset, axis = self._offset(k), self._axis(k)
             acceleration = R.T @ (acceleration + _turned(omega, alpha, offset))
             carried = R.T @ omega
             alpha = R.T @ alpha + casadi.cross(carried, axis) * v[k] + axis * a[k]
@@ -98,25 +97,54 @@ class ArmDynamics:
             own = forces[k]
             moment = moments[k] + casadi.cross(com, own) + moment
             force = own + force
-            axis = _sparse(np.array(self.arm.axes[k], dtype=float))
-            tau[k] = casadi.dot(axis, moment)
+            tau[k] = casadi.dot(self._axis(k), moment)
             if rotors:
                 tau[k] += self.arm.reflected_inertias[k] * a[k]
             # In the frame of the link before, about its origin.
             force = rotations[k] @ force
-            offset = _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
-            moment = rotations[k] @ moment + casadi.cross(offset, force)
+            moment = rotations[k] @ moment + casadi.cross(self._offset(k), force)
         return casadi.densify(casadi.vertcat(*tau))
 
     def momentum(self, q: Expression, v: Expression) -> tuple[Expression, Expression]:
         """p = M(q) v of the links, and dL/dq of their Lagrangian L = v' M v / 2 - U: Lagrange's equation is then
 
         dp/dt = dL/dq + tau, for the torques tau that act on the links.
+
+        In the frame of link k, about its origin, what it carries beyond has the momentum [l; h] (angular, linear) and
+        the first moment s; a is its axis. Of its velocity, only what it has from the link before, [w; u], depends on
+        q_k, as gravity g does: they turn against the joint. So p_k = a . l and dL/dq_k = a . (s x g - w x l - u x h).
         """
-        zero = casadi.SX(JOINTS, 1)
-        p = self.inverse_dynamics(q, zero, v, gravity=0.0, rotors=False)
-        gravity = self.inverse_dynamics(q, zero, zero, rotors=False)
-        return p, casadi.gradient(casadi.dot(v, p) / 2, q) - gravity
+        zero = casadi.SX(3, 1)
+        omega, velocity, g = zero, zero, _sparse(np.array([0.0, 0.0, -GRAVITY]))
+        given, own = [], []
+        for k, (mass, com, inertia) in enumerate(self._bodies):
+            R = self._rotation(k, q[k])
+            velocity = R.T @ (velocity + casadi.cross(omega, self._offset(k)))
+            carried, g = R.T @ omega, R.T @ g
+            given.append((R, carried, velocity, g))
+            omega = carried + self._axis(k) * v[k]
+            linear = mass * (velocity + casadi.cross(omega, com))
+            own.append((inertia @ omega + casadi.cross(com, linear), linear, mass * com))
+        p, gradient = [casadi.SX(0)] * JOINTS, [casadi.SX(0)] * JOINTS
+        mass, angular, linear, first = 0.0, zero, zero, zero
+        for k in reversed(range(JOINTS)):
+            mass += self._bodies[k][0]
+            angular, linear, first = angular + own[k][0], linear + own[k][1], first + own[k][2]
+            R, carried, velocity, g = given[k]
+            turning = casadi.cross(first, g) - casadi.cross(carried, angular) - casadi.cross(velocity, linear)
+            p[k], gradient[k] = casadi.dot(self._axis(k), angular), casadi.dot(self._axis(k), turning)
+            # In the frame of the link before, about its origin.
+            linear, first = R @ linear, R @ first + mass * self._offset(k)
+            angular = R @ angular + casadi.cross(self._offset(k), linear)
+        return casadi.densify(casadi.vertcat(*p)), casadi.densify(casadi.vertcat(*gradient))
+
+    def _offset(self, k: int) -> Expression:
+        """Of the origin of link k, in the frame of the one before."""
+        return _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
+
+    def _axis(self, k: int) -> Expression:
+        """Of joint k, in the frames of its link and of the one before."""
+        return _sparse(np.array(self.arm.axes[k], dtype=float))
 
     def _rotation(self, k: int, angle: Expression) -> Expression:
         """Of link k in the one before."""
