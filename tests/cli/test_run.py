@@ -209,3 +209,19 @@ def test_bad_input_is_one_line(
     assert program.stderr.startswith("Error: ")
     assert program.stderr.count("\n") == 1
     assert message in program.stderr
+
+
+def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub) -> None:
+    options = ("--url", hub.url, "--field", "max_age=0.05", "--pace", "", "--no-live", *FAR)
+    with MachineProcess(ServoMachineScenario(), hub.url) as machine, start(SERVO, *options) as program:
+        assert program.stderr is not None
+        assert any("the DPS commands" in line for line in program.stderr)
+        machine.kill()
+        # It goes on, with what is safe.
+        assert any("the fallbacks command from now on" in line for line in program.stderr)
+        assert program.poll() is None
+        program.send_signal(signal.SIGTERM)
+        output, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 1
+    assert "Error: the fallbacks took over: sensor signal" in errors
+    assert " s: sensor signal position is stale" in output

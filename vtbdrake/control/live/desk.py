@@ -42,15 +42,15 @@ _BURST = 200  # messages to take in at a time
 _MEMORY = 1000  # requests to set and get that are known if they are said again
 _CONNECT_TIMEOUT = 2.0  # s
 
-# From the loop: the number of a request and
-VALUES = b"v"  # what was read
-TEXT = b"t"  # a pickled (number, what became of it)
-_HEAD = struct.Struct("<IQdd")
+# From the loop:
+VALUES = b"v"  # records of what was read
+TEXT = b"t"  # a pickled (number of a request, what became of it)
+_HEAD = struct.Struct("<IQddI")
 
 
-def values_frame(number: int, cycle: int, since: float, time: float, entries: Sequence[float]) -> bytes:
-    """A frame of what was read for request ``number``."""
-    return VALUES + _HEAD.pack(number, cycle, since, time) + struct.pack(f"<{len(entries)}d", *entries)
+def values_record(number: int, cycle: int, since: float, time: float, entries: Sequence[float]) -> bytes:
+    """What was read for request ``number``; records, one after another, make a frame of `VALUES`."""
+    return struct.pack(f"<IQddI{len(entries)}d", number, cycle, since, time, len(entries), *entries)
 
 
 def text_frame(number: int, **outcome: Any) -> bytes:
@@ -174,7 +174,9 @@ class Desk:
             except TimeoutError:
                 return
             if frame[:1] == VALUES:
-                self._tell_values(frame)
+                start = 1
+                while start < len(frame):
+                    start = self._tell_values(frame, start)
             else:
                 self._conclude(*pickle.loads(frame[1:]))
 
@@ -202,21 +204,24 @@ class Desk:
 
         return f"there is no variable and no output port {address!r}{suggestion(address, self._addresses)}"
 
-    def _tell_values(self, frame: bytes) -> None:
-        number, cycle, since, now = _HEAD.unpack_from(frame, 1)
+    def _tell_values(self, frame: bytes, start: int) -> int:
+        """Tells the record that begins at ``start``; where the next one does."""
+        number, cycle, since, now, count = _HEAD.unpack_from(frame, start)
+        end = start + _HEAD.size + 8 * count
         task = self._tasks.get(number)
         if task is None or not isinstance(task.request, ReadRequest):
-            return
-        entries = struct.unpack_from(f"<{(len(frame) - 1 - _HEAD.size) // 8}d", frame, 1 + _HEAD.size)
-        values, start = {}, 0
+            return int(end)
+        entries = struct.unpack_from(f"<{count}d", frame, start + _HEAD.size)
+        values, place = {}, 0
         for address, shape in zip(task.request.addresses, task.shapes, strict=True):
-            values[address] = nested(entries[start : start + prod(shape)], shape)
-            start += prod(shape)
+            values[address] = nested(entries[place : place + prod(shape)], shape)
+            place += prod(shape)
         if task.channel == WATCH:
             self._publish(WATCHED + task.request.id, {"cycle": cycle, "since": since, "time": now, "values": values})
         else:
             del self._tasks[number]
             self._say(task, ok=True, time=now, values=values)
+        return int(end)
 
     def _say(self, task: _Task, **outcome: Any) -> None:
         self._publish(task.channel + ANSWER, {"id": task.request.id, **outcome})

@@ -6,6 +6,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.control.live.desk import attend, text_frame, values_frame
+from vtbdrake.control.live.desk import VALUES, attend, text_frame, values_record
 from vtbdrake.control.runtime import Runtime
 
 
@@ -35,12 +36,16 @@ class LiveService:
         url: the bus.
         budget: seconds of computing per cycle for reading; one value is always read.
         longest: seconds of computing beyond which a single value is not read again.
+        pause: seconds between two times that values are sent to those who watch: to wake the companion costs more
+            than to read a value.
 
     Attributes:
         refused: how many requests were, a moment ago.
     """
 
-    def __init__(self, runtime: Runtime, url: str, *, budget: float = 100e-6, longest: float = 1e-3) -> None:
+    def __init__(
+        self, runtime: Runtime, url: str, *, budget: float = 100e-6, longest: float = 1e-3, pause: float = 0.01
+    ) -> None:
         if not 0.0 < budget <= longest:
             raise ValueError(f"a budget lies above 0 s and below {longest} s for a single value, not at {budget} s")
         self.budget = budget
@@ -51,6 +56,9 @@ class LiveService:
         self._ports = frozenset(addresses)
         self._orders: deque[bytes] = deque()
         self._readings: deque[_Reading] = deque()
+        self._records: list[bytes] = []
+        self._flush_at = -inf
+        self._pause = pause
         self._companion = Companion(attend, url, addresses, name="the live service")
         runtime.watch(self)
 
@@ -77,6 +85,8 @@ class LiveService:
             self._begin(*pickle.loads(self._orders.popleft()))
         if self._readings:
             self._read(cycle)
+        if self._records and cycle.now >= self._flush_at:
+            self._flush(cycle.now)
 
     def _begin(self, number: int, order: tuple[Any, ...] | None) -> None:
         if order is None:
@@ -130,8 +140,6 @@ class LiveService:
             self._readings.rotate(-1)
             if before - begin > self.budget:
                 break
-        if self._companion.dropped and not self._companion.alive:
-            self._readings.clear()
 
     def _conclude(self, reading: _Reading, cycle: Cycle) -> bool:
         """Sends what was read; whether it is to be read again."""
@@ -141,8 +149,17 @@ class LiveService:
         if not reading.told:
             reading.told = True
             self._companion.post(text_frame(reading.number, shapes=reading.shapes))
-        self._companion.post(values_frame(reading.number, cycle.number, reading.since, cycle.time, reading.entries))
+        self._records.append(values_record(reading.number, cycle.number, reading.since, cycle.time, reading.entries))
+        if not reading.every:
+            self._flush_at = -inf
         return reading.every > 0
+
+    def _flush(self, now: float) -> None:
+        self._companion.post(VALUES, *self._records)
+        self._records.clear()
+        self._flush_at = now + self._pause
+        if self._companion.dropped and not self._companion.alive:
+            self._readings.clear()
 
 
 class _Reading:
