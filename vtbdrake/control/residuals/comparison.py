@@ -84,8 +84,8 @@ class Comparison:
         self._where = rows
         self._config = config
         self._twin = mode == TWIN
-        # Rows that have to be there before a window can be predicted, after its end.
-        self._wait = max(0, max(predictor.ages) - config.horizon)
+        # Rows that have to be there before a window can be predicted, after its end: what comes late comes by then.
+        self._wait = max(1, max(predictor.ages) - config.horizon)
         self._rows: dict[int, Array] = {}
         self._nothing = rows.empty(1)[0]
         self._newest: int | None = None
@@ -97,6 +97,9 @@ class Comparison:
         horizon, found = self._config.horizon, []
         for row in rows:
             index = int(row[INDEX])
+            if self._newest is not None and self._newest - horizon <= index <= self._newest:
+                self._complete(index, row)
+                continue
             if self._newest is None or not 0 < index - self._newest <= horizon:
                 self._restart(index)
             self._newest = index
@@ -109,6 +112,17 @@ class Comparison:
                 oldest = self._next - max(self._config.delay, 1)
                 self._rows = {i: kept for i, kept in self._rows.items() if i >= oldest}
         return found
+
+    def _complete(self, index: int, late: Array) -> None:
+        """Adds what came late of a row; of two commands for one period the second one acts."""
+        row = self._rows.get(index)
+        if row is None:
+            return
+        commands = self._where.commanded
+        new = np.isnan(row)
+        new[commands] = True
+        new &= ~np.isnan(late)
+        self._rows[index] = np.where(new, late, row)
 
     def _restart(self, index: int) -> None:
         """Begins anew with the first window all of whose rows come from here on."""
@@ -148,10 +162,10 @@ class Comparison:
         commanded = self._block(j - self._config.delay for j in periods)
         told = self._block(j + 1 for j in periods)
         acting = commanded[:, where.commanded] if self._twin else told[:, where.reports]
-        clear = ~np.isnan(acting).any(axis=1)
-        whole = self._believe(s) and bool(clear.all() and not np.isnan(told[:, INDEX]).any())
-        predicted = [self._predictor.step(u if given else None) for u, given in zip(acting, clear.tolist(), strict=True)]
-        sense = told[:, where.sensed] - np.array(predicted)
+        commands = [None if np.isnan(u).any() else u for u in acting]
+        missing = bool(np.isnan(told[:, INDEX]).any()) or any(u is None for u in commands)
+        whole = self._believe(s) and not missing
+        sense = told[:, where.sensed] - np.array([self._predictor.step(u) for u in commands])
         return np.hstack((sense, told[:, where.reports] - commanded[:, where.compared])), whole
 
     def _block(self, indices: Iterable[int]) -> Array:

@@ -145,12 +145,13 @@ class ResidualMonitor:
             self._begin_block()
         if self._filled == 0 and not self._sampler.listens():
             return
-        self._filled += self._sampler.fill(self._block[self._filled], cycle)
-        if self._filled == len(self._block):
+        self._filled += self._sampler.fill(self._block[self._filled :], cycle)
+        if self._filled >= self.config.horizon:
             self._pass_on()
 
     def _begin_block(self) -> None:
-        self._block: Array = self._rows.empty(self.config.horizon)
+        # A cycle brings no more rows than it has signals.
+        self._block: Array = self._rows.empty(self.config.horizon + len(self._rows.sense))
         self._filled = 0
 
     def _pass_on(self) -> None:

@@ -93,23 +93,34 @@ class Sampler:
             return self._runtime.command(next(iter(self._layout.command))) is not None
         return set(target.positions(self._runtime.context)["sense"].values()) == {REAL}
 
-    def fill(self, row: Array, cycle: Cycle) -> bool:
-        """Whether the cycle had a new sample; ``row`` is all NaN before."""
+    def fill(self, rows: Array, cycle: Cycle) -> int:
+        """Fills rows, all NaN before, with what is new in a cycle; says how many: none without a new sample, and
+        several where some of its samples are older than the others."""
         if not cycle.fed:
-            return False
-        sent = max(self._sensed[name].sent for name in cycle.fed)
-        if sent == sent:
-            if not self._first <= sent:  # also at first, when it is NaN, and where the sender's time was set back
-                self._first = sent
-            index = round((sent - self._first) / self._runtime.period)
-        else:
-            index = cycle.number
-        row[INDEX], row[TIME] = index, cycle.time
-        latest = sent - 0.5 * self._runtime.period
-        for name, value in cycle.fed.items():
-            # What is older than the rest came too late to be told of together with it.
-            if not self._sensed[name].sent < latest:
-                row[self._layout.sense[name]] = value
+            return 0
+        groups = self._by_index(cycle)
+        for row, index in zip(rows, sorted(groups), strict=False):
+            row[INDEX], row[TIME] = index, cycle.time
+            for name in groups[index]:
+                row[self._layout.sense[name]] = cycle.fed[name]
+        self._answer(rows[len(groups) - 1], max(groups), cycle)
+        return len(groups)
+
+    def _by_index(self, cycle: Cycle) -> dict[int, list[str]]:
+        """The signals that are new, by the index of their samples."""
+        times = {name: self._sensed[name].sent for name in cycle.fed}
+        oldest = min(times.values())
+        if oldest != oldest:
+            return {cycle.number: list(times)}
+        if not self._first <= oldest:  # also at first, when it is NaN, and where the sender's time was set back
+            self._first = oldest
+        groups: dict[int, list[str]] = {}
+        for name, sent in times.items():
+            groups.setdefault(round((sent - self._first) / self._runtime.period), []).append(name)
+        return groups
+
+    def _answer(self, row: Array, index: int, cycle: Cycle) -> None:
+        """What the DPS made of the newest sample, and what is reported beside it."""
         for name, place in self._layout.command.items():
             command = cycle.verdict.commands.get(name) if self._sends else self._runtime.command(name)
             if command is not None:
@@ -122,7 +133,6 @@ class Sampler:
             if (index - age) % self._horizon == 0:
                 for place, read in estimates:
                     row[place] = np.ravel(read(self._runtime.context))
-        return True
 
 
 def _indices(places: Iterable[slice]) -> list[int]:
