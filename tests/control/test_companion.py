@@ -33,7 +33,8 @@ def fall_asleep(channel):
 
 def tell_scheduling(channel):
     handler = signal.getsignal(signal.SIGINT)
-    channel.send(f"{os.sched_getscheduler(0)} {handler == signal.SIG_IGN}".encode())
+    processors = len(os.sched_getaffinity(0))
+    channel.send(f"{os.sched_getscheduler(0)} {processors} {handler == signal.SIG_IGN}".encode())
 
 
 def fail(channel, code):
@@ -122,7 +123,12 @@ def test_its_exit_code_is_told():
     assert Companion(fail, 3, name="failure").close() == 3
 
 
-def test_it_has_ordinary_scheduling_and_leaves_interrupts_to_the_main_process():
-    companion = Companion(tell_scheduling, name="teller")
-    assert taken(companion, 1) == [f"{os.SCHED_OTHER} True".encode()]
-    companion.close()
+def test_it_has_ordinary_scheduling_all_processors_and_leaves_interrupts_to_the_main_process():
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(processors)})
+    try:
+        companion = Companion(tell_scheduling, name="teller")
+        assert taken(companion, 1) == [f"{os.SCHED_OTHER} {len(processors)} True".encode()]
+        companion.close()
+    finally:
+        os.sched_setaffinity(0, processors)

@@ -257,6 +257,8 @@ def main() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    # The loop may be confined to processors of its own, where nothing else is to work.
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
     with socket.socket(fileno=int(sys.argv[1])) as line:
         channel = Channel(line)
         try:
