@@ -1,6 +1,7 @@
 """``vtbdrake hub`` as its users run it."""
 
 import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -54,6 +55,15 @@ def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
     assert program.stderr.count("\n") == 1
 
 
+def test_it_runs_on_the_processors_that_it_is_told() -> None:
+    cpu = max(os.sched_getaffinity(0))
+    with running("--port", 0, "--cpu", cpu) as (program, url):
+        bus = lcm.LCM(url)
+        bus.subscribe("VTB_HUB", lambda *_: None)
+        assert bus.handle_timeout(30_000)  # it serves
+        assert os.sched_getaffinity(program.pid) == {cpu}
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -63,6 +73,7 @@ def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
         (("--port", 0, "--max-queue", "inf"), "'inf' is not a valid integer"),
         (("--port", 0, "--protect", "VTB_HUB"), "'VTB_HUB' is the hub's own"),
         (("--port", 0, "--lease", 0), "lease is a positive time"),
+        (("--port", 0, "--cpu", -1), "processors have the numbers"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[object, ...], named: str) -> None:
