@@ -27,6 +27,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.text import number, write_whole
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.guard import Guards
 from vtbdrake.control.live.service import LiveService
 from vtbdrake.control.operation import operation_of, take_over
 from vtbdrake.control.protocol import protocol_of
@@ -108,16 +109,14 @@ def run_dps(
     bridge = protocol_of(scenario).bridge(scenario.interface(), url)
     alone = DpsAlone(scenario)
     context = None
-    if snapshot is not None or values:
+    if snapshot is not None:
         context = alone.default_context()
-        if snapshot is not None:
-            alone.restore(context, snapshot)
-        alone.write(context, settings(values))
-    runtime = operation.runtime(alone, bridge, context=context)
-    begin = runtime.clock.now()
+        alone.restore(context, snapshot)
     # Whoever ends the process by `kill` ends the loop as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with ExitStack() as stack:
+    with operation.runtime(alone, bridge, context=context) as runtime, ExitStack() as stack:
+        alone.write(runtime.context, settings(values))
+        begin = runtime.clock.now()
         try:
             bridge.open()
         except BridgeError as error:
@@ -131,14 +130,25 @@ def run_dps(
         real_time = stack.enter_context(RealTime(priority=priority or None, lock_memory=lock_memory))
         click.echo(real_time)
         _run(runtime, wait=wait, seconds=seconds)
-    click.echo(runtime.statistics)
     if statistics is not None:
         write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
-    faults = [fault for fault in runtime.guards.log if fault.kind != "told"]
+    click.echo(runtime.statistics)
+    _report_faults(runtime.guards, begin)
+
+
+def _report_faults(guards: Guards, begin: float) -> None:
+    """
+    Raises:
+        FailedError: the guards have latched, for more than the farewell.
+    """
+    faults = [fault for fault in guards.log if fault.kind != "told"]
     for fault in faults[:MOST_FAULTS]:
         click.echo(f"fault after {number(fault.time - begin)} s: {fault.reason}")
-    if any(fault.kind != "told" for fault in runtime.guards.latched):
-        raise FailedError(f"the fallbacks took over: {'; '.join(fault.reason for fault in runtime.guards.latched)}")
+    if len(faults) > MOST_FAULTS:
+        click.echo(f"and {len(faults) - MOST_FAULTS} more faults")
+    causes = [fault.reason for fault in guards.latched if fault.kind != "told"]
+    if causes:
+        raise FailedError(f"the fallbacks took over: {'; '.join(causes)}")
 
 
 def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
