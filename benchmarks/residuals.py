@@ -49,9 +49,11 @@ def payload_alarm(nominal: float = 10.0) -> list[Benchmark]:
         with ResidualMonitor(runtime, "twin", calibration=calibration) as right:
             took = seconds(lambda: runtime.run(cycles=round(nominal / PERIOD)))
         simulated = runtime.time - begin
-    with arm_loop(seed=3, mass=(1.0 + ERROR) * Arm().tool_mass) as runtime:
-        with ResidualMonitor(runtime, "twin", calibration=calibration) as wrong:
-            runtime.run(cycles=round(SEARCH / PERIOD))
+    with (
+        arm_loop(seed=3, mass=(1.0 + ERROR) * Arm().tool_mass) as runtime,
+        ResidualMonitor(runtime, "twin", calibration=calibration) as wrong,
+    ):
+        runtime.run(cycles=round(SEARCH / PERIOD))
     if not wrong.alarms:
         raise RuntimeError(f"a payload that is wrong by {ERROR:.0%} was not found in {SEARCH} s")
     first = wrong.history[0].time - wrong.config.window
