@@ -16,21 +16,26 @@ from vtbdrake.testbed import DpsAlone
 
 
 def wandering(t: float) -> Mapping[str, Any]:
-    """Both signals, at any time other values; the speed only in every other cycle."""
+    """Both signals, at any time other values; the position only in every other cycle."""
     cycle = round(t / PERIOD)
-    values = {"position": 0.3 * np.sin([37.0 * t + 1.0, 11.0 * t])}
-    return values | ({"speed": np.cos([5.0 * t, 3.0 * t])} if cycle % 2 == 0 else {})
+    values = {"speed": np.cos([5.0 * t, 3.0 * t])}
+    return values | ({"position": 0.3 * np.sin([37.0 * t + 1.0, 11.0 * t])} if cycle % 2 == 0 else {})
 
 
 class Servo:
     """A loop in lock-step with a simulated clock, on real from its second cycle on.
 
+    Args:
+        alone: steps the DPS alone.
+        begun: its first cycle is done, and its switches are thrown.
+        scenario: another one than the servo's own.
+
     Attributes:
         cycles: all that there were.
     """
 
-    def __init__(self, *, alone: bool = True, begun: bool = True, **options: Any) -> None:
-        self.scenario = ServoScenario(rate=0.0)
+    def __init__(self, *, alone: bool = True, begun: bool = True, scenario: ServoScenario | None = None) -> None:
+        self.scenario = scenario or ServoScenario(rate=0.0)
         target = DpsAlone(self.scenario) if alone else self.scenario.build()
         clock = SimulatedClock()
         self.bridge = ScriptedBridge(self.scenario.interface(), clock, wandering)
@@ -42,7 +47,6 @@ class Servo:
             clock=clock,
             guards=Guards(self.scenario.interface(), PERIOD),
             watchers=(self.cycles.append,),
-            **options,
         )
         if begun:
             self.runtime.cycle()

@@ -39,7 +39,7 @@ def test_every_cycle_is_recorded_to_the_last_bit(tmp_path: Path) -> None:
     assert np.array_equal(log.commands["velocity"], servo.commands, equal_nan=True)
     sent = [cycle.verdict.commands.get("velocity", [np.nan, np.nan]) for cycle in cycles]
     assert np.array_equal(log.sent["velocity"], sent, equal_nan=True)
-    assert (log.sources["speed"] != 0).tolist() == ["speed" in cycle.fed for cycle in cycles]
+    assert (log.sources["position"] != 0).tolist() == ["position" in cycle.fed for cycle in cycles]
     for i, cycle in enumerate(cycles):
         for name, value in cycle.fed.items():
             assert np.array_equal(log.fed[name][i], value)
@@ -102,6 +102,22 @@ def test_a_recording_may_begin_and_end_while_the_loop_runs(tmp_path: Path) -> No
     assert read_log(tmp_path / "one").numbers.tolist() == list(range(11, 21))
     assert read_log(tmp_path / "two").numbers.tolist() == list(range(26, 36))
     assert servo.bridge.tap is None
+
+
+@pytest.mark.parametrize("before", [6, 7])
+def test_what_lay_at_the_ports_when_it_began_is_new_once(tmp_path: Path, before: int) -> None:
+    servo = Servo()
+    servo.runtime.run(cycles=before)
+    with Recorder(servo.runtime, tmp_path / "run.lcm"):
+        servo.runtime.run(cycles=6)
+    log = read_log(tmp_path / "run.lcm")
+    fed = [cycle.fed.get("position") for cycle in servo.cycles]
+    assert (log.sources["position"] != 0).tolist() == [True, *(value is not None for value in fed[before + 2 :])]
+    known = fed[0]
+    for number, value in enumerate(fed):
+        known = known if value is None else value
+        if number > before:
+            assert np.array_equal(log.fed["position"][number - before - 1], known)
 
 
 @pytest.fixture(scope="module")
