@@ -10,7 +10,7 @@ import pytest
 
 from tests.control.residuals.line import Together
 from tests.control.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
-from vtbdrake.control.residuals import ResidualConfig, ResidualMonitor
+from vtbdrake.control.residuals import Comparison, Predictor, ResidualConfig, ResidualMonitor, RowLayout, Sampler
 from vtbdrake.control.runtime import Runtime
 
 CONFIG = ResidualConfig(period=PERIOD, settle=0)
@@ -130,6 +130,46 @@ def test_long_gap_has_it_begin_anew() -> None:
     assert monitor.skipped == 6
     assert len(times) == 8 + 7
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
+
+
+def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
+    """What a comparison of a twin takes, and the rows of a heavier machine."""
+    scenario = DrivenPendulum()
+    runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
+    predictor = Predictor(scenario, period=PERIOD, values={})
+    layout = RowLayout(predictor.interface, ("torque",), {"dps.seen[0]": 1, "dps.seen": 2})
+    sampler = Sampler(runtime, layout, predictor.ages, mode="twin", horizon=CONFIG.horizon)
+    rows = layout.empty(cycles)
+    for row in rows:
+        assert sampler.fill(row[None], runtime.cycle()) == 1
+    return Comparison(predictor, layout, CONFIG, mode="twin"), rows
+
+
+def test_rows_may_come_in_any_portions_and_parts() -> None:
+    comparison, rows = rows_of(102)
+    expected = np.array([window.residual for window in comparison.take(rows)])
+    assert np.abs(expected).max() > 1e-2
+    again, _ = rows_of(1)
+    found = []
+    for row in rows:
+        # The velocity comes by itself, and then both again.
+        early, late = row.copy(), again._where.empty(1)[0]
+        velocity = again._where.sense["velocity"]
+        late[:2], late[velocity] = row[:2], row[velocity]
+        early[velocity] = np.nan
+        found += again.take(early[None]) + again.take(np.array([late, row]))
+    assert again.skipped == 0
+    np.testing.assert_array_equal([window.residual for window in found], expected)
+
+
+def test_second_command_for_one_period_is_the_one_that_acts() -> None:
+    comparison, rows = rows_of(102)
+    expected = np.array([window.residual for window in comparison.take(rows)])
+    again, _ = rows_of(1)
+    first = rows.copy()
+    first[:, again._where.command["torque"]] += 5.0
+    found = again.take(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
+    np.testing.assert_array_equal([window.residual for window in found], expected)
 
 
 def test_failed_prediction_is_told_and_begins_anew() -> None:
