@@ -150,8 +150,6 @@ class LiveService:
             reading.told = True
             self._companion.post(text_frame(reading.number, shapes=reading.shapes))
         self._records.append(values_record(reading.number, cycle.number, reading.since, cycle.time, reading.entries))
-        if not reading.every:
-            self._flush_at = -inf
         return reading.every > 0
 
     def _flush(self, now: float) -> None:
