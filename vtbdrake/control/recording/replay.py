@@ -125,7 +125,7 @@ class _Replay:
     def run(self) -> None:
         """All cycles."""
         log, feed, context = self._log, self._ports.feed, self._context
-        vectors = [(log.sources[name].tolist(), name, values) for name, values in log.fed.items()]
+        vectors = [(_differs(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
         changes: dict[int, list[Change]] = {}
         for i, change in log.changes:
             changes.setdefault(i, []).append(change)
@@ -216,6 +216,13 @@ class _Replay:
         RESET: _reset,
         RESULT: _deliver,
     }
+
+
+def _differs(values: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """Where a vector signal has a new value of other bits than before: only those must be fed."""
+    bits, new = values.view(np.uint64), sources != 0
+    new[1:] &= (bits[1:] != bits[:-1]).any(axis=1) | (np.cumsum(new)[1:] == 1)
+    return new
 
 
 def _until_gap(log: ControlLog) -> int:
