@@ -98,6 +98,17 @@ def test_wrong_report_of_the_command_is_found(mode: str) -> None:
     assert alarm.residual == pytest.approx(0.01, abs=0.002)
 
 
+def test_bias_that_is_nominal_is_no_alarm_and_its_absence_is() -> None:
+    biased = replace(nominal(), mean=nominal().mean | {"act.torque": [0.01]})
+    together, monitors = start(calibration=biased)
+    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque + 0.01)
+    together.run(200)
+    assert not monitors["twin"].alarms
+    together.line.falsify = lambda channel, data: data
+    together.run(200)
+    assert monitors["twin"].alarms[0].signal == "act.torque"
+
+
 def test_alarm_ends_when_the_fault_has_gone() -> None:
     together, monitors = start(calibration=nominal())
     monitor = monitors["twin"]

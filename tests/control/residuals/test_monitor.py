@@ -97,6 +97,7 @@ def test_process_that_is_stopped_leaves_windows_out() -> None:
         before = monitor.history[-1].time
         wait_for_windows(monitor, together, len(monitor.history) + 10)
         assert monitor.skipped >= 50
+        assert np.diff([window.time for window in monitor.history]).max() > 50 * CONFIG.window
         assert monitor.history[-1].time > before
         assert not monitor.alarms
 
