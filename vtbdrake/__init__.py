@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
     from vtbdrake.control.hub import Hub
     from vtbdrake.control.lcm_bridge import LcmBridge
-    from vtbdrake.control.live.client import LiveWatch, ParameterClient, watch
+    from vtbdrake.control.live.client import ParameterClient, watch
+    from vtbdrake.control.live.live_watch import LiveWatch
     from vtbdrake.control.live.service import LiveService
     from vtbdrake.control.machine import MachineProcess
     from vtbdrake.control.operation import Operation
@@ -80,7 +81,8 @@ _HOMES = {
     "control.guard": ("Guards",),
     "control.hub": ("Hub",),
     "control.lcm_bridge": ("LcmBridge",),
-    "control.live.client": ("LiveWatch", "ParameterClient", "watch"),
+    "control.live.client": ("ParameterClient", "watch"),
+    "control.live.live_watch": ("LiveWatch",),
     "control.live.service": ("LiveService",),
     "control.machine": ("MachineProcess",),
     "control.operation": ("Operation",),

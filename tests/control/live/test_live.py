@@ -15,8 +15,9 @@ import pytest
 from tests.control.live.rig import PATIENCE, Rig, served
 from tests.control.scripted import PERIOD
 from vtbdrake.control.hub import Hub
-from vtbdrake.control.live.client import LiveError, LiveWatch, ParameterClient, SilenceError, watch
+from vtbdrake.control.live.client import LiveError, ParameterClient, SilenceError, watch
 from vtbdrake.control.live.desk import MAX_WAITING
+from vtbdrake.control.live.live_watch import LiveWatch
 
 # Enough to read everything in one cycle, on a computer that is busy.
 AMPLE = {"budget": 10.0, "longest": 10.0}
