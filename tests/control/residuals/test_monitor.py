@@ -102,6 +102,20 @@ def test_process_that_is_stopped_leaves_windows_out() -> None:
         assert not monitor.alarms
 
 
+def test_windows_that_lack_samples_are_told_of_while_the_loop_runs() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        together.driver.unwatch(monitor)
+        together.driver.watch(lambda cycle: monitor(cycle) if cycle.number % 2 else None)
+        end = time.monotonic() + PATIENCE
+        while monitor.skipped < 20:
+            assert time.monotonic() < end, "nobody hears of it"
+            together.run(10)
+            assert monitor._companion is not None
+            select.select((monitor._companion,), (), (), 0.05)
+        assert not monitor.history
+
+
 def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
     together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
     assert together.shadow is not None

@@ -16,7 +16,7 @@ from vtbdrake.control.residuals.rows import Array, RowLayout
 from vtbdrake.testbed import Scenario
 
 _LATE = 100  # blocks of rows that may wait; what waits beyond that is left out
-_REPORT = 10  # windows after which results go back, if there is no alarm meanwhile
+_REPORT = 10  # windows, judged or not, after which results go back, if there is no alarm meanwhile
 
 
 @dataclass
@@ -69,7 +69,7 @@ def serve(channel: Channel, scenario: Scenario, config: ResidualConfig, mode: st
     channel.send(pickle.dumps(predictor.ages))
     layout: RowLayout = pickle.loads(channel.receive())
     check = ResidualCheck(Comparison(predictor, layout, config, mode=mode), judge)
-    pending, left_out, ended = Report(), 0, False
+    pending, left_out, told, ended = Report(), 0, 0, False
     while not ended:
         blocks, ended = _blocks(channel)
         left_out += max(0, len(blocks) - _LATE)
@@ -78,11 +78,12 @@ def serve(channel: Channel, scenario: Scenario, config: ResidualConfig, mode: st
             report.windows = pending.windows + report.windows
             report.skipped += left_out
             pending = report
-            if report.alarms or len(report.windows) >= _REPORT:
+            # That nothing comes of the windows has to be told as well.
+            without = report.skipped + report.failed
+            if report.alarms or len(report.windows) + without - told >= _REPORT:
                 channel.send(pickle.dumps(report))
-                pending = Report()
-    if pending.windows:
-        channel.send(pickle.dumps(pending))
+                pending, told = Report(skipped=report.skipped, failed=report.failed, error=report.error), without
+    channel.send(pickle.dumps(pending))
 
 
 def _blocks(channel: Channel) -> tuple[list[bytes], bool]:
