@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 
 import numpy as np
 from drake import lcmt_force_torque, lcmt_scope
@@ -228,6 +229,10 @@ class ManipulatorScenario(Scenario):
         builder.builder.Connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
         for k, name in enumerate(JOINT_NAMES):
             for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
+                # All joints in one reading: whoever looks at the belief while the loop runs has little time.
                 builder.believe(
-                    f"sim.sys.arm.{name}.{value}", of=[f"dps.env.joint_{value}[{k}]"], age=(1 + errors.latency) * T
+                    f"sim.sys.arm.{name}.{value}",
+                    of=[f"dps.env.joint_{value}"],
+                    by=itemgetter(k),
+                    age=(1 + errors.latency) * T,
                 )
