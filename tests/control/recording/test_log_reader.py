@@ -14,6 +14,7 @@ import pytest
 
 from tests.control.recording.servo import Servo
 from tests.control.scripted import PERIOD
+from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.control.recording.log_events import LogEvents
@@ -169,6 +170,17 @@ def test_a_jump_of_the_clock_is_told_and_does_not_matter(
     assert list(log.clock_jumps) == [7] and not log.damages and not log.gaps
     assert f"the clock jumps at cycle {reference.numbers[7]}" in caplog.text
     assert replay(log).identical
+
+
+def test_a_cycle_that_was_held_up_is_no_jump_of_the_clock(tmp_path: Path) -> None:
+    servo = Servo()
+    clock = servo.runtime.clock
+    assert isinstance(clock, SimulatedClock)
+    servo.runtime.watch(lambda cycle: clock.advance(0.3) if cycle.number == 5 else None)
+    with Recorder(servo.runtime, tmp_path / "run.lcm"):
+        servo.runtime.run(cycles=CYCLES)
+    log = read_log(tmp_path / "run.lcm")
+    assert np.diff(log.utimes).max() > 0.2e6 and not log.clock_jumps
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 something else", bytes(5000)], ids=["empty", "short", "zeros"])

@@ -180,5 +180,12 @@ def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[G
 
 
 def _jumps(records: np.ndarray) -> list[int]:
-    day, clock = np.diff(1e-6 * records["utime"]), np.diff(records["now"])
-    return [int(i) + 1 for i in np.flatnonzero((np.abs(day - clock) > JUMP) | (clock < 0.0))]
+    """A cycle that was held up comes to its entry late; a jump goes on in the cycles that follow."""
+    if len(records) < 2:
+        return []
+    offset = 1e-6 * records["utime"] - records["now"]
+    step = np.diff(offset)
+    ahead, behind = np.append(offset[2:], offset[-1]), np.insert(offset[:-2], 0, offset[0])
+    forward = (step > JUMP) & (ahead - offset[:-1] > JUMP)
+    backward = (step < -JUMP) & (offset[1:] - behind < -JUMP)
+    return [int(i) + 1 for i in np.flatnonzero(forward | backward | (np.diff(records["now"]) < 0.0))]
