@@ -97,8 +97,8 @@ def _check_complete(recorder: Recorder) -> None:
 
 
 def replay_rtf(simulated: float = 10.0, repeats: int = 5) -> Benchmark:
-    """Seconds of the loop per second of replaying its log with the DPS alone, the file's reading included. The log is
-    that of the arm on the machine, with the bridge's messages; the replay has to be identical.
+    """Seconds of the loop per second of replaying its log with the DPS alone; to read the file and to build the DPS is
+    part of it. The log is that of the arm on the machine, with the bridge's messages; the replay has to be identical.
 
     Raises:
         RuntimeError: the replay was not.
@@ -109,10 +109,9 @@ def replay_rtf(simulated: float = 10.0, repeats: int = 5) -> Benchmark:
             runtime = rig.runtime(DpsAlone(rig.scenario))
             with Recorder(runtime, path):
                 rig.run(runtime, round(simulated / PERIOD))
-        target = DpsAlone(rig.scenario)
         logs: list[ControlLog] = []
         reading = np.array([seconds(lambda: logs.append(read_log(path))) for _ in range(repeats)])
-        took = np.array([seconds(lambda: _replay(path, target)) for _ in range(repeats)])
+        took = np.array([seconds(lambda: _replay(path)) for _ in range(repeats)])
         duration = len(logs[0]) * PERIOD
     return Benchmark(
         name="replay_rtf",
@@ -125,7 +124,7 @@ def replay_rtf(simulated: float = 10.0, repeats: int = 5) -> Benchmark:
     )
 
 
-def _replay(path: Path, target: DpsAlone) -> None:
-    report = replay(path, target)
+def _replay(path: Path) -> None:
+    report = replay(path)
     if not report.identical:
         raise RuntimeError(f"the replay is not identical: {report}")

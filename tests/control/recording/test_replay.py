@@ -118,7 +118,28 @@ def test_a_dps_that_waits_to_begin_waits_in_the_replay(tmp_path: Path) -> None:
     assert report.times[29] == 0.0 and report.times[30] == PERIOD
 
 
-def test_what_the_dps_raised_it_raises_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("begun", [True, False])
+def test_replayed_at_once_and_cycle_by_cycle_it_is_the_same_to_the_last_bit(
+    tmp_path: Path, begun: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="vtbdrake.control.recording.replay")
+    servo = Servo(begun=begun)
+
+    def act() -> None:
+        servo.runtime.run(cycles=1)  # so that both signals have come
+        servo.runtime.switch("real")
+        servo.runtime.write({"u.target": [0.3, 1.0 / 3.0], "dps.gain": 4.7})
+
+    log = recorded(tmp_path, servo, act, cycles=1200)
+    at_once, by_cycle = replay(log), replay(log, DpsAlone(servo.scenario))
+    assert "cycle by cycle" not in caplog.text
+    assert at_once.identical and by_cycle.identical and at_once.digests == by_cycle.digests == 2401
+    assert np.array_equal(at_once.times, by_cycle.times)
+    assert np.array_equal(at_once.commands["velocity"], by_cycle.commands["velocity"], equal_nan=True)
+
+
+def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="vtbdrake.control.recording.replay")
     servo = Servo()
 
     def trouble() -> None:
@@ -129,6 +150,7 @@ def test_what_the_dps_raised_it_raises_again(tmp_path: Path) -> None:
     report = replay(recorded(tmp_path, servo, trouble))
     assert report.identical, report
     assert report.errors == dict.fromkeys([31, 32, 33], "RuntimeError: out of ideas")
+    assert "replayed cycle by cycle: " in caplog.text and "out of ideas" in caplog.text
     assert report.times[33] - report.times[29] == pytest.approx(PERIOD)
 
 

@@ -25,8 +25,8 @@ def recorded_target(log: ControlLog) -> Target:
     return DpsAlone(scenario) if log.header.target == DPS else scenario.build()
 
 
-def begin(log: ControlLog, target: Target) -> Context:
-    """A context of ``target`` in the state before the first recorded cycle.
+def begin(log: ControlLog, target: Target, context: Context) -> None:
+    """Brings a context of ``target`` into the state before the first recorded cycle.
 
     Raises:
         LogError: the log is of something else, or what it fed to the DPS came from a simulated world that is not here.
@@ -34,7 +34,6 @@ def begin(log: ControlLog, target: Target) -> Context:
     log.header.check(target.scenario)
     if isinstance(target, DpsAlone) and log.header.target == TESTBED:
         _check_real(log)
-    context = target.default_context()
     try:
         if isinstance(target, DpsAlone) or log.header.target == TESTBED:
             target.restore(context, log.start)
@@ -42,7 +41,6 @@ def begin(log: ControlLog, target: Target) -> Context:
             _restore_dps(target, context, log.start)
     except SnapshotError as error:
         raise LogError(f"the scenario is built in another way than the one of {log.path}: {error}") from error
-    return context
 
 
 def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> None:
