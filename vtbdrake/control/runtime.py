@@ -5,29 +5,27 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from math import floor, inf
 from typing import Any, Self
 
-import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.boundary import RealPorts
-from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, WallClock
-from vtbdrake.control.cycle import RESET, WRITE, Change, Cycle, time_after
+from vtbdrake.control.cycle import RESET, Cycle
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.control.stepped import Stepped
 from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
-from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
 
 _log = logging.getLogger(__name__)
 
 
-class Runtime:
+class Runtime(Stepped):
     """Steps a testbed, or the DPS alone, once per period, with the machine on the other side of a bridge.
 
     A cycle takes in what has arrived, gives it to the DPS, steps it by one period, lets the guards look at its
@@ -62,11 +60,6 @@ class Runtime:
     Attributes:
         cycles: how many there were.
         slow_parts: of the DPS, with their statistics.
-        steps: how many of them the DPS has done.
-        start_time: of the DPS, in seconds, before its first step.
-        idle: whether the DPS alone has not begun yet.
-        initialized: whether the events of initialization have happened; they do in the first step, unless ``context``
-            was given.
     """
 
     def __init__(
@@ -89,41 +82,21 @@ class Runtime:
             raise ValueError(f"the period of a loop is positive and finite, not {period} s")
         if pace is not None and pace not in bridge.sensed:
             raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
-        self.target = target
-        self.bridge = bridge
-        self.period = period
+        super().__init__(target, bridge, period=period, context=context)
         self.clock = clock or WallClock()
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
         self.continuity = dict(continuity or {})
         self.ready = ready
         self.cycles = 0
-        self.steps = 0
         self.pace = pace
-        self.initialized = context is not None
         self._patience = patience * period
         self._watchers = list(watchers)
-        self._simulator = target.simulator(context, restored=context is not None)
-        self._context = self._simulator.get_mutable_context()
-        self.start_time = self._context.get_time()
-        self._ports = RealPorts(target, self._context)
-        self.idle = isinstance(target, DpsAlone)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
-        self._watched: Mapping[str, Reception] = {}
-        self._active: list[str] = []
-        self._changes: list[Change] = []
-        self._fed: dict[str, Any] = {}
-        # How many of each signal's values are known: what is counted beyond that is new.
-        self._sensed = dict.fromkeys(bridge.sensed, 0)
-        self._commanded = dict.fromkeys(bridge.commanded, 0)
-        for name in bridge.commanded:
-            if f"{COMMAND}{name}" not in target.variables():
-                raise ValueError(f"the command {name} comes from inside the testbed, the bridge cannot give it as well")
         self.slow_parts = SlowParts(
             slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.changed
         )
-        self.look()
 
     def close(self) -> None:
         """Ends the processes of slow parts; the last thing to do with it."""
@@ -134,16 +107,6 @@ class Runtime:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def context(self) -> Context:
-        """The target's context; only the thread that runs the cycles may touch it while they run."""
-        return self._context
-
-    @property
-    def time(self) -> float:
-        """The DPS's time in seconds."""
-        return float(self._context.get_time())
 
     @property
     def missed(self) -> int:
@@ -225,17 +188,16 @@ class Runtime:
         self.bridge.poll()
         now = self.clock.now()
         self._serve()
-        if self._commanded:
-            self._take_commands()
+        self.take_commands()
         self.feed()
         self.slow_parts.receive()
-        active = self._active
+        active = self.active
         fed = self.clock.now()
-        error, commands = self._step(active)
+        error, commands = self.step()
         stepped = self.clock.now()
         verdict = self.guards.check(
             now,
-            self._watched,
+            self.watched,
             commands,
             active,
             error=error,
@@ -246,9 +208,8 @@ class Runtime:
             self.bridge.publish(verdict.commands)
         self.slow_parts.send()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
-        done = Cycle(self.cycles, self.time, now, tuple(self._changes), self._fed, commands, verdict)
-        self._changes.clear()
-        self._fed = {}
+        changes, new = self.news()
+        done = Cycle(self.cycles, self.time, now, changes, new, commands, verdict)
         self.cycles += 1
         for watcher in self._watchers[:]:
             try:
@@ -258,85 +219,11 @@ class Runtime:
                 self._watchers.remove(watcher)
         return done
 
-    def _step(self, active: Iterable[str]) -> tuple[BaseException | None, dict[str, Any]]:
-        """Steps by one period; what is raised inside is the guards' business, not the loop's end."""
-        if self.idle:
-            return None, {}
-        self.initialized = True
-        try:
-            self._simulator.AdvanceTo(time_after(self.steps + 1, start=self.start_time, period=self.period))
-            self.steps += 1
-            return None, self._ports.commands(active)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            # The time stays where it was: the step is tried again in the next cycle.
-            return error, {}
-
-    def begin(self) -> None:
-        """Lets the DPS alone be stepped, and command."""
-        self.idle = False
-        self.look()
-
-    def look(self) -> None:
-        """Looks which signals are on real: sensor signals are watched, actuator signals commanded.
-
-        To be called after a switch was thrown by other means than `perform`, unless `run` or a `request` did.
-        """
-        sensed = self.bridge.sensed
-        self._active = [] if self.idle else self._ports.active()
-        if isinstance(self.target, DpsAlone):
-            self._watched = {} if self.idle else sensed
-        else:
-            positions = self.target.positions(self._context)["sense"]
-            self._watched = {name: sensed[name] for name, position in positions.items() if position == REAL}
-
-    def feed(self) -> None:
-        """Gives samples that are new to the DPS's real ports."""
-        for name, reception in self.bridge.sensed.items():
-            if reception.count != self._sensed[name]:
-                self._sensed[name] = reception.count
-                self._ports.feed(name, reception.value)
-                self._fed[name] = reception.value
-
-    def _take_commands(self) -> None:
-        for name, reception in self.bridge.commanded.items():
-            if reception.count != self._commanded[name]:
-                self._commanded[name] = reception.count
-                address = f"{COMMAND}{name}"
-                try:
-                    self.write({address: np.reshape(reception.value, self.target.variables()[address].shape)})
-                except ValueError:
-                    reception.reject("refused")
-
-    def write(self, values: Mapping[str, Any]) -> None:
-        """Sets variables by address, in the thread that runs the cycles, or between them; from another one by
-        `request`.
-
-        Raises:
-            ValueError: an address is unknown or a value impossible (nothing has changed), or it is the time or a
-                switch.
-        """
-        for address in values:
-            if address == "time" or address.startswith((T_SENSE, T_ACT)):
-                raise ValueError(f"{address} is not written while the loop runs: switches are thrown by switch()")
-        self.target.write(self._context, values)
-        self.changed(WRITE, values)
-
-    def changed(self, kind: str, values: Mapping[str, Any]) -> None:
-        """Notes for those who watch what has changed the target; see `Change`."""
-        self._changes.append(Change(kind, dict(values)))
-
-    def command(self, name: str) -> Any:
-        """What the DPS would command now, wherever the signal's switch stands; None if the DPS has not begun."""
-        if self.idle:
-            return None
-        port = self.target.dps.GetOutputPort(name)
-        return port.Eval(self.target.dps.GetMyContextFromRoot(self._context))
-
     def send_fallback(self, reason: str) -> None:
         """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""
-        verdict = self.guards.fault(reason, self.clock.now(), self._watched)
+        verdict = self.guards.fault(reason, self.clock.now(), self.watched)
         # The guards know what was on real in the last cycle, and give nothing for a signal that has not been commanded.
-        farewell = {name: command for name, command in verdict.commands.items() if name in self._active}
+        farewell = {name: command for name, command in verdict.commands.items() if name in self.active}
         if farewell:
             self.bridge.publish(farewell)
 
@@ -390,7 +277,7 @@ class Runtime:
         Raises:
             SwitchRefusedError: what they latched for is still there.
         """
-        reasons = self.guards.reset(self.clock.now(), self._watched)
+        reasons = self.guards.reset(self.clock.now(), self.watched)
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
         self.changed(RESET, {})
