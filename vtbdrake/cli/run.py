@@ -171,8 +171,10 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
 def _record(stack: ExitStack, runtime: Runtime, path: Path) -> None:
     from vtbdrake.control.recording.recorder import Recorder
 
-    recorder = stack.enter_context(Recorder(runtime, path))
-    stack.callback(lambda: click.echo(f"recorded to {path}; {recorder.lost} frames lost"))
+    recorder = Recorder(runtime, path)
+    # Told when it is closed, for then it is known.
+    stack.callback(lambda: click.echo(f"recorded to {path}; {recorder.lost} cycles lost"))
+    stack.enter_context(recorder)
 
 
 @contextmanager
