@@ -145,7 +145,7 @@ def test_it_ends_when_the_time_is_up_and_writes_what_it_measured_and_recorded(hu
     assert told.period == PERIOD
     # One command in each cycle but those before the machine spoke, and the farewell.
     assert told.cycles + 1 >= len(ear.listen()) / 2 > 1
-    assert f"recorded to {tmp_path / 'log.lcm'}; 0 frames lost" in output
+    assert f"recorded to {tmp_path / 'log.lcm'}; 0 cycles lost" in output
     assert (tmp_path / "log.lcm").stat().st_size > 0
 
 
