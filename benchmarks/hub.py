@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.measure import LOWER, Benchmark
 from vtbdrake.control.hub import Hub
+from vtbdrake.control.realtime import RealTime
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,6 +39,7 @@ def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: i
     hub."""
     times: dict[str, list[float]] = {"hub": [], "naive": [], "echo": []}
     with Hub(port=0) as hub, _naive_hub() as naive_url, contextlib.ExitStack() as stack:
+        rights = stack.enter_context(RealTime(priority=None, lock_memory=False))
         ours, naive, pinger = lcm.LCM(hub.url), lcm.LCM(naive_url), lcm.LCM(hub.url)
         for bus, channel in ((ours, "SELF"), (naive, "SELF"), (pinger, "PONG")):
             bus.subscribe(channel, lambda *_: None)
@@ -57,7 +59,12 @@ def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: i
             goal=GOAL,
             better=LOWER,
             against=f"{against}: {1e3 * p50['naive']:.3g} ms",
-            note="; ".join(f"{name}: {_percentiles(values)}" for name, values in times.items()),
+            note="; ".join(
+                [
+                    *(f"{name}: {_percentiles(values)}" for name, values in times.items()),
+                    *(str(grant) for grant in rights.grants if not grant.granted),
+                ]
+            ),
         ),
         Benchmark(
             name="hub_echo_round_trip_p50",

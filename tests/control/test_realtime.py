@@ -18,6 +18,8 @@ from vtbdrake.control.realtime import RealTime
 
 ROOT = Path(__file__).resolve().parents[2]
 
+LATENCY = "/dev/cpu_dma_latency"  # us that a processor may take to wake up
+
 STATE = """
 import ctypes, gc, json, os, re, sys
 from vtbdrake.control.realtime import RealTime, RealTimeError
@@ -57,7 +59,7 @@ def told(code: str) -> dict[str, Any]:
 
 
 def may_schedule() -> bool:
-    return told("r = RealTime()\nwith r: pass\ntell(all=all(g.granted for g in r.grants))")["all"]
+    return told("r = RealTime(awake=False)\nwith r: pass\ntell(all=all(g.granted for g in r.grants))")["all"]
 
 
 privileged = pytest.mark.skipif(
@@ -70,7 +72,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give up ri
 def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
     states = told(
         "before = state()\n"
-        "with RealTime(priority=42, cpus={before['cpus'][0]}) as r: inside = state()\n"
+        "with RealTime(priority=42, cpus={before['cpus'][0]}, awake=False) as r: inside = state()\n"
         "tell(before=before, inside=inside, after=state(), granted=[g.granted for g in r.grants])"
     )
     assert states["granted"] == [True] * 6
@@ -81,6 +83,16 @@ def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
     assert inside["cpus"] == states["before"]["cpus"][:1]
     assert inside["locked"] and inside["frozen"] and not inside["collects"]
     assert inside["switch"] == pytest.approx(5e-5)
+
+
+@pytest.mark.skipif(not os.access(LATENCY, os.W_OK), reason=f"needs {LATENCY}")
+def test_processors_are_kept_awake_inside_only() -> None:
+    allowed = told(
+        f"def allowed(): return int.from_bytes(open('{LATENCY}', 'rb').read(4), 'little')\n"
+        "with RealTime(priority=None, lock_memory=False): inside = allowed()\n"
+        "tell(inside=inside, after=allowed())"
+    )
+    assert allowed["inside"] == 0 < allowed["after"]
 
 
 @privileged
@@ -134,6 +146,7 @@ def test_without_rights_the_refusals_tell_reason_and_remedy_and_the_rest_is_gran
     assert "rtprio in /etc/security/limits.conf" in lines["SCHED_FIFO 80"]
     assert lines["locked memory"].startswith("locked memory: refused (ENOMEM, ")
     assert "memlock unlimited" in lines["locked memory"]
+    assert lines["processors stay awake"].startswith("processors stay awake: refused (E")
     assert lines["no garbage collection"] == "no garbage collection: granted"
     assert lines["switch interval 50 us"] == "switch interval 50 us: granted"
     assert states["inside"]["slack"] == 1
@@ -183,7 +196,7 @@ def test_processors_that_may_not_be_used_are_refused() -> None:
 def test_what_is_not_asked_for_is_left_alone() -> None:
     states = told(
         "before = state()\n"
-        "only = RealTime(priority=None, lock_memory=False, collect_garbage=True, switch_interval=None)\n"
+        "only = RealTime(priority=None, lock_memory=False, awake=False, collect_garbage=True, switch_interval=None)\n"
         "with only as r: inside = state()\n"
         "tell(before=before, inside=inside, requests=[g.request for g in r.grants])"
     )

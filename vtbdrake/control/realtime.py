@@ -59,6 +59,8 @@ class RealTime:
         lock_memory: whether to keep present and future memory from being paged out. Under a limit of locked memory (see
             ``ulimit -l``), later allocations fail when it is reached.
         cpus: the processors to run on; None leaves them alone.
+        awake: whether to keep all processors from sleeping when they have nothing to do: one that slept wakes up late.
+            It costs power.
         collect_garbage: whether Python's garbage collector goes on. What refers to itself is not freed while it rests.
         switch_interval: after how many seconds a thread that waits for the GIL asks for it; None leaves it alone.
         require: whether a refusal is an error.
@@ -73,6 +75,7 @@ class RealTime:
         priority: int | None = 80,
         lock_memory: bool = True,
         cpus: set[int] | None = None,
+        awake: bool = True,
         collect_garbage: bool = False,
         switch_interval: float | None = 5e-5,
         require: bool = False,
@@ -88,6 +91,8 @@ class RealTime:
         self._requests: list[tuple[str, Callable[[], AbstractContextManager[None]], str]] = []
         if cpus is not None:
             self._requests.append((f"processors {sorted(cpus)}", partial(_affinity, frozenset(cpus)), _CPUS))
+        if awake:
+            self._requests.append(("processors stay awake", _awake, _AWAKE))
         if lock_memory:
             self._requests.append(("locked memory", _locked_memory, _MEMORY))
         if not collect_garbage:
@@ -123,6 +128,8 @@ class RealTime:
         return "\n".join(map(str, self.grants))
 
 
+_LATENCY = "/dev/cpu_dma_latency"
+
 _FIFO = (
     "run as root, or give the user rtprio in /etc/security/limits.conf, or the container --cap-add SYS_NICE "
     "--ulimit rtprio=99"
@@ -132,6 +139,7 @@ _MEMORY = (
     "--ulimit memlock=-1"
 )
 _CPUS = "choose from those that the process may use (os.sched_getaffinity(0)), or widen the container's cpuset"
+_AWAKE = f"run as root, or let the user write to {_LATENCY}; in a container, --device {_LATENCY}"
 _SLACK = "use a kernel that has PR_SET_TIMERSLACK"
 
 
@@ -156,6 +164,14 @@ def _affinity(cpus: frozenset[int]) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
+
+
+@contextmanager
+def _awake() -> Iterator[None]:
+    # The kernel's PM QoS interface: 0 us are allowed for waking up, as long as the file is open.
+    with open(_LATENCY, "wb", buffering=0) as file:
+        file.write(bytes(4))
+        yield
 
 
 @contextmanager
