@@ -93,8 +93,9 @@ class Stepper:
 
 
 @pytest.fixture(scope="module")
-def running(hub: Hub) -> Iterator[Stepper]:
-    with MachineProcess(RobotScenario(), hub.url, lock_step=True, values=PUSHED) as process:
+def running() -> Iterator[Stepper]:
+    """On a bus of its own, for it lives on and would answer the commands of other tests."""
+    with Hub(port=0) as hub, MachineProcess(RobotScenario(), hub.url, lock_step=True, values=PUSHED) as process:
         yield Stepper(hub.url, process)
 
 
