@@ -11,6 +11,7 @@ from typing import Any
 
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import JOINTS
+from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.guard import Guards
@@ -32,8 +33,6 @@ WARM_UP = 200  # cycles before each round that do not count
 PATIENCE = 1.0  # s that a sensor signal may be old
 # Of the machine's joints, in N m s/rad: with so much of it, no stall of the loop lets it come to any harm.
 FRICTION = {"sim.act.drives.viscous": [40.0] * JOINTS}
-# From how far away (N m) the command may depart: the guards' rate limit takes it from there.
-CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
 
 
 class TimedRuntime(Runtime):

@@ -11,11 +11,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
 
-from benchmarks.loop_rig import CONTINUITY, PERIOD
+from benchmarks.loop_rig import PERIOD
 from benchmarks.measure import LOWER, Benchmark, seconds
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
+from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.machine import MachineProcess

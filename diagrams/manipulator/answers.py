@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
 from diagrams.answers import Answer
-from diagrams.manipulator.safety import CONTINUITY, arm_guards
 from diagrams.manipulator.scenario import ManipulatorScenario
 from diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 from vtbdrake.control.bridge import Bridge
@@ -131,17 +129,8 @@ class _Real:
         self.commands: list[NDArray[np.float64]] = []
         self._bridge = _bridge(scenario, hub)
         self._machine = MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED)
-        self.loop = Runtime(
-            target,
-            self._bridge,
-            context=context,
-            guards=arm_guards(scenario, aging=False, max_missed=inf),
-            # The last message of a cycle: all the others are there.
-            pace="wrench",
-            patience=PATIENCE / scenario.period,
-            continuity=CONTINUITY,
-            watchers=(self._take_down,),
-        )
+        operation = scenario.operation().in_lock_step("wrench", wait=PATIENCE)
+        self.loop = operation.runtime(target, self._bridge, context=context, watchers=(self._take_down,))
 
     def __enter__(self) -> _Real:
         self._machine.start()

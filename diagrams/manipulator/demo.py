@@ -8,11 +8,11 @@ import signal
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
-from diagrams.manipulator.safety import CONTINUITY, arm_guards
 from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
@@ -20,6 +20,7 @@ from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.machine import MachineProcess
+from vtbdrake.control.operation import Operation
 from vtbdrake.control.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
@@ -105,7 +106,7 @@ class Demo:
         return track, loop
 
     def _shadow(self, simulated: Runtime) -> Runtime:
-        loop = Runtime(self.testbed, self.bridge, context=simulated.context, continuity=CONTINUITY)
+        loop = self._operation().runtime(self.testbed, self.bridge, context=simulated.context)
         self._switch(loop, "shadow")
         loop.run(seconds=1.0)
         command = loop.command("joint_torque")
@@ -115,16 +116,15 @@ class Demo:
 
     def _strip(self, shadowed: Runtime) -> Runtime:
         alone = DpsAlone(self.scenario)
-        loop = Runtime(
-            alone,
-            self.bridge,
-            context=alone.continue_from(self.testbed, shadowed.context),
-            continuity=CONTINUITY,
-            guards=arm_guards(self.scenario, max_missed=MAX_MISSED),
-            watchers=(self.attendant,),
-        )
+        context = alone.continue_from(self.testbed, shadowed.context)
+        loop = self._operation().runtime(alone, self.bridge, context=context, watchers=(self.attendant,))
         self._switch(loop, "real")
         return loop
+
+    def _operation(self) -> Operation:
+        """A new one each time, for its fallback has a memory."""
+        operation = self.scenario.operation()
+        return replace(operation, guards={**operation.guards, "max_missed": MAX_MISSED})
 
     def _switch(self, loop: Runtime, mode: str) -> None:
         """Tried again where something was late just now."""

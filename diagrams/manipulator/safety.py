@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from math import inf
 from typing import Any
 
 import casadi
@@ -14,9 +12,7 @@ from numpy.typing import NDArray
 from diagrams.manipulator.arm import JOINTS, Arm
 from diagrams.manipulator.dynamics import ArmDynamics, function
 from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.fallback import Fallback, FallbackController, Zero
-from vtbdrake.control.guard import Guards
 
 # The switch to real is refused where the command is further than this from the measured torque (N m).
 CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
@@ -60,16 +56,3 @@ class FloatInPlace:
 def arm_fallback() -> dict[str, Fallback]:
     """What commands the arm after a fault: it floats in place."""
     return {"joint_torque": FallbackController(FloatInPlace(), otherwise=Zero())}
-
-
-def arm_guards(scenario: ManipulatorScenario, *, aging: bool = True, **options: Any) -> Guards:
-    """Guards that let the arm float in place after a fault.
-
-    Args:
-        aging: False where time stands still between two messages, in lock-step: sensor signals may be of any age.
-        options: those of `Guards`.
-    """
-    interface = scenario.interface()
-    if not aging:
-        interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
-    return Guards(interface, scenario.period, fallback=arm_fallback(), **options)

@@ -14,6 +14,7 @@ from diagrams.manipulator.dps import gravity_torque, make_dps
 from diagrams.manipulator.dynamics import ArmDynamics
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import HOME, MOTIONS
+from diagrams.manipulator.safety import CONTINUITY, arm_fallback
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import (
     ErrorModel,
@@ -151,8 +152,6 @@ class ManipulatorScenario(Scenario):
 
     def operation(self) -> Operation:
         """How the DPS is run on the arm: after a fault, the arm floats in place."""
-        from diagrams.manipulator.safety import CONTINUITY, arm_fallback
-
         return Operation(period=self.period, guards={"fallback": arm_fallback()}, continuity=CONTINUITY)
 
     def residuals(self) -> ResidualConfig:

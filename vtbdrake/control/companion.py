@@ -72,12 +72,13 @@ class Channel:
             self._received += self._frames.feed(data)
         return self._received.popleft()
 
-    def send(self, data: bytes) -> None:
-        """
+    def send(self, *parts: bytes) -> None:
+        """Sends one frame, of the parts' bytes one after another.
+
         Raises:
             OSError: the other end is closed.
         """
-        self._line.sendall(_LENGTH.pack(len(data)) + data)
+        self._line.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
 
 class Companion:
@@ -216,6 +217,13 @@ class Companion:
         """What becomes readable when frames come back."""
         return self._line.fileno()
 
+    def drain(self, timeout: float = 10.0) -> None:
+        """Waits until all that waits is sent, for ``timeout`` seconds at most."""
+        end = time.monotonic() + timeout
+        while self._waiting and self.alive and (left := end - time.monotonic()) > 0.0:
+            select.select((), (self._line,), (), left)
+            self.flush()
+
     def close(self, timeout: float = 10.0) -> int:
         """Sends what waits, tells it the end, and waits for it; after ``timeout`` seconds it is killed.
 
@@ -223,9 +231,7 @@ class Companion:
             The exit code; negative if a signal ended it.
         """
         end = time.monotonic() + timeout
-        while self._waiting and not self._gone and (left := end - time.monotonic()) > 0.0:
-            select.select((), (self._line,), (), left)
-            self.flush()
+        self.drain(timeout)
         try:
             self._line.shutdown(socket.SHUT_WR)
         except OSError as error:

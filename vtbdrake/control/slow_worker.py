@@ -36,7 +36,7 @@ def keep(channel: Channel, function: bytes, patience: float, name: str) -> None:
             reason = _pass_on(channel, worker, patience)
         finally:
             worker.kill()
-        channel.send(b"".join(pack((LOST, reason))))
+        channel.send(*pack((LOST, reason)))
         _pause(channel, begin + patience - time.monotonic())
 
 
@@ -77,14 +77,14 @@ def serve(channel: Channel, function: bytes) -> None:
         function: a `SlowFunction`, by cloudpickle.
     """
     compute = pickle.loads(function)
-    channel.send(b"".join(pack((READY, None))))
+    channel.send(*pack((READY, None)))
     while True:
         tick, arrays = unpack(channel.receive())
         try:
             answer = RESULT, (tick, compute(arrays))
         except Exception:
             answer = ERROR, (tick, traceback.format_exc())
-        channel.send(b"".join(pack(answer)))
+        channel.send(*pack(answer))
 
 
 def pack(message: Any) -> list[Any]:

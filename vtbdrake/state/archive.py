@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import zipfile
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
@@ -29,7 +31,21 @@ def write_archive(
     arrays: Mapping[str, np.ndarray],
 ) -> None:
     """Writes ``arrays`` and ``header`` (plain data) as a file of ``kind``."""
-    with whole_file(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+    with whole_file(path) as partial:
+        _write(partial, kind, version, header, arrays)
+
+
+def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """What `write_archive` would write."""
+    buffer = io.BytesIO()
+    _write(buffer, kind, version, header, arrays)
+    return buffer.getvalue()
+
+
+def _write(
+    file: Path | IO[bytes], kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, **header}))
         for key, value in arrays.items():
             with archive.open(f"{key}.npy", "w") as entry:
@@ -37,16 +53,17 @@ def write_archive(
 
 
 def read_archive(
-    path: str | os.PathLike[str], *, kind: str, version: int
+    source: str | os.PathLike[str] | bytes, *, kind: str, version: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, arrays) of what `write_archive` wrote.
+    """(header, arrays) of what `write_archive` wrote, or of the bytes of it.
 
     Raises:
         FileNotFoundError: there is no such file.
         ArchiveError: it is damaged, of another kind, or of another version.
     """
+    path = f"an archive of {len(source)} bytes" if isinstance(source, bytes) else source
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
             header = json.loads(archive.read(_HEADER))
             if not isinstance(header, dict) or (header.get("kind"), header.get("version")) != (kind, version):
                 raise ArchiveError(f"{path} is not a {kind} of version {version}, but says of itself: {header}")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state.archive import read_archive, write_archive
+from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
 from vtbdrake.state.kinds import is_camera, is_plant, is_scene_graph
 from vtbdrake.state.systems import group_size, is_python, leaves, read_group, write_group
@@ -76,19 +76,25 @@ class Snapshot:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one file (a zip of .npy arrays and a JSON header), whole or not at all."""
+        write_archive(path, kind=KIND, version=VERSION, **self._parts())
+
+    def to_bytes(self) -> bytes:
+        """What `save` would write."""
+        return archive_bytes(kind=KIND, version=VERSION, **self._parts())
+
+    def _parts(self) -> dict[str, Any]:
         arrays = {f"values/{key}": value for key, value in self.values.items()}
         arrays |= {f"groups/{key}": value for key, value in self.groups.items()}
-        header = {"time": self.time, "scenario": dict(self.scenario)}
-        write_archive(path, kind=KIND, version=VERSION, header=header, arrays=arrays)
+        return {"header": {"time": self.time, "scenario": dict(self.scenario)}, "arrays": arrays}
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Snapshot:
-        """Reads what `save` wrote.
+    def load(cls, source: str | os.PathLike[str] | bytes) -> Snapshot:
+        """Reads what `save` wrote, or `to_bytes` gave.
 
         Raises:
-            ArchiveError: the file is not a snapshot, is damaged, or was written by another version.
+            ArchiveError: it is not a snapshot, is damaged, or was written by another version.
         """
-        header, arrays = read_archive(path, kind=KIND, version=VERSION)
+        header, arrays = read_archive(source, kind=KIND, version=VERSION)
         parts: dict[str, dict[str, np.ndarray]] = {"values": {}, "groups": {}}
         for name, array in arrays.items():
             part, key = name.split("/", 1)

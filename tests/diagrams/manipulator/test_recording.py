@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, SWING
-from diagrams.manipulator.safety import CONTINUITY, arm_guards
 from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.hub import Hub
 from vtbdrake.control.machine import MachineProcess
@@ -19,7 +17,6 @@ from vtbdrake.control.protocol import protocol_of
 from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.recorder import Recorder
 from vtbdrake.control.recording.replay import replay
-from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone
 
 PATIENCE = 60.0  # s
@@ -37,14 +34,7 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
     """By the DPS alone, as it was recorded, and in the whole testbed; against a machine with other parameters."""
     scenario = ManipulatorScenario(law=law)
     bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
-    runtime = Runtime(
-        DpsAlone(scenario),
-        bridge,
-        guards=arm_guards(scenario, aging=False, max_missed=inf),
-        pace="wrench",
-        patience=PATIENCE / scenario.period,
-        continuity=CONTINUITY,
-    )
+    runtime = scenario.operation().in_lock_step("wrench", wait=PATIENCE).runtime(DpsAlone(scenario), bridge)
     path = tmp_path / "run.lcm"
     with (
         Recorder(runtime, path, digest_period=0.02),

@@ -25,6 +25,8 @@ from math import isfinite
 from operator import methodcaller
 from typing import Any
 
+from vtbdrake.control.json_object import json_object
+
 SET, GET, WATCH = "VTB_SET", "VTB_GET", "VTB_WATCH"
 WATCHED = "VTB_WATCHED/"
 ANSWER = "_ANSWER"
@@ -107,13 +109,7 @@ def parse(channel: str, data: bytes) -> Request:
 def _parsed(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_LENGTH:
         raise RequestError(f"a request has at most {MAX_LENGTH} bytes, not {len(data)}")
-    try:
-        message = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise RequestError(f"a request is JSON, which this is not: {error}") from None
-    if not isinstance(message, dict):
-        raise RequestError(f"a request is a JSON object, not {_short(message)}")
-    return message
+    return json_object(data, RequestError, show=_short)
 
 
 def _only(message: dict[str, Any], what: str, *others: str) -> Any:

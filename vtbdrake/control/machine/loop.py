@@ -12,6 +12,7 @@ from math import inf
 from typing import Any
 
 from vtbdrake.control.clock import Clock, WallClock
+from vtbdrake.control.json_object import json_object
 from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.machine.faults import FaultError, fault_from_dict
 from vtbdrake.control.machine.machine import Machine
@@ -231,7 +232,7 @@ class MachineLoop:
 
     def _answer(self, text: bytes) -> dict[str, Any]:
         try:
-            more = self._do(_parsed(text))
+            more = self._do(json_object(text, FaultError))
         except ValueError as error:
             _log.warning("request refused: %s", error)
             return {"error": str(error)}
@@ -265,16 +266,6 @@ class MachineLoop:
                 f"cannot be {request!r}"
             )
         return {}
-
-
-def _parsed(text: bytes) -> dict[str, Any]:
-    try:
-        request = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FaultError(f"a request is JSON, which this is not: {error}") from None
-    if not isinstance(request, dict):
-        raise FaultError(f"a request is a JSON object, not {request!r}")
-    return request
 
 
 def _values(given: Any) -> dict[str, Any]:

@@ -37,7 +37,6 @@ from vtbdrake.control.recording.log_format import (
     LogError,
 )
 from vtbdrake.control.recording.log_header import LogHeader
-from vtbdrake.control.recording.start import snapshot_of
 from vtbdrake.state import Snapshot
 from vtbdrake.state.archive import ArchiveError
 
@@ -114,7 +113,7 @@ def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         if not events.on(STATE):
             raise LogError(f"{path} cannot be used: the state before the first cycle is not there")
         state = decode(lcmt_vtb_state, events.data(*events.on(STATE)[0][2:]))
-        return LogHeader.from_json(header.header), snapshot_of(state.snapshot)
+        return LogHeader.from_json(header.header), Snapshot.load(state.snapshot)
     except (MalformedError, ArchiveError) as error:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import select
 import time
 import zlib
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from vtbdrake.control.recording.log_format import CHANGE, DIGEST, END, FAULT, LO
 from vtbdrake.control.recording.log_header import LogHeader
 from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.log_writer import Loss, write_log
-from vtbdrake.control.recording.start import check_recordable, snapshot_bytes
+from vtbdrake.control.recording.start import check_recordable
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.state import snapshot as snapshots
 
@@ -189,7 +188,7 @@ class Recorder:
         target = runtime.target
         message = lcmt_vtb_state()
         message.utime = self._utime()
-        message.snapshot = snapshot_bytes(snapshots.take(target.diagram, runtime.context, target.variables()))
+        message.snapshot = snapshots.take(target.diagram, runtime.context, target.variables()).to_bytes()
         message.size = len(message.snapshot)
         return self._single(STATE, message)
 
@@ -206,7 +205,8 @@ class Recorder:
         self._runtime.unwatch(self)
         if self._runtime.bridge.tap == self._tap:
             self._runtime.bridge.tap = self._next_tap
-        self._drain()
+        # So that there is room for the last frame.
+        self._companion.drain()
         self._take_losses()
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
@@ -219,13 +219,6 @@ class Recorder:
             self._missing = self._recorded - self._arrived()
         if self.lost:
             _log.error("%d of %d cycles are not in %s", self.lost, self._recorded, self.path)
-
-    def _drain(self, timeout: float = 10.0) -> None:
-        """Waits until there is room for the last frame."""
-        companion, end = self._companion, time.monotonic() + timeout
-        while companion.waiting and companion.alive and (left := end - time.monotonic()) > 0.0:
-            select.select((), (companion,), (), left)
-            companion.flush()
 
     def _arrived(self) -> int:
         try:

@@ -19,8 +19,7 @@ from vtbdrake.control.recording.log_header import kind_of
 from vtbdrake.control.recording.replay_report import Difference, differences
 from vtbdrake.control.recording.replay_start import Target, begin
 from vtbdrake.control.switching import throw
-from vtbdrake.state.systems import leaves
-from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed import VirtualTestbed, slow_parts
 
 TICK = "tick"
 """Of the values of a result: the number of its sample."""
@@ -43,9 +42,7 @@ class ReplayRun:
         target.write(context, values)
         self._simulator = self._new_simulator()
         self._ports = RealPorts(target, context)
-        self._slow_parts: dict[str, Any] = {
-            p: system for p, system in leaves(target.diagram) if hasattr(system, "deliver")
-        }
+        self._slow_parts = slow_parts(target.diagram)
         self._idle, self._steps = header.idle, header.steps
         self._digest = StateDigest(target, context)
         self._readers = {address: target.reader(address) for address in record}

@@ -1,12 +1,8 @@
-"""What a recording begins with: the state of what is stepped, as bytes and back."""
+"""Whether a recording can begin."""
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.state import Snapshot
 
 
 def check_recordable(runtime: Runtime) -> None:
@@ -33,23 +29,3 @@ def check_recordable(runtime: Runtime) -> None:
                 f"sensor signal {signal.name} is abstract, and the message with its present value was not recorded: "
                 "begin to record before the bridge is opened"
             )
-
-
-def snapshot_bytes(snapshot: Snapshot) -> bytes:
-    """The file that `Snapshot.save` writes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "start"
-        snapshot.save(path)
-        return path.read_bytes()
-
-
-def snapshot_of(data: bytes) -> Snapshot:
-    """The inverse of `snapshot_bytes`.
-
-    Raises:
-        ArchiveError: the bytes are damaged.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "start"
-        path.write_bytes(data)
-        return Snapshot.load(path)

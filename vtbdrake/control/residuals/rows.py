@@ -90,7 +90,7 @@ class Sampler:
         """Whether the DPS is fed by the machine alone, so that what it believes is about the machine."""
         target = self._runtime.target
         if not isinstance(target, VirtualTestbed):
-            return self._runtime.command(next(iter(self._layout.command))) is not None
+            return not self._runtime.idle
         return set(target.positions(self._runtime.context)["sense"].values()) == {REAL}
 
     def fill(self, rows: Array, cycle: Cycle) -> int:
