@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -254,10 +255,27 @@ sys.stdin.read()
             url = f"tcpq://127.0.0.1:{server.getsockname()[1]}"
             with closing(TcpqConnection(url, {}, PATIENCE)) as connection, pytest.raises(BlockingIOError):
                 for _ in range(1000):
-                    connection.publish("A", bytes(100_000))
+                    connection.publish([("A", bytes(100_000))])
         finally:
             frozen.kill()
             frozen.communicate()
+
+
+def test_messages_that_leave_together_arrive_in_order_and_stamped_with_their_arrival(hub: Hub) -> None:
+    messages = [("A", b"1"), ("B", b"2"), ("A", b"")]
+    heard: list[tuple[str, bytes]] = []
+    handlers = dict.fromkeys("AB", lambda *message: heard.append(message))
+    with (
+        closing(TcpqConnection(hub.url, {}, PATIENCE)) as sender,
+        closing(TcpqConnection(hub.url, handlers, PATIENCE, stamped=True)) as receiver,
+    ):
+        begin = time.monotonic()
+        sender.publish(messages)
+        select.select([receiver], [], [], PATIENCE)
+        there = time.monotonic()
+        assert receiver.arrived is None
+        assert (receiver.take(10), heard) == (3, messages)
+        assert begin < receiver.arrived < there
 
 
 def test_frozen_hub_is_not_lost_and_not_waited_for(hub: Hub, user_types: ModuleType) -> None:

@@ -155,19 +155,20 @@ class LcmBridge(Bridge):
                 f"{', '.join(self.sent)}"
             )
         self._utime = max(self._utime + 1, round((self._time_of_day + time.monotonic()) * 1e6))
-        for outlet in self._outlets:
-            data = outlet.message(commands, self._utime)
-            if data is None:
-                continue
-            watch = self._watches.get(outlet.channel)
-            if watch is not None:
+        leaving = [
+            (outlet, data) for outlet in self._outlets if (data := outlet.message(commands, self._utime)) is not None
+        ]
+        if not leaving:
+            return
+        for outlet, data in leaving:
+            if (watch := self._watches.get(outlet.channel)) is not None:
                 watch.expect(data)
-            problem = "" if self._link.publish(outlet.channel, data) else "no bus"
-            if not problem and outlet.channel in self._ownership.foreign:
-                # It has left all the same: the hub lets it pass as soon as the channel is free.
-                problem = "refused"
-            outlet.count(problem)
-            if problem != "no bus" and self.tap is not None:
+        left = self._link.publish(*[(outlet.channel, data) for outlet, data in leaving])
+        for outlet, data in leaving:
+            # What is refused has left all the same: the hub lets it pass as soon as the channel is free.
+            refused = "refused" if outlet.channel in self._ownership.foreign else ""
+            outlet.count(refused if left else "no bus")
+            if left and self.tap is not None:
                 self.tap(outlet.channel, data)
 
     def _tapped(self, inlet: Inlet) -> Handler:
@@ -186,8 +187,7 @@ class LcmBridge(Bridge):
         """
         if not self.url.startswith(_HUB):
             raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to take over")
-        for outlet in self._outlets:
-            self._link.publish(TAKE_PREFIX + outlet.channel, b"")
+        self._link.publish(*[(TAKE_PREFIX + outlet.channel, b"") for outlet in self._outlets])
 
 
 def _signals(signals: Sequence[Signal], map: LcmMap, kind: str) -> list[Signal]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import socket
 import struct
+import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from urllib.parse import urlsplit
 
 import lcm
@@ -32,6 +33,8 @@ _LONGEST_MESSAGE = 1 << 28  # LCM_MAX_MESSAGE_SIZE
 _RECEIVE = 1 << 16
 _WORDS = struct.Struct(">II")
 _HEAD = 12  # bytes of a publication beside its channel and its data
+_SO_TIMESTAMPNS = 35  # <asm-generic/socket.h>; the type of the control message, too
+_TIMESPEC = struct.Struct("@ll")
 
 
 class Connection(ABC):
@@ -39,9 +42,12 @@ class Connection(ABC):
 
     Attributes:
         name: under which a hub knows it; None where there is no hub.
+        arrived: when the message that is handed on had arrived at this computer, by `time.monotonic`; if it was to be
+            stamped and can be, else None.
     """
 
     name: str | None = None
+    arrived: float | None = None
 
     @abstractmethod
     def fileno(self) -> int:
@@ -56,10 +62,11 @@ class Connection(ABC):
         """
 
     @abstractmethod
-    def publish(self, channel: str, data: bytes) -> None:
-        """
+    def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
+        """Publishes messages, each a channel and its bytes.
+
         Raises:
-            BlockingIOError: the bus takes nothing at present; the message is dropped.
+            BlockingIOError: the bus takes nothing at present; the messages are dropped.
             OSError: the connection is lost.
         """
 
@@ -67,14 +74,17 @@ class Connection(ABC):
     def close(self) -> None: ...
 
 
-def connect(url: str, handlers: Mapping[str, Handler], timeout: float) -> Connection:
+def connect(url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> Connection:
     """A connection to the bus at ``url``, subscribed to the channels of ``handlers``.
+
+    Args:
+        stamped: whether the kernel is to stamp what arrives; it does for tcpq.
 
     Raises:
         OSError: there is no bus.
     """
     if url.startswith("tcpq://"):
-        return TcpqConnection(url, handlers, timeout)
+        return TcpqConnection(url, handlers, timeout, stamped=stamped)
     return LibraryConnection(url, handlers)
 
 
@@ -99,8 +109,9 @@ class LibraryConnection(Connection):
             count += 1
         return count
 
-    def publish(self, channel: str, data: bytes) -> None:
-        self._lcm.publish(channel, data)
+    def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
+        for channel, data in messages:
+            self._lcm.publish(channel, data)
 
     def close(self) -> None:
         del self._lcm
@@ -114,7 +125,7 @@ class TcpqConnection(Connection):
     told.
     """
 
-    def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float) -> None:
+    def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
         self._handlers = {channel.encode(): (channel, handler) for channel, handler in handlers.items()}
         self._reader = Reader(max_message=_LONGEST_MESSAGE)
         self._reader.greeted = True  # the hub's greeting is read below; what follows has the form of a client's records
@@ -128,10 +139,13 @@ class TcpqConnection(Connection):
             for channel in handlers:
                 name = _literally(channel).encode()
                 self._socket.sendall(_WORDS.pack(SUBSCRIBE, len(name)) + name)
+            if stamped:
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
             self._socket.setblocking(False)
         except OSError:
             self._socket.close()
             raise
+        self._receive = self._receive_stamped if stamped else self._socket.recv
 
     def _greet(self) -> None:
         self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
@@ -152,7 +166,7 @@ class TcpqConnection(Connection):
         chunk_size = _RECEIVE
         while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
             try:
-                chunk = self._socket.recv(_RECEIVE)
+                chunk = self._receive(_RECEIVE)
             except BlockingIOError:
                 break
             chunk_size = len(chunk)
@@ -165,6 +179,16 @@ class TcpqConnection(Connection):
             count += self._dispatch(limit - count)
         return count
 
+    def _receive_stamped(self, size: int) -> bytes:
+        """Bytes that have arrived; `arrived` is then the time of the last of them."""
+        chunk, ancillary, _, _ = self._socket.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size))
+        stamps = [data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS)]
+        if stamps:
+            seconds, nanoseconds = _TIMESPEC.unpack(stamps[0])
+            age = time.time() - (seconds + 1e-9 * nanoseconds)
+            self.arrived = time.monotonic() - age
+        return chunk
+
     def _dispatch(self, limit: int) -> int:
         records, handlers = self._records, self._handlers
         count = min(limit, len(records))
@@ -175,13 +199,13 @@ class TcpqConnection(Connection):
                 handler(channel, bytes(record[_HEAD + len(name) :]))
         return count
 
-    def publish(self, channel: str, data: bytes) -> None:
+    def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
         if self._unsent:
             self._unsent = self._unsent[self._socket.send(self._unsent) :]
             if self._unsent:
                 raise BlockingIOError("an earlier message is still on its way")
-        record = publication(channel.encode(), data)
-        self._unsent = record[self._socket.send(record) :]
+        records = b"".join([publication(channel.encode(), data) for channel, data in messages])
+        self._unsent = records[self._socket.send(records) :]
 
     def close(self) -> None:
         self._socket.close()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import select
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.lcm_connections import Connection, Handler, connect
@@ -17,9 +18,9 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
 class _Search(threading.Thread):
     """Seeks a bus until it finds one or is cancelled; in a thread of its own, because connecting may take long."""
 
-    def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float) -> None:
+    def __init__(self, connect: Callable[[], Connection]) -> None:
         super().__init__(name="vtbdrake-lcm-search", daemon=True)
-        self._arguments = (url, handlers, timeout)
+        self._connect = connect
         self._cancelled = threading.Event()
         self._lock = threading.Lock()
         self._found: Connection | None = None
@@ -31,7 +32,7 @@ class _Search(threading.Thread):
         pause = FIRST_PAUSE
         while not self._cancelled.is_set():
             try:
-                connection = connect(*self._arguments)
+                connection = self._connect()
             except OSError:
                 self._cancelled.wait(pause)
                 pause = min(2 * pause, LONGEST_PAUSE)
@@ -67,11 +68,14 @@ class LcmLink:
         reconnections: how often it was found again.
     """
 
-    def __init__(self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float) -> None:
+    def __init__(
+        self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float, stamped: bool = False
+    ) -> None:
+        """``stamped``: see `connect`."""
         self.url = url
         self.losses = 0
         self.reconnections = 0
-        self._arguments = (url, handlers, connect_timeout)
+        self._connect = partial(connect, url, handlers, connect_timeout, stamped=stamped)
         self._connection: Connection | None = None
         self._search: _Search | None = None
 
@@ -83,7 +87,7 @@ class LcmLink:
         if self.is_open:
             return
         try:
-            self._connection = connect(*self._arguments)
+            self._connection = self._connect()
         except OSError as error:
             remedy = "start a hub there (vtbdrake hub)" if self.url.startswith("tcpq:") else "is the URL right?"
             raise BridgeError(f"no LCM bus at {self.url} ({error}); {remedy}") from error
@@ -117,6 +121,11 @@ class LcmLink:
         return connection
 
     @property
+    def arrived(self) -> float | None:
+        """Of the message that is handed on; see `Connection`."""
+        return None if self._connection is None else self._connection.arrived
+
+    @property
     def sources(self) -> list[Connection]:
         """What becomes readable when messages arrive, for `select`; empty while there is no bus."""
         connection = self._current()
@@ -139,13 +148,13 @@ class LcmLink:
             self._lose()
             return 0
 
-    def publish(self, channel: str, data: bytes) -> bool:
-        """Whether the message went to the bus."""
+    def publish(self, *messages: tuple[str, bytes]) -> bool:
+        """Whether the messages (channel and bytes) went to the bus."""
         connection = self._required()
         if connection is None:
             return False
         try:
-            connection.publish(channel, data)
+            connection.publish(messages)
         except BlockingIOError:
             return False
         except OSError:
@@ -158,7 +167,7 @@ class LcmLink:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
-        self._search = _Search(*self._arguments)
+        self._search = _Search(self._connect)
         self._search.start()
 
     def close(self) -> None:

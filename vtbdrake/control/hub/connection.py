@@ -74,21 +74,27 @@ class Connection:
         """Whether it has subscribed to the channel."""
         return any(matches(channel) for _, matches in self._subscriptions)
 
-    def send(self, message: bytes | bytearray, now: float) -> int:
-        """Sends a message, or queues what of it cannot be sent at once; says how many messages that drops.
+    def send(self, messages: list[bytes | bytearray], now: float) -> int:
+        """Sends messages, or queues what of them cannot be sent at once; says how many messages that drops.
 
         Raises:
             OSError: the connection is lost.
         """
-        if self._queue:
-            return self._enqueue(message)
-        sent = self._send(message)
-        if sent < len(message):
+        begun = 0
+        if not self._queue:
+            begun = self._send(messages[0] if len(messages) == 1 else b"".join(messages))
+            done = 0
+            while done < len(messages) and begun >= len(messages[done]):
+                begun -= len(messages[done])
+                done += 1
+            if done == len(messages):
+                return 0
+            messages = messages[done:]
             self.progressed = now
-            self._offset = sent
-            self._queue.append(message)
-            self.queued = len(message) - sent
-        return 0
+            self._offset = begun
+        self._queue.extend(messages)
+        self.queued += sum(map(len, messages)) - begun
+        return self._drop()
 
     def flush(self, now: float) -> None:
         """Sends a slice of what is queued.
@@ -116,9 +122,7 @@ class Connection:
         except BlockingIOError:
             return 0
 
-    def _enqueue(self, message: bytes | bytearray) -> int:
-        self._queue.append(message)
-        self.queued += len(message)
+    def _drop(self) -> int:
         oldest = 1 if self._offset else 0  # what has begun must end
         dropped = 0
         while self.queued > self._max_queue and len(self._queue) > oldest:

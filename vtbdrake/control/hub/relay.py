@@ -36,6 +36,9 @@ class _Route(NamedTuple):
 class Relay:
     """Clients, their subscriptions, and the messages between them. It reads no socket and waits for nothing.
 
+    What goes to a client is collected until `deliver`: several messages that came together leave together, and wake
+    it up once.
+
     Attributes:
         lost: clients whose connection failed when something was sent, and how; to be cleared by who has seen to it.
         behind: clients that have begun to queue; likewise.
@@ -46,6 +49,7 @@ class Relay:
         self.lost: list[tuple[Connection, OSError]] = []
         self.behind: list[Connection] = []
         self.news = False
+        self._leaving: dict[Connection, list[bytes | bytearray]] = {}
         self._clients: list[Connection] = []
         self._routes: dict[bytes, _Route] = {}
         self._protected = {name: ProtectedChannel(name, lease=config.lease) for name in config.protect}
@@ -82,7 +86,7 @@ class Relay:
             client.unsubscribe(channel)
             self._routes.clear()
         else:
-            self._send(client, tcpq.GREETING, now)
+            self._send(client, tcpq.GREETING)
 
     def _publish(self, client: Connection, channel: bytes, content: bytes | bytearray, now: float) -> None:
         statistics = self._statistics
@@ -94,7 +98,7 @@ class Relay:
         else:
             statistics.messages += 1
             statistics.volume += len(content)
-            self._distribute(route, content, now)
+            self._distribute(route, content)
 
     def _find_route(self, channel: bytes) -> _Route:
         name = text(channel)
@@ -109,22 +113,34 @@ class Relay:
         self._routes[channel] = route
         return route
 
-    def _distribute(self, route: _Route, content: bytes | bytearray, now: float) -> None:
+    def _distribute(self, route: _Route, content: bytes | bytearray) -> None:
         for subscriber in route.subscribers:
             if not subscriber.closed:
-                self._send(subscriber, content, now)
+                self._send(subscriber, content)
                 self._statistics.delivered += 1
 
-    def _send(self, client: Connection, content: bytes | bytearray, now: float) -> None:
-        try:
-            self._statistics.dropped += client.send(content, now)
-        except OSError as error:
-            client.close()
-            self.lost.append((client, error))
-            return
-        if client.queued and not client.watched:
-            client.watched = True
-            self.behind.append(client)
+    def _send(self, client: Connection, content: bytes | bytearray) -> None:
+        leaving = self._leaving.get(client)
+        if leaving is None:
+            self._leaving[client] = [content]
+        else:
+            leaving.append(content)
+
+    def deliver(self, now: float) -> None:
+        """Sends what was collected."""
+        for client, messages in self._leaving.items():
+            if client.closed:
+                continue
+            try:
+                self._statistics.dropped += client.send(messages, now)
+            except OSError as error:
+                client.close()
+                self.lost.append((client, error))
+                continue
+            if client.queued and not client.watched:
+                client.watched = True
+                self.behind.append(client)
+        self._leaving.clear()
 
     def _admit(self, client: Connection, protection: ProtectedChannel, now: float) -> bool:
         owner = protection.owner
@@ -154,7 +170,8 @@ class Relay:
         channel = tcpq.STATUS_CHANNEL.encode()
         route = self._routes.get(channel) or self._find_route(channel)
         if route.subscribers:
-            self._distribute(route, tcpq.publication(channel, self.statistics(now).to_json()), now)
+            self._distribute(route, tcpq.publication(channel, self.statistics(now).to_json()))
+            self.deliver(now)
 
     def statistics(self, now: float) -> Statistics:
         statistics = self._statistics

@@ -114,6 +114,7 @@ class HubServer:
                     client = self._clients.get(fileno)
                     if client is not None:
                         self._attend(client, event)
+                        relay.deliver(self._now)
                     elif fileno in self._others:  # or it is a client that another event has just disconnected
                         self._others[fileno]()
                     if relay.behind or relay.lost:

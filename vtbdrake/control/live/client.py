@@ -176,7 +176,7 @@ def samples(
             if time.monotonic() >= heard + timeout:
                 raise _silence(link, timeout)
     finally:
-        link.publish(WATCH, to_json({**request, "watch": []}))
+        link.publish((WATCH, to_json({**request, "watch": []})))
         link.close()
 
 
@@ -190,7 +190,7 @@ def _publish(link: LcmLink, channel: str, message: dict[str, Any]) -> None:
         parse(channel, data)
     except ValueError as error:
         raise LiveError(str(error)) from None
-    link.publish(channel, data)
+    link.publish((channel, data))
 
 
 def _silence(link: LcmLink, seconds: float) -> SilenceError:

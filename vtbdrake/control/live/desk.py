@@ -227,7 +227,7 @@ class Desk:
         self._publish(task.channel + ANSWER, {"id": task.request.id, **outcome})
 
     def _publish(self, channel: str, message: dict[str, Any]) -> None:
-        self._link.publish(channel, to_json(message))
+        self._link.publish((channel, to_json(message)))
 
 
 def _order(request: Request) -> tuple[Any, ...]:

@@ -48,9 +48,10 @@ class MachineLoop:
 
     Attributes:
         statistics: of its cycles; ``step`` is the simulation.
-        state_to_command: from telling a state to the next command's arrival, in seconds; of states that are not
-            answered before the next one, the oldest counts. A command does not say which state it answers: where all
-            answers come more than a period late, they are taken for those to the next state.
+        state_to_command: from telling a state to the next command's arrival (at the computer: the machine may be at
+            work), in seconds; of states that are not answered before the next one, the oldest counts. A command does
+            not say which state it answers: where all answers come more than a period late, they are taken for those to
+            the next state.
         lost: seconds of the clock that the simulation could not keep up with.
     """
 
@@ -82,7 +83,7 @@ class MachineLoop:
         if control is not None:
             control.setblocking(False)
         self._stop = threading.Event()
-        self._last: list[tuple[str, bytes]] = []
+        self._messages: list[tuple[str, bytes]] = []
         self._braking = False
         self._arrived: set[str] = set()
         self._alone = True
@@ -91,7 +92,7 @@ class MachineLoop:
         self._next_status = 0
         handlers = {channel: self._receive for channel in machine.channels}
         handlers[machine.config.control_channel] = self._hear
-        self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
+        self._link = LcmLink(url, handlers, connect_timeout=connect_timeout, stamped=True)
         self._link.open()
 
     def stop(self) -> None:
@@ -103,7 +104,10 @@ class MachineLoop:
         self._link.close()
 
     def run(self, *, lock_step: bool = False, cycles: float = inf) -> None:
-        """
+        """Tells the state at the beginning of each cycle. With the clock, the commands that have come by then act in
+        it, as those of a robot on a fieldbus do: the answer to a state acts a period later. In lock-step, the answer
+        acts in the cycle whose state it answers, as a testbed's DPS does in simulation.
+
         Args:
             lock_step: a cycle begins when one message has arrived on every command channel, instead of with the clock.
             cycles: after how many it ends.
@@ -112,29 +116,46 @@ class MachineLoop:
             RuntimeError: the simulation failed.
         """
         end = self.machine.cycle + cycles
+        self._messages = self.machine.messages()
         begin = self._clock.now() - self.machine.time
         self._tell()
         while not self._stop.is_set() and self.machine.cycle < end:
             if lock_step:
                 self._await_commands()
-                woke = deadline = self._clock.now()
-                steps = 1
+                if not self._stop.is_set():
+                    self._cycle_in_lock_step()
             else:
-                deadline = begin + self.machine.time + self.machine.config.period
-                woke = self._await(deadline)
-                begin, steps = self._behind(begin, woke)
-            if self._stop.is_set():
-                break
-            for _ in range(int(min(steps, end - self.machine.cycle))):
-                self.machine.advance()
-            stepped = self._clock.now()
-            if not lock_step:
-                # What came during the simulation answers the state before.
-                self._link.take(0.0, _BURST)
-            self._tell()
+                begin = self._cycle_by_clock(begin, end)
             self._serve()
-            self.statistics.record(lateness=woke - deadline, step=stepped - woke, cycle=self._clock.now() - woke)
+
+    def _cycle_in_lock_step(self) -> None:
+        begin = self._clock.now()
+        step = self._advance(1)
+        self._tell()
+        self.statistics.record(lateness=0.0, step=step, cycle=self._clock.now() - begin)
+
+    def _cycle_by_clock(self, begin: float, end: float) -> float:
+        """Where the clock's zero was, and where it is after this cycle."""
+        work = self._clock.now()
+        begin, steps = self._behind(begin, work)
+        step = self._advance(int(min(steps, end - self.machine.cycle)))
+        worked = self._clock.now() - work
+        deadline = begin + self.machine.time
+        woke = self._await(deadline)
+        if not self._stop.is_set():
+            self._tell()
+            self.statistics.record(lateness=woke - deadline, step=step, cycle=worked + self._clock.now() - woke)
             self.statistics.miss(steps - 1)
+        return begin
+
+    def _advance(self, cycles: int) -> float:
+        """Does cycles, prepares what is to be told then, and gives the seconds that the simulation took."""
+        begin = self._clock.now()
+        for _ in range(cycles):
+            self.machine.advance()
+        took = self._clock.now() - begin
+        self._messages = self.machine.messages()
+        return took
 
     # -- when a cycle begins
 
@@ -150,7 +171,7 @@ class MachineLoop:
     def _behind(self, begin: float, now: float) -> tuple[float, int]:
         """Where the clock's zero is, and how many cycles are due: a body does not stop while nobody looks at it."""
         period = self.machine.config.period
-        due = int((now - begin) / period + 1e-6) - self.machine.cycle
+        due = int((now - begin) / period + 1e-6) + 1 - self.machine.cycle
         steps = max(1, min(due, int(_CATCH_UP / period)))
         lost = max(0, due - steps) * period
         self.lost += lost
@@ -169,13 +190,14 @@ class MachineLoop:
             if self._alone and time.monotonic() >= repeat:
                 repeat = time.monotonic() + _REPEAT
                 self._reconnections = self._link.reconnections
-                self._publish(self._last)
+                self._publish()
         self._arrived.clear()
         self._alone = False
 
     def _receive(self, channel: str, data: bytes) -> None:
-        if self._told < inf:
-            self.state_to_command.record(time.monotonic() - self._told)
+        arrived = self._link.arrived or time.monotonic()
+        if self._told <= arrived:
+            self.state_to_command.record(arrived - self._told)
             self._told = inf
         self._arrived.add(channel)
         self.machine.receive(channel, data)
@@ -183,24 +205,22 @@ class MachineLoop:
     # -- what it tells
 
     def _tell(self) -> None:
-        self._last = self.machine.messages()
         # Before they leave: where the controller preempts this process, its answer is there before `_publish` returns.
         # A state without an answer counts until one comes.
         self._told = min(self._told, time.monotonic())
-        self._publish(self._last)
+        self._publish()
         braking = self.machine.braking
         if self.machine.cycle >= self._next_status or braking != self._braking:
             self._braking = braking
             self._tell_status()
 
-    def _publish(self, messages: list[tuple[str, bytes]]) -> None:
-        for channel, data in messages:
-            self._link.publish(channel, data)
+    def _publish(self) -> None:
+        self._link.publish(*self._messages)
 
     def _tell_status(self) -> None:
         config = self.machine.config
         self._next_status = self.machine.cycle + max(1, round(config.status_period / config.period))
-        self._link.publish(config.status_channel, json.dumps(self.machine.status().to_dict()).encode())
+        self._link.publish((config.status_channel, json.dumps(self.machine.status().to_dict()).encode()))
 
     # -- requests
 

@@ -58,7 +58,7 @@ class MachineProcess:
         scenario: whose world it is; a class that other processes can import.
         url: of the bus.
         config: see there.
-        lock_step: cycles begin with commands, instead of with the clock.
+        lock_step: cycles begin with commands, instead of with the clock; see `MachineLoop.run`.
         cycles: after how many it ends by itself.
         priority: of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
         options: fields of the config, in its place or to change it.
