@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
     from vtbdrake.control.hub import Hub
     from vtbdrake.control.lcm_bridge import LcmBridge
-    from vtbdrake.control.live.client import ParameterClient, watch
+    from vtbdrake.control.live.client import LiveClient, watch
     from vtbdrake.control.live.live_watch import LiveWatch
     from vtbdrake.control.live.service import LiveService
     from vtbdrake.control.machine import MachineProcess
@@ -47,12 +47,12 @@ __all__ = [
     "Hub",
     "Interface",
     "LcmBridge",
+    "LiveClient",
     "LiveService",
     "LiveWatch",
     "MachineProcess",
     "Operation",
     "Parameter",
-    "ParameterClient",
     "PlantFields",
     "Problem",
     "Protocol",
@@ -81,7 +81,7 @@ _HOMES = {
     "control.guard": ("Guards",),
     "control.hub": ("Hub",),
     "control.lcm_bridge": ("LcmBridge",),
-    "control.live.client": ("ParameterClient", "watch"),
+    "control.live.client": ("LiveClient", "watch"),
     "control.live.live_watch": ("LiveWatch",),
     "control.live.service": ("LiveService",),
     "control.machine": ("MachineProcess",),

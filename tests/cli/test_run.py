@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -167,6 +168,26 @@ def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:
     assert [(line["dps.gain"], line["u.target"]) for line in lines] == [(0.5, [0.2, 0.1])] * 3
     assert refused.exit_code == 1
     assert refused.stderr.startswith("Error: there is no variable") and "did you mean dps.gain" in refused.stderr
+
+
+def test_a_dps_that_stopped_is_let_on_when_the_machine_is_back(hub: Hub) -> None:
+    options = ("--url", hub.url, "--field", "max_age=0.2", "--pace", "", *FAR)
+    patience = ("--url", hub.url, "--timeout", PATIENCE)
+    with MachineProcess(ServoMachineScenario(), hub.url) as machine, start(SERVO, *options) as program:
+        assert program.stderr is not None
+        assert any("the DPS commands" in line for line in program.stderr)
+        machine.pause()
+        assert any("the fallbacks command from now on" in line for line in program.stderr)
+        refused = ask("reset", *patience)
+        machine.resume()
+        limit = time.monotonic() + PATIENCE
+        while (released := ask("reset", *patience)).exit_code:
+            assert time.monotonic() < limit, released.stderr
+        program.send_signal(signal.SIGTERM)
+        program.communicate(timeout=PATIENCE)
+    assert refused.exit_code == 1
+    assert "is stale" in refused.stderr
+    assert released.stdout.startswith("over: sensor signal position is stale")
 
 
 def test_a_machine_that_does_not_speak_is_waited_for_and_then_given_up(hub: Hub) -> None:

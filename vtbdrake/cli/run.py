@@ -75,7 +75,7 @@ MOST_FAULTS = 20
     show_default=True,
     help="Keep memory from being paged out, all of it: what is never used becomes resident, too.",
 )
-@click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set and watch.")
+@click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set, watch and reset.")
 @click.option("--record", callback=output(".lcm"), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay.")
 @click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the loop's timing: .json.")
 def run_dps(
@@ -97,8 +97,9 @@ def run_dps(
     """Run the DPS of a scenario on its machine, without its simulated world, until Ctrl-C.
 
     The scenario says by its method protocol() on which channels they speak, and by operation() what guards it. The DPS
-    commands as soon as all its sensor signals are fresh and plausible and the machine is ready. In the end the fallback
-    commands go out once. The exit code is 1 if the machine was not ready, or if the guards had to step in.
+    commands as soon as all its sensor signals are fresh and plausible and the machine is ready. After a fault the
+    fallbacks command, until vtbdrake reset. In the end they go out once. The exit code is 1 if the machine was not
+    ready, or if the fallbacks commanded in the end.
 
     \b
     Example:

@@ -15,7 +15,7 @@ import pytest
 from tests.control.live.rig import PATIENCE, Rig, served
 from tests.control.scripted import PERIOD
 from vtbdrake.control.hub import Hub
-from vtbdrake.control.live.client import LiveError, ParameterClient, SilenceError, watch
+from vtbdrake.control.live.client import LiveClient, LiveError, SilenceError, watch
 from vtbdrake.control.live.desk import MAX_WAITING
 from vtbdrake.control.live.live_watch import LiveWatch
 
@@ -36,9 +36,9 @@ def shared() -> Iterator[Rig]:
         yield rig
 
 
-def asked(url: str, method: str, argument: Any) -> Any:
-    with ParameterClient(url, timeout=PATIENCE) as client:
-        return getattr(client, method)(argument)
+def asked(url: str, method: str, *arguments: Any) -> Any:
+    with LiveClient(url, timeout=PATIENCE) as client:
+        return getattr(client, method)(*arguments)
 
 
 def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[tuple[float, dict[str, Any]]]:
@@ -91,9 +91,10 @@ def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
     bus.subscribe("VTB_SET_ANSWER", lambda _, data: answers.append(json.loads(data)))
     with served(hub.url) as (rig, service):
         rig.during(asked, hub.url, "get", ["dps.gain"])  # The companion listens.
+        bus.publish("VTB_RESET", b'{"id": "me", "reset": 1}')
         for data in (b"", b"\x00\xff", b" " * 100_000, b'{"id": "me", "set": {"x": Infinity}}', b'{"id": "me"}'):
             bus.publish("VTB_SET", data)
-        rig.until(lambda: service.refused == 5)
+        rig.until(lambda: service.refused == 6)
         while len(answers) < 5:
             assert bus.handle_timeout(round(1e3 * PATIENCE))
         assert [answer["id"] for answer in answers] == ["", "", "", "me", "me"]
@@ -128,8 +129,24 @@ def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> Non
 
 
 def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
-    with ParameterClient(hub.url, timeout=0.1) as client, pytest.raises(SilenceError, match="nobody has answered"):
+    with LiveClient(hub.url, timeout=0.1) as client, pytest.raises(SilenceError, match="nobody has answered"):
         client.get(["dps.gain"])
+
+
+def test_a_latch_is_released_from_outside_once_its_cause_is_over(hub: Hub) -> None:
+    with served(hub.url) as (rig, _):
+        assert rig.during(asked, hub.url, "reset") == []
+        rig.during(asked, hub.url, "set", {"dps.trouble": 1.0})
+        rig.until(lambda: rig.runtime.guards.latched != ())
+        with pytest.raises(LiveError, match="the DPS raised"):
+            rig.during(asked, hub.url, "reset")
+        assert rig.runtime.guards.latched != ()
+        rig.during(asked, hub.url, "set", {"dps.trouble": 0.0})
+        (reason,) = rig.during(asked, hub.url, "reset")
+        assert reason.startswith("the DPS raised")
+        rig.runtime.cycle()
+        assert rig.cycles[-1].verdict.ok
+        assert [change.kind for cycle in rig.cycles for change in cycle.changes].count("reset") == 1
 
 
 # -- watch

@@ -227,7 +227,8 @@ class HubServer:
     def _disconnect(self, client: Connection, reason: str, message: str) -> None:
         client.close()
         if self._clients.pop(client.fileno, None) is not None:
-            log = _log.info if reason == "closed" else _log.warning
+            # A client that ends with messages unread is lost, too: nothing to worry about.
+            log = _log.info if reason in ("closed", "lost") else _log.warning
             log("%s %s", client.name, message)
             self._relay.leave(client, reason)
 

@@ -1,4 +1,4 @@
-"""The part of those who set, read and watch variables of a DPS that runs in another process."""
+"""The part of those who set, read, watch and reset what runs in another process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.control.lcm_link import LcmLink
-from vtbdrake.control.live.messages import ANSWER, GET, SET, WATCH, WATCHED, parse, to_json
+from vtbdrake.control.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
 
 _CONNECT_TIMEOUT = 2.0  # s
 _BURST = 1000  # messages to take in at a time
@@ -32,13 +32,13 @@ class SilenceError(TimeoutError):
     """Nobody answers."""
 
 
-class ParameterClient:
-    """Sets and reads variables of a DPS that runs with a `LiveService`.
+class LiveClient:
+    """Sets and reads variables of a DPS that runs with a `LiveService`, and resets its guards.
 
     ::
 
-        with ParameterClient("tcpq://127.0.0.1:7700") as parameters:
-            parameters.set({"dps.impl.stiffness": 200.0})
+        with LiveClient("tcpq://127.0.0.1:7700") as dps:
+            dps.set({"dps.impl.stiffness": 200.0})
 
     Args:
         url: the bus.
@@ -53,7 +53,9 @@ class ParameterClient:
         self._answers: dict[str, dict[str, Any]] = {}
         self._waiting = ""
         self._link = LcmLink(
-            url, dict.fromkeys((SET + ANSWER, GET + ANSWER), self._hear), connect_timeout=_CONNECT_TIMEOUT
+            url,
+            dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._hear),
+            connect_timeout=_CONNECT_TIMEOUT,
         )
         self._link.open()
 
@@ -74,6 +76,16 @@ class ParameterClient:
             SilenceError: nobody answers.
         """
         return to_arrays(self._ask(GET, {"get": list(addresses)})["values"])
+
+    def reset(self) -> list[str]:
+        """Releases the latch of the guards; what they had latched for, empty if they had not.
+
+        Raises:
+            LiveError: a cause persists; the fallbacks go on.
+            SilenceError: nobody answers; it may have been released or not.
+        """
+        released: list[str] = self._ask(RESET, {"reset": True})["released"]
+        return released
 
     def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
         self._waiting = _new_id()
@@ -102,7 +114,7 @@ class ParameterClient:
         """Gives the connection back."""
         self._link.close()
 
-    def __enter__(self) -> ParameterClient:
+    def __enter__(self) -> LiveClient:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -20,12 +20,14 @@ from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.live.messages import (
     ANSWER,
     GET,
+    RESET,
     SET,
     WATCH,
     WATCHED,
     ReadRequest,
     Request,
     RequestError,
+    ResetRequest,
     SetRequest,
     nested,
     parse,
@@ -80,7 +82,7 @@ class Desk:
         self.refused = 0
         self._loop = channel
         self._addresses = addresses
-        self._link = LcmLink(url, dict.fromkeys((SET, GET, WATCH), self._hear), connect_timeout=_CONNECT_TIMEOUT)
+        self._link = LcmLink(url, dict.fromkeys((SET, GET, RESET, WATCH), self._hear), connect_timeout=_CONNECT_TIMEOUT)
         self._link.open()
         self._tasks: dict[int, _Task] = {}
         self._numbers = 0
@@ -233,6 +235,8 @@ class Desk:
 def _order(request: Request) -> tuple[Any, ...]:
     if isinstance(request, SetRequest):
         return ("set", request.values)
+    if isinstance(request, ResetRequest):
+        return ("reset", ())
     return ("read", request.addresses, request.every)
 
 

@@ -5,6 +5,7 @@ channel    request                                               answer, on the 
 ========== ===================================================== =======================================
 VTB_SET    ``{"id": ID, "set": {ADDRESS: VALUE, ...}}``          ``{"id": ID, "ok": true}``
 VTB_GET    ``{"id": ID, "get": [ADDRESS, ...]}``                 ``{"id": ID, "ok": true, "time": T, "values": {...}}``
+VTB_RESET  ``{"id": ID, "reset": true}``                         ``{"id": ID, "ok": true, "released": [REASON, ...]}``
 VTB_WATCH  ``{"id": ID, "watch": [ADDRESS, ...], "every": N,     ``{"id": ID, "ok": true}``, and then the values on
            "lease": S}``, again before the lease is over         ``VTB_WATCHED/ID``, every N cycles
 ========== ===================================================== =======================================
@@ -12,7 +13,10 @@ VTB_WATCH  ``{"id": ID, "watch": [ADDRESS, ...], "every": N,     ``{"id": ID, "o
 Who is refused gets ``{"id": ID, "error": REASON}``. Values watched are ``{"cycle": K, "since": T0, "time": T, "values":
 {...}}``: read between the cycles of the DPS's times T0 and T, which are one and the same as long as there is time for
 all of them in one cycle. Who watches nothing (an empty list) has ended. ``{"id": ID, "ended": true}`` tells that the
-DPS has.
+DPS has. A reset releases the latch of the guards, unless a cause persists; what it had latched for is told.
+
+Whoever is on the bus may say these things, but for the channels that a hub protects: ``vtbdrake hub --protect
+VTB_RESET``.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from typing import Any
 
 from vtbdrake.control.json_object import json_object
 
-SET, GET, WATCH = "VTB_SET", "VTB_GET", "VTB_WATCH"
+SET, GET, RESET, WATCH = "VTB_SET", "VTB_GET", "VTB_RESET", "VTB_WATCH"
 WATCHED = "VTB_WATCHED/"
 ANSWER = "_ANSWER"
 
@@ -67,7 +71,14 @@ class ReadRequest:
     lease: float = 0.0
 
 
-Request = SetRequest | ReadRequest
+@dataclass(frozen=True)
+class ResetRequest:
+    """Wants the latch of the guards released."""
+
+    id: str
+
+
+Request = SetRequest | ReadRequest | ResetRequest
 
 
 def to_json(message: Any) -> bytes:
@@ -95,6 +106,10 @@ def parse(channel: str, data: bytes) -> Request:
         raise RequestError(f"a request has an id of up to 40 letters, digits and _.:-, not {_short(id)}")
     if channel == SET:
         return SetRequest(id, _values(_only(message, "set")))
+    if channel == RESET:
+        if _only(message, "reset") is not True:
+            raise RequestError(f"reset is true, not {_short(message['reset'])}")
+        return ResetRequest(id)
     if channel == GET:
         return ReadRequest(id, _addresses(_only(message, "get"), least=1))
     addresses = _addresses(_only(message, "watch", "every", "lease"), least=0)

@@ -16,10 +16,12 @@ from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.live.desk import VALUES, attend, text_frame, values_record
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
 
 
 class LiveService:
-    """Lets other processes set variables of a running DPS, and read and watch variables and output ports.
+    """Lets other processes set variables of a running DPS, read and watch variables and output ports, and reset its
+    guards.
 
     ::
 
@@ -96,6 +98,9 @@ class LiveService:
         if kind == "refused":
             self.refused = what
             return
+        if kind == "reset":
+            self._companion.post(text_frame(number, **self._reset()))
+            return
         # Asked first: what the others do for an unknown address, looking for similar ones, takes long.
         known = self._runtime.target.variables() if kind == "set" else self
         unknown = next((address for address in what if address not in known), None)
@@ -117,6 +122,15 @@ class LiveService:
         except Exception as error:  # Whatever it is, it is the business of who asked, not the loop's.
             return {"error": str(error)}
         return {"ok": True}
+
+    def _reset(self) -> dict[str, Any]:
+        released = [fault.reason for fault in self._runtime.guards.latched]
+        try:
+            if released:
+                self._runtime.reset()
+        except SwitchRefusedError as error:
+            return {"error": str(error)}
+        return {"ok": True, "released": released}
 
     def _read(self, cycle: Cycle) -> None:
         """One after another, from where it ended in the cycle before."""

@@ -1,4 +1,4 @@
-"""``vtbdrake set`` and ``vtbdrake get``: variables of a DPS that runs in another process."""
+"""``vtbdrake set``, ``get`` and ``reset``: what others say to a DPS that runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.live.client import LiveError, ParameterClient, SilenceError
+from vtbdrake.control.live.client import LiveClient, LiveError, SilenceError
 
 
 @click.command("set")
@@ -25,7 +25,7 @@ def set_values(values: tuple[Setting, ...], url: str, timeout: float) -> None:
       vtbdrake set --url tcpq://127.0.0.1:7700 u.motion=2 "dps.impl.stiffness=[20,20,20,900,900,900]"
     """
     try:
-        with ParameterClient(url, timeout=timeout) as client:
+        with LiveClient(url, timeout=timeout) as client:
             client.set(settings(values))
     except (BridgeError, LiveError, SilenceError) as error:
         raise FailedError(one_line(error)) from error
@@ -43,9 +43,32 @@ def get_values(addresses: tuple[str, ...], url: str, timeout: float) -> None:
       vtbdrake get --url tcpq://127.0.0.1:7700 u.motion dps.impl.stiffness
     """
     try:
-        with ParameterClient(url, timeout=timeout) as client:
+        with LiveClient(url, timeout=timeout) as client:
             values = client.get(addresses)
     except (BridgeError, LiveError, SilenceError) as error:
         raise FailedError(one_line(error)) from error
     for address, value in values.items():
         click.echo(f"{address} = {np.asarray(value).tolist()}")
+
+
+@click.command("reset")
+@url_option
+@timeout_option
+def reset_guards(url: str, timeout: float) -> None:
+    """Let a DPS that runs by vtbdrake run command again, after a fault that is over.
+
+    Prints what its guards had latched for. The exit code is 1 if a cause persists, or if nobody answers.
+
+    \b
+    Example:
+      vtbdrake reset --url tcpq://127.0.0.1:7700
+    """
+    try:
+        with LiveClient(url, timeout=timeout) as client:
+            released = client.reset()
+    except (BridgeError, LiveError, SilenceError) as error:
+        raise FailedError(one_line(error)) from error
+    for reason in released:
+        click.echo(f"over: {reason}")
+    if not released:
+        click.echo("nothing had latched")
