@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,9 @@ def benchmark_all(
     """
     results: list[Benchmark | Crash] = []
     for name in chosen(registry, only):
-        echo(f"{name} ...")
+        begin = time.monotonic()
         found = run(registry, name)
+        echo(f"{name}: measured in {time.monotonic() - begin:.0f} s")
         results += found if isinstance(found, list) else [found]
     return results
 
