@@ -27,8 +27,8 @@ class ResidualConfig:
             none of what happens in them by chance.
         period: of the machine's cycles and the DPS's, in seconds.
         horizon: of a prediction, in periods: so often it begins anew from the belief.
-        delay: periods from the instant of a sample until the command that answers it acts, beyond a machine's that is
-            answered at once and obeys at once.
+        delay: periods from the instant of a sample until the command that answers it acts: 0 where it is answered at
+            once and obeys at once, as in lock-step; 1 for a machine by the clock, which obeys from its next period on.
         settle: windows that are predicted but not judged at first, and after a gap: what the belief does not say (the
             currents of drives, samples in transit) follows from the commands alone, after some time.
         values: of variables of the predicted world, by address: the payload that the machine is thought to carry, say.
