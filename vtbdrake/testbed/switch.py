@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
     DiagramBuilder,
     InputPort,
     InputPortIndex,
-    LeafSystem,
     LeafSystem_,
     OutputPort,
     System,
@@ -26,6 +24,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 from vtbdrake.state.element import DISCRETE, Codec, Element
 from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variable import Variable, VariableError, X
+from vtbdrake.testbed.abstract_switch import AbstractSwitch, CommandGate
 from vtbdrake.testbed.signal import Interface, Signal
 
 SIM, REAL, TWIN = "sim", "real", "twin"
@@ -33,13 +32,6 @@ SENSE_POSITIONS = (SIM, REAL)
 ACT_POSITIONS = (SIM, REAL, TWIN)
 
 T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
-
-
-@dataclass(frozen=True)
-class Command:
-    """What an abstract signal's port ``real.act.<signal>`` carries: a command, or none (``value`` is None)."""
-
-    value: Any = None
 
 
 @TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
@@ -144,61 +136,6 @@ def _port(positions: tuple[str, ...], position: str) -> InputPortIndex:
     return InputPortIndex(1 + positions.index(position))
 
 
-class AbstractSwitch(LeafSystem):
-    """PortSwitch for abstract values, which pydrake binds for vectors only. Evaluates the selected input alone.
-
-    .. pydrake_system::
-
-        name: AbstractSwitch
-        input_ports:
-        - port_selector
-        - in1
-        - in2
-        - ...
-        output_ports:
-        - value
-    """
-
-    def __init__(self, signal: Signal, count: int) -> None:
-        super().__init__()
-        self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
-        for i in range(count):
-            self.DeclareAbstractInputPort(f"in{i + 1}", signal.abstract_value())
-        self.DeclareAbstractOutputPort(
-            "value", signal.abstract_value, self._calc, prerequisites_of_calc={self.all_input_ports_ticket()}
-        )
-
-    def _calc(self, context: Context, output: AbstractValue) -> None:
-        selected = self._selector.Eval(context)
-        output.SetFrom(self.EvalAbstractInput(context, int(selected)))
-
-
-class CommandGate(LeafSystem):
-    """What an abstract actuator signal's real port carries: a `Command`, empty while T_act is on sim.
-
-    .. pydrake_system::
-
-        name: CommandGate
-        input_ports:
-        - port_selector
-        - command
-        output_ports:
-        - value
-    """
-
-    def __init__(self, signal: Signal) -> None:
-        super().__init__()
-        self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
-        self._command = self.DeclareAbstractInputPort("command", signal.abstract_value())
-        self.DeclareAbstractOutputPort(
-            "value", lambda: Value(Command()), self._calc, prerequisites_of_calc={self.all_input_ports_ticket()}
-        )
-
-    def _calc(self, context: Context, output: AbstractValue) -> None:
-        position = ACT_POSITIONS[int(self._selector.Eval(context)) - 1]
-        output.set_value(Command() if position == SIM else Command(self._command.Eval(context)))
-
-
 class Switches:
     """T_sense and T_act of all signals.
 
@@ -288,7 +225,7 @@ class Switches:
         return output
 
     def _gate(self, switch: str, signal: Signal, command: OutputPort) -> OutputPort:
-        gate = self._builder.AddNamedSystem(f"{switch}.real", CommandGate(signal))
+        gate = self._builder.AddNamedSystem(f"{switch}.real", CommandGate(signal, _port(ACT_POSITIONS, SIM)))
         self._builder.Connect(self._board.GetOutputPort(switch), gate.GetInputPort("port_selector"))
         self._builder.Connect(command, gate.GetInputPort("command"))
         return gate.get_output_port()
