@@ -146,6 +146,26 @@ def test_a_cycle_that_comes_twice_counts_once(whole: bytes, reference: ControlLo
     assert [damage.what for damage in log.damages] == [f"cycle {n} follows cycle 6" for n in (4, 5, 6)]
 
 
+def test_what_comes_with_a_cycle_that_comes_twice_counts_once(
+    whole: bytes, reference: ControlLog, tmp_path: Path
+) -> None:
+    bounds = ends(reference)
+    log = read(tmp_path, whole[: bounds[13]] + whole[bounds[7] :])
+    assert [i for i, _ in log.changes] == [i for i, _ in reference.changes] == [0, 10]
+    assert log.faults == reference.faults and log.digests == reference.digests
+    assert len(log.damages) == 6 and replay(log).identical
+
+
+def test_a_change_of_a_damaged_cycle_is_not_taken_for_another_cycles(
+    whole: bytes, reference: ControlLog, tmp_path: Path
+) -> None:
+    content = bytearray(whole)
+    for _, _, begin, _ in reference.events.on("VTB_CHANGE")[-2:]:  # of cycle 11; the number follows the time
+        content[begin + 16 : begin + 24] = (5).to_bytes(8, "big")
+    log = read(tmp_path, bytes(content))
+    assert log.gaps == [(11, 11)] and [i for i, _ in log.changes] == [0]
+
+
 def shifted(content: bytes, reference: ControlLog, first: int, seconds: float) -> bytes:
     """The log with other times of day from a cycle on, as if the clock had been set; checksums as they should be."""
     import zlib

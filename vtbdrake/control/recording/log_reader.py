@@ -6,7 +6,8 @@ import logging
 import os
 import struct
 import zlib
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from vtbdrake.control.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
-from vtbdrake.control.recording.log_events import LogEvents
+from vtbdrake.control.recording.log_events import LogEvents, Place
 from vtbdrake.control.recording.log_format import (
     CHANGE,
     COMMANDED,
@@ -61,7 +62,7 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
     header, start = _begin(path, events)
     layout = CycleLayout(header.sense, header.act)
     damages = [Damage(*damage) for damage in events.damages]
-    records = _cycles(events, layout, damages)
+    records, frames = _cycles(events, layout, damages)
     index = {number: i for i, number in enumerate(records["number"].tolist())}
     source, act = records["source"], records["act"]
     log = ControlLog(
@@ -78,16 +79,17 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
         commands=_where(records["commands"], layout, header, act & COMMANDED),
         commanded={signal.name: act[:, i] & COMMANDED != 0 for i, signal in enumerate(header.act)},
         sent=_where(records["sent"], layout, header, act & SENT),
-        changes=[(index[number], change) for number, change in _changes(events, index, damages)],
+        changes=[
+            (index[number], change)
+            for number, change in changes_of(_messages(events, CHANGE, lcmt_vtb_change, damages, frames))
+        ],
         faults=[
             (index[message.number], tuple(message.reasons))
-            for message in _messages(events, FAULT, lcmt_vtb_fault, damages)
-            if message.number in index
+            for message in _messages(events, FAULT, lcmt_vtb_fault, damages, frames)
         ],
         digests=[
             (index[message.number], message.digest)
-            for message in _messages(events, DIGEST, lcmt_vtb_digest, damages)
-            if message.number in index
+            for message in _messages(events, DIGEST, lcmt_vtb_digest, damages, frames)
         ],
         damages=damages,
         gaps=_gaps(header, records["number"], [m.number for m in _messages(events, END, lcmt_vtb_end, damages)]),
@@ -118,10 +120,11 @@ def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 
 
-def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> np.ndarray:
-    """The cycles that are whole, in order."""
+def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> tuple[np.ndarray, list[range]]:
+    """The cycles that are whole, in order, and which bytes of the file belong to each."""
     content, size = memoryview(events.content), layout.dtype.itemsize
     whole: list[bytes] = []
+    frames: list[range] = []
     frame_size, numbers = struct.Struct(">iI"), struct.Struct(">q")
     newest = -1
     for _, _, begin, end in events.on(CYCLE):
@@ -136,12 +139,13 @@ def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> np
             else:
                 newest = number
                 whole.append(bytes(content[begin:end]))
+                frames.append(range(end - length, end))
                 continue
         damages.append(Damage(begin, what))
     records = np.frombuffer(b"".join(whole), layout.dtype)
     if not layout.fits(records).all():
         raise LogError("the log's cycles do not have the signals that its header tells of")
-    return records
+    return records, frames
 
 
 def _columns(entries: np.ndarray, parts: dict[str, slice]) -> dict[str, np.ndarray]:
@@ -157,9 +161,13 @@ def _where(entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: n
     return columns
 
 
-def _messages(events: LogEvents, channel: str, message_type: Any, damages: list[Damage]) -> list[Any]:
+def _messages(
+    events: LogEvents, channel: str, message_type: Any, damages: list[Damage], frames: list[range] | None = None
+) -> list[Any]:
+    """Those of a channel; with ``frames`` only what belongs to them: of a cycle that does not count, nothing does."""
     found = []
-    for _, _, begin, end in events.on(channel):
+    places = events.on(channel)
+    for _, _, begin, end in places if frames is None else _within(frames, places):
         try:
             found.append(decode(message_type, events.data(begin, end)))
         except (MalformedError, struct.error, ValueError) as error:
@@ -167,10 +175,13 @@ def _messages(events: LogEvents, channel: str, message_type: Any, damages: list[
     return found
 
 
-def _changes(events: LogEvents, index: dict[int, int], damages: list[Damage]) -> Sequence[tuple[int, Any]]:
-    messages = _messages(events, CHANGE, lcmt_vtb_change, damages)
-    # Of a cycle whose checksum is wrong, nothing is believed.
-    return changes_of(message for message in messages if message.number in index)
+def _within(frames: list[range], places: Sequence[Place]) -> Iterator[Place]:
+    ends = [frame.stop for frame in frames]
+    for place in places:
+        _, _, begin, end = place
+        i = bisect_left(ends, end)
+        if i < len(frames) and begin in frames[i]:
+            yield place
 
 
 def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
