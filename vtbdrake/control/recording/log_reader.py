@@ -109,13 +109,17 @@ def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         where = f"; {events.damages[0][1]} at byte {events.damages[0][0]}" if events.damages else ""
         raise LogError(f"{path} is no log of a control loop: it has no event on {LOG}{where}")
     try:
-        header = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
-        if zlib.crc32(header.header.encode()) != header.crc & 0xFFFFFFFF:
+        told = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
+        if zlib.crc32(told.header.encode()) != told.crc & 0xFFFFFFFF:
             raise LogError(f"{path} cannot be used: its header is damaged")
+        # First of all: another version may have another state, too.
+        header = LogHeader.from_json(told.header)
         if not events.on(STATE):
             raise LogError(f"{path} cannot be used: the state before the first cycle is not there")
         state = decode(lcmt_vtb_state, events.data(*events.on(STATE)[0][2:]))
-        return LogHeader.from_json(header.header), Snapshot.load(state.snapshot)
+        if zlib.crc32(state.snapshot) != state.crc & 0xFFFFFFFF:
+            raise LogError(f"{path} cannot be used: the state before the first cycle is damaged")
+        return header, Snapshot.load(state.snapshot)
     except (MalformedError, ArchiveError) as error:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 

@@ -179,8 +179,7 @@ class Recorder:
         message = lcmt_vtb_log()
         message.utime = self._utime()
         message.header = header.to_json()
-        crc = zlib.crc32(message.header.encode())
-        message.crc = crc - (1 << 32) if crc >> 31 else crc  # LCM's integers have a sign
+        message.crc = _signed_crc(message.header.encode())
         return self._single(LOG, message)
 
     def _state_event(self) -> bytes:
@@ -190,6 +189,7 @@ class Recorder:
         message.utime = self._utime()
         message.snapshot = snapshots.take(target.diagram, runtime.context, target.variables()).to_bytes()
         message.size = len(message.snapshot)
+        message.crc = _signed_crc(message.snapshot)
         return self._single(STATE, message)
 
     def _single(self, channel: str, message: Any) -> bytes:
@@ -225,3 +225,8 @@ class Recorder:
             return len(read_log(self.path).numbers)
         except (LogError, OSError):
             return 0
+
+
+def _signed_crc(data: bytes) -> int:
+    crc = zlib.crc32(data)
+    return crc - (1 << 32) if crc >> 31 else crc  # LCM's integers have a sign

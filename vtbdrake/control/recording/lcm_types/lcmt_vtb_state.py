@@ -10,11 +10,11 @@ import struct
 class lcmt_vtb_state(object):
     """ VTB_STATE: what is stepped, before the first recorded cycle. """
 
-    __slots__ = ["utime", "size", "snapshot"]
+    __slots__ = ["utime", "size", "snapshot", "crc"]
 
-    __typenames__ = ["int64_t", "int32_t", "byte"]
+    __typenames__ = ["int64_t", "int32_t", "byte", "int32_t"]
 
-    __dimensions__ = [None, None, ["size"]]
+    __dimensions__ = [None, None, ["size"], None]
 
     def __init__(self):
         self.utime = 0
@@ -27,6 +27,12 @@ class lcmt_vtb_state(object):
         LCM Type: byte[size]
         """
 
+        self.crc = 0
+        """
+        CRC-32 of it
+        LCM Type: int32_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -37,6 +43,7 @@ class lcmt_vtb_state(object):
     def _encode_one(self, buf):
         buf.write(struct.pack(">qi", self.utime, self.size))
         buf.write(bytearray(self.snapshot[:self.size]))
+        buf.write(struct.pack(">i", self.crc))
 
     @staticmethod
     def decode(data: bytes):
@@ -53,12 +60,13 @@ class lcmt_vtb_state(object):
         self = lcmt_vtb_state()
         self.utime, self.size = struct.unpack(">qi", buf.read(12))
         self.snapshot = buf.read(self.size)
+        self.crc = struct.unpack(">i", buf.read(4))[0]
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_vtb_state in parents: return 0
-        tmphash = (0xbe05cd033cb3f2fe) & 0xffffffffffffffff
+        tmphash = (0xd08877307c474500) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None
