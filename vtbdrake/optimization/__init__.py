@@ -7,7 +7,7 @@ from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
 from vtbdrake.optimization.study import Study
-from vtbdrake.optimization.study_lock import StudyError
+from vtbdrake.optimization.study_error import StudyError
 from vtbdrake.optimization.sweep import Sweep
 
 __all__ = [

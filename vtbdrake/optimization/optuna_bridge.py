@@ -17,7 +17,7 @@ from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study_file import encode
-from vtbdrake.optimization.study_lock import StudyError
+from vtbdrake.optimization.study_error import StudyError
 
 if TYPE_CHECKING:
     import optuna

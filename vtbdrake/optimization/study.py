@@ -13,7 +13,7 @@ from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
 from vtbdrake.optimization.solvers.solver import Solver
 from vtbdrake.optimization.study_file import StudyFile
-from vtbdrake.optimization.study_lock import StudyError
+from vtbdrake.optimization.study_error import StudyError
 from vtbdrake.optimization.study_record import StudyRecord
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor

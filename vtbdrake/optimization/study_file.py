@@ -14,7 +14,8 @@ from typing import Any
 
 from vtbdrake.optimization.outcome import Outcome
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_lock import StudyError, claim
+from vtbdrake.optimization.study_error import StudyError, damaged, explained
+from vtbdrake.optimization.study_lock import claim
 
 VERSION = 1
 _APPLICATION = 0x56544253  # "VTBS"
@@ -55,18 +56,19 @@ class StudyFile:
         self._lock = threading.RLock()
         if self.path is not None:
             self._look(new=meta is not None)
-        # Commits are explicit; the lock of this object keeps threads apart.
-        self._db = sqlite3.connect(self.path or ":memory:", timeout=30.0, isolation_level=None, check_same_thread=False)
+        with explained(self.path):
+            # Commits are explicit; the lock of this object keeps threads apart.
+            self._db = sqlite3.connect(
+                self.path or ":memory:", timeout=30.0, isolation_level=None, check_same_thread=False
+            )
         try:
-            self._refuse_others(new=meta is not None)
-            self._db.execute("PRAGMA journal_mode = WAL")
-            # A killed process loses nothing that was committed; a machine without power may lose the last rollouts.
-            self._db.execute("PRAGMA synchronous = NORMAL")
-            self._prepare(meta)
-        except sqlite3.DatabaseError as error:
-            self._db.close()
-            raise StudyError(self._damaged(error)) from error
-        except StudyError:
+            with explained(self.path):
+                self._refuse_others(new=meta is not None)
+                # A killed process loses nothing that was committed; a machine without power may lose the last rollouts.
+                self._db.execute("PRAGMA synchronous = NORMAL")
+                if meta is not None and self._is_empty():
+                    self._create(meta)
+        except BaseException:
             self._db.close()
             raise
 
@@ -77,16 +79,6 @@ class StudyFile:
                 raise StudyError(f"there is no study file {self.path}")
             if not self.path.parent.is_dir():
                 raise StudyError(f"{self.path} lies in a folder that does not exist")
-            return
-
-    def _damaged(self, error: Exception) -> str:
-        return f"{self.path} cannot be read ({error}); it was left as it is: restore it from a copy"
-
-    def _prepare(self, meta: Mapping[str, Any] | None) -> None:
-        with self._transaction():
-            # Another process may have made it meanwhile.
-            if meta is not None and self._is_empty():
-                self._create(meta)
 
     def _is_empty(self) -> bool:
         (tables,) = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()
@@ -109,19 +101,23 @@ class StudyFile:
             )
         (verdict,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
         if verdict != "ok":
-            raise StudyError(self._damaged(sqlite3.DatabaseError(verdict)))
+            raise damaged(self.path, verdict)
 
     def _create(self, meta: Mapping[str, Any]) -> None:
-        for table in _TABLES:
-            self._db.execute(table)
-        rows = [(key, json.dumps(value)) for key, value in meta.items()]
-        self._db.executemany("INSERT INTO meta VALUES (?, ?)", rows)
-        self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
-        self._db.execute(f"PRAGMA user_version = {VERSION}")
+        self._db.execute("PRAGMA journal_mode = WAL")
+        with self._transaction():
+            if not self._is_empty():
+                return  # Another process has made it meanwhile.
+            for table in _TABLES:
+                self._db.execute(table)
+            rows = [(key, json.dumps(value)) for key, value in meta.items()]
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", rows)
+            self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
+            self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._lock:
+        with self._lock, explained(self.path):
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -131,11 +127,8 @@ class StudyFile:
             self._db.execute("COMMIT")
 
     def _read(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
-        with self._lock:
-            try:
-                return self._db.execute(query, values).fetchall()
-            except sqlite3.DatabaseError as error:
-                raise StudyError(self._damaged(error)) from error
+        with self._lock, explained(self.path):
+            return self._db.execute(query, values).fetchall()
 
     def close(self) -> None:
         with self._lock:
@@ -185,7 +178,7 @@ class StudyFile:
         """Records a finished rollout, whole or not at all; one that is there already stays."""
         columns = (outcome.h, outcome.value, json.dumps(outcome.measures), outcome.t_star, outcome.end)
         # One statement is a transaction by itself.
-        with self._lock:
+        with self._lock, explained(self.path):
             self._db.execute(
                 "INSERT OR IGNORE INTO rollouts "
                 "(point, condition, h, value, measures, t_star, end, message, wall_time) "

@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-
-class StudyError(ValueError):
-    """A study file that is no study, is damaged, of another version or of another problem, or is in use."""
+from vtbdrake.optimization.study_error import StudyError
 
 
 @contextmanager
@@ -24,10 +22,13 @@ def claim(path: Path | None) -> Iterator[None]:
         return
     lock = path.with_name(path.name + "-lock")
     while True:
-        handle = os.open(lock, os.O_CREAT | os.O_RDWR)
+        try:
+            handle = os.open(lock, os.O_CREAT | os.O_RDWR)
+        except OSError as error:
+            raise StudyError(f"the study {path} cannot be run, for its lock cannot be made: {error}") from error
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             os.close(handle)
             raise StudyError(
                 f"the study {path} is being run by another process: wait for it, or give points to it with `add`"

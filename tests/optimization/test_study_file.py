@@ -1,0 +1,35 @@
+"""The file of a study when it cannot be used: what is said, and that nothing is lost."""
+
+import pytest
+
+from tests.optimization.studies import pendulum_problem
+from vtbdrake.optimization import Study, StudyError
+
+
+def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
+    path = tmp_path / "a.db"
+    study = pendulum_problem().study(path, solver="random")
+    # What a full disk looks like to SQLite.
+    study._file._db.execute("PRAGMA max_page_count = 12")
+    with pytest.raises(StudyError, match=r"a\.db cannot be used .database or disk is full.*what was recorded is kept"):
+        study.run(rollouts=500, executor="serial", progress=False)
+    finished = len(study)
+    study.close()
+    with pendulum_problem().study(path) as again:
+        assert len(again) == finished > 0
+        again.run(rollouts=finished + 5, executor="serial", progress=False)
+        assert len(again.trials) == finished + 5
+
+
+def test_a_folder_is_no_study(tmp_path):
+    for use in (Study.open, pendulum_problem().study):
+        with pytest.raises(StudyError, match=r"cannot be used .unable to open database file"):
+            use(tmp_path)
+
+
+def test_a_closed_study_says_that_it_is_closed(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db")
+    study.close()
+    for use in (lambda: study.trials, lambda: study.add([0.0, 0.0]), lambda: study.run(rollouts=1, progress=False)):
+        with pytest.raises(StudyError, match=r"a\.db is closed"):
+            use()
