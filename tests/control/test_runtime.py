@@ -123,6 +123,35 @@ def test_from_real_to_sim_the_world_starts_from_what_the_dps_believes():
     assert len(bridge.sent) == count
 
 
+@pytest.mark.parametrize("ways", [["real"], ["twin"], ["sim", "real"]])
+def test_a_command_that_goes_out_goes_on_wherever_its_switch_is_thrown_again(ways):
+    runtime, bridge, _ = switched(rate=2.0)
+    runtime.run(cycles=300)
+    for way in ways:
+        runtime.switch(way)
+    runtime.run(cycles=100)
+    assert np.abs(np.diff(sent(bridge), axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
+
+
+def test_a_sensor_that_goes_back_to_sim_finds_the_world_where_the_dps_believes_the_machine_to_be():
+    runtime, _, _ = make()
+    runtime.run(cycles=100)
+    runtime.switch("shadow")
+    runtime.run(cycles=100)
+    runtime.switch(sense={"position": "sim"})
+    assert np.array_equal(runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0"), [0.05, 0.0])
+
+
+def test_a_world_that_drives_already_is_left_alone():
+    runtime, _, _ = make()
+    runtime.run(cycles=100)
+    runtime.switch("shadow")
+    runtime.run(cycles=100)
+    before = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
+    runtime.switch(act="sim")
+    assert np.array_equal(runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0"), before)
+
+
 # -- what is refused
 
 
@@ -139,6 +168,33 @@ def test_a_switch_to_a_sensor_that_never_spoke_is_refused():
     runtime, _, _ = make(sensors=lambda t: {})
     runtime.cycle()
     assert "position" in refusal(runtime, "shadow")
+
+
+@pytest.mark.parametrize(("listens", "stale"), [("shadow", {"position", "speed"}), ("sim", {"speed"})])
+def test_commands_to_a_machine_that_has_fallen_silent_are_refused(listens, stale):
+    runtime, _, _ = make(sensors=lambda t: still(t) if t < 0.02 else {}, continuity={"velocity": ("speed", 5.0)})
+    runtime.cycle()
+    runtime.switch(listens)
+    runtime.run(cycles=100)
+    reasons = runtime.prepare(act="real").reasons
+    assert {name for name in ("position", "speed") if f"{name} is stale" in "; ".join(reasons)} == stale
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"sense": {"nose": "real"}}, "no sensor signal 'nose'"),
+        ({"act": {"nose": "sim"}}, "no actuator signal 'nose'"),
+        ({"sense": "twin"}, "sim, real, not to 'twin'"),
+        ({"act": {"velocity": "up"}}, "sim, real, twin, not to 'up'"),
+        ({"mode": "real", "act": "sim"}, "not both"),
+    ],
+)
+def test_switches_that_there_are_not_are_refused_before_anything_changes(asked, message):
+    runtime, _, _ = make(continuity={"velocity": ("speed", 5.0)})
+    runtime.cycle()
+    with pytest.raises(ValueError, match=message):
+        runtime.prepare(**asked)
 
 
 def test_a_switch_to_a_machine_out_of_reach_or_not_ready_is_refused():
@@ -254,6 +310,15 @@ def test_requests_of_other_threads_are_served_between_cycles():
     with pytest.raises(ValueError, match="nowhere"):
         futures[1].result(timeout=1)
     assert sent(bridge)[-1] == pytest.approx(5.0 * np.array([-0.05, 0.0]))
+
+
+def test_a_request_that_was_given_up_is_left_out():
+    runtime, _, _ = switched()
+    done = []
+    given_up, served = (runtime.request(lambda name=name: done.append(name)) for name in ("given up", "served"))
+    assert given_up.cancel()
+    runtime.run(cycles=1)
+    assert served.done() and done == ["served"]
 
 
 def test_an_interruption_sends_the_fallback_once():

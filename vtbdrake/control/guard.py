@@ -107,6 +107,11 @@ class Guards:
         """The faults that latched; empty while the DPS commands."""
         return self._latched
 
+    @property
+    def driven(self) -> frozenset[str]:
+        """The actuator signals that were on real in the last cycle."""
+        return self._active
+
     def needs_start(self, name: str) -> bool:
         """Whether an actuator signal has a limit of its rate or acceleration, which counts from somewhere."""
         return self.commands[name].needs_start

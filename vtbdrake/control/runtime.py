@@ -265,6 +265,8 @@ class Runtime(Stepped):
             return
         while self._requests:
             action, future = self._requests.popleft()
+            if not future.set_running_or_notify_cancel():
+                continue
             try:
                 future.set_result(action())
             except Exception as error:

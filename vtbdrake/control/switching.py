@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.cycle import SWITCH
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
-from vtbdrake.testbed.switch import REAL, SIM
+from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM
 from vtbdrake.testbed.testbed import MODES, check_mode
 
 if TYPE_CHECKING:
@@ -44,30 +44,37 @@ def prepare(
 ) -> Preparation:
     """See `Runtime.prepare`.
 
-    A sensor signal that becomes real has to be fresh and plausible, an actuator signal that becomes real has to
-    continue what is measured, and the machine has to be ready and within reach.
+    A sensor signal that becomes real has to be fresh and plausible; if an actuator signal is to be on real, all sensor
+    signals on real have to be, and what its command departs from. One that becomes real has to continue what is
+    measured, and the machine has to be ready and within reach.
 
     Raises:
-        ValueError: the mode, a signal or a position is unknown.
+        ValueError: the mode, a signal or a position is unknown, or there are a mode and positions.
     """
     target = runtime.target
     if mode is not None:
         check_mode(mode)
+        if sense is not None or act is not None:
+            raise ValueError(f"give either the mode ({mode}) or the positions of a side, not both")
         sense, act = MODES[mode]
     interface = target.interface
-    senses = _positions(sense, [signal.name for signal in interface.sense])
-    acts = _positions(act, [signal.name for signal in interface.act])
+    senses = _positions("sensor", sense, [signal.name for signal in interface.sense], SENSE_POSITIONS)
+    acts = _positions("actuator", act, [signal.name for signal in interface.act], ACT_POSITIONS)
     if isinstance(target, DpsAlone) and any(position != REAL for position in [*senses.values(), *acts.values()]):
         raise ValueError("the DPS alone has no simulated world: it can be switched to real only")
     now = runtime.clock.now()
     reasons = []
-    becoming = [name for name, position in acts.items() if position != SIM]
-    if (becoming or REAL in senses.values()) and not runtime.bridge.connected:
+    commanding = [name for name, position in acts.items() if position != SIM]
+    becoming = [name for name in commanding if name not in runtime.guards.driven]
+    if (commanding or REAL in senses.values()) and not runtime.bridge.connected:
         reasons.append("the bridge is not connected")
-    for name, position in senses.items():
-        if position == REAL:
-            reasons += runtime.guards.doubts(name, now, runtime.bridge.sensed[name])
-    if becoming:
+    heard = [name for name, position in senses.items() if position == REAL]
+    if commanding:
+        heard += [name for name in runtime.watched if senses.get(name) != SIM]
+        heard += [runtime.continuity[name][0] for name in becoming if name in runtime.continuity]
+    for name in dict.fromkeys(heard):
+        reasons += runtime.guards.doubts(name, now, runtime.bridge.sensed[name])
+    if commanding:
         reasons += [f"the guards are latched ({fault.reason}): reset them first" for fault in runtime.guards.latched]
         not_ready = runtime.ready()
         if not_ready is not None:
@@ -80,10 +87,18 @@ def prepare(
     return Preparation(tuple(reasons), perform)
 
 
-def _positions(wanted: str | Mapping[str, str] | None, names: list[str]) -> dict[str, str]:
+def _positions(
+    kind: str, wanted: str | Mapping[str, str] | None, names: list[str], positions: tuple[str, ...]
+) -> dict[str, str]:
     if wanted is None:
         return {}
-    return dict.fromkeys(names, wanted) if isinstance(wanted, str) else dict(wanted)
+    given = dict.fromkeys(names, wanted) if isinstance(wanted, str) else dict(wanted)
+    for name, position in given.items():
+        if name not in names:
+            raise ValueError(f"there is no {kind} signal {name!r} to switch; there are: {', '.join(names)}")
+        if position not in positions:
+            raise ValueError(f"the {kind} signal {name} goes to one of {', '.join(positions)}, not to {position!r}")
+    return given
 
 
 def _jumps(runtime: Runtime, names: list[str]) -> list[str]:
@@ -114,8 +129,8 @@ def _jumps(runtime: Runtime, names: list[str]) -> list[str]:
 def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
     target, context = runtime.target, runtime.context
     for name, position in acts.items():
-        if position != SIM and name in runtime.continuity:
-            # Within its limits, the command departs from what is measured.
+        if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
+            # Within its limits, the command departs from what is measured; one that goes out goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
     runtime.changed(
         SWITCH,
@@ -131,8 +146,14 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
 
 
 def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
-    """Throws switches of a testbed that runs; a simulated world that takes over does so where the machine is."""
+    """Throws switches of a testbed that runs; where a signal goes back to sim, the simulated world goes on from where
+    the machine is."""
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)
-    if SIM in acts.values() and any(before["act"][name] != SIM for name in acts) and target.believes:
+    back = any(
+        position == SIM != before[side][name]
+        for side, positions in (("sense", senses), ("act", acts))
+        for name, position in positions.items()
+    )
+    if back and target.believes:
         target.start_from_belief(context)
