@@ -83,6 +83,15 @@ def test_what_waits_is_sent_before_it_ends():
     assert companion.take() == [b"10000000"]
 
 
+def test_one_that_waits_to_say_something_hears_the_rest():
+    companion = Companion(echo, name="echo", backlog=1 << 26)
+    frames = [bytes([k]) * 100_000 for k in range(100)]
+    for frame in frames:
+        assert companion.post(frame)
+    assert companion.close() == 0
+    assert companion.take() == frames
+
+
 def test_a_long_frame_goes_piece_by_piece():
     companion = Companion(sum_up, name="sum")
     waiting = []

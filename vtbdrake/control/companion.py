@@ -221,7 +221,9 @@ class Companion:
         """Waits until all that waits is sent, for ``timeout`` seconds at most."""
         end = time.monotonic() + timeout
         while self._waiting and self.alive and (left := end - time.monotonic()) > 0.0:
-            select.select((), (self._line,), (), left)
+            # Who waits for room to say something does not listen.
+            select.select((self._line,), (self._line,), (), left)
+            self._receive()
             self.flush()
 
     def close(self, timeout: float = 10.0) -> int:
