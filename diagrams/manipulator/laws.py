@@ -98,12 +98,14 @@ def _joint_impedance(
     p: dict[str, Expression],
     period: float,
 ) -> tuple[Expression, dict[str, Expression]]:
-    # Cartesian motions become joint motions by closed-loop inverse kinematics, from where the reference is.
+    # Cartesian motions become joint motions by closed-loop inverse kinematics, from where the reference is. Without the
+    # pull to the home pose, an arm with a joint to spare ends each circle in another posture, in the end at its stops.
     last = state["reference"]
     start, tip = model.tip(r.q), model.tip(last)
     least = _Projection(tip.J)
     error = _pose_error(tip.R, tip.p, start.R, start.p + r.dp)
-    v_c = least.inverse(_linear(r.dv) + p["tracking_rate"] * error) + least.null(p["posture_rate"] * (r.q - last))
+    pull = r.ease * p["posture_rate"] * (p["home"] - last)
+    v_c = least.inverse(_linear(r.dv) + p["tracking_rate"] * error) + least.null(pull)
     a_c = least.inverse(_linear(r.da) - model.tip_bias(last, v_c))
     q_r = casadi.if_else(r.in_joints, r.q, last)
     v_r = casadi.if_else(r.in_joints, r.v, v_c)
@@ -176,7 +178,7 @@ LAWS = {
             "stiffness": ((800.0, 800.0, 600.0, 600.0, 300.0, 150.0, 100.0), "N m/rad", _POSITIVE),
             "damping": ((60.0, 60.0, 40.0, 40.0, 20.0, 8.0, 6.0), "N m s/rad", _POSITIVE),
             "tracking_rate": (20.0, "1/s", _POSITIVE),
-            "posture_rate": (1.0, "1/s", _POSITIVE),
+            "posture_rate": (4.0, "1/s", _POSITIVE),
         },
         _joint_impedance,
     ),

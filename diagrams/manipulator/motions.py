@@ -52,6 +52,8 @@ class Reference:
         dp, dv, da: displacement of the tip (3) from its place at ``q``, in the world; 0 while the motion is in joint
             space.
         following: 1 during `follow`.
+        ease: of a Cartesian motion, 0 at its begin and end and at most 1 between, with its first derivative: when the
+            arm may do what the tip does not feel.
         state: the next values of ``motion``, ``clock`` and ``start``.
     """
 
@@ -63,6 +65,7 @@ class Reference:
     dv: Expression
     da: Expression
     following: Expression
+    ease: Expression
     state: dict[str, Expression]
 
 
@@ -112,7 +115,10 @@ def reference(
     ]
     following = {"motion": motion, "clock": clock + period, "start": start}
     in_joints = 1 - is_press - is_circle
-    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, FOLLOW), following)
+    x = clock / (is_press * p["press_duration"] + is_circle * p["circle_duration"] + in_joints)
+    x = casadi.fmin(casadi.fmax(x, 0), 1)
+    ease = (1 - in_joints) * (4 * x * (1 - x)) ** 2
+    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, FOLLOW), ease, following)
 
 
 def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression, Expression]:

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, Diagram
 from diagrams.manipulator.arm import GRAVITY, Arm
 from diagrams.manipulator.dps import SENSOR_SIGNALS, make_dps
 from diagrams.manipulator.laws import LAWS
+from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.world import add_arm
 from vtbdrake.state import Variables, collect
 
@@ -207,3 +208,17 @@ def test_offsets_calibrate_sensors_and_drives(plant: MultibodyPlant) -> None:
     bench = Bench("joint_impedance", **{"sense.offset.value": offset, "act.offset.value": np.full(7, 0.5)})
     bench.feed(joint_position=HOME - 0.01)
     np.testing.assert_allclose(bench.step(), model(plant, HOME)[0] + 0.5, atol=1e-6)
+
+
+def test_the_posture_stays_while_the_tip_goes_round_and_round() -> None:
+    """Inverse kinematics alone does not close a redundant arm's circle (Klein, Huang, "Review of Pseudoinverse Control
+    for Use with Kinematically Redundant Manipulators", 1983)."""
+    bench = Bench("joint_impedance")
+    bench.feed(motion=[float(CIRCLE)])
+    bench.step(8)
+    postures = []
+    for _ in range(2):
+        bench.step(5 * 4000)
+        postures.append(np.array(bench.read("impl.reference")))
+    np.testing.assert_allclose(postures[1], postures[0], atol=2e-3)
+    np.testing.assert_allclose(postures[1], HOME, atol=0.1)
