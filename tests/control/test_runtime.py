@@ -283,6 +283,32 @@ def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
     assert bridge.sensed["position"].count >= before + 30
 
 
+def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():
+    runtime, bridge, _ = switched(rate=0.0, lateness=[0.0] * 4 + [50.4 * PERIOD])
+    runtime.run(cycles=6)
+    assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True] * 4 + [False] * 2
+    assert runtime.guards.latched[0].kind == "missed" and runtime.missed == 50
+
+
+@pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])
+@pytest.mark.parametrize("asleep", [False, True])
+def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cycles(held_up, missed, asleep):
+    runtime, bridge, clock = switched(rate=0.0, pace="position")
+    poll = bridge.poll
+
+    def stopped(timeout=0.0):
+        if runtime.cycles == 5 and bool(timeout) == asleep:
+            clock.advance(held_up * PERIOD)
+            bridge.poll = poll
+        return poll(timeout)
+
+    bridge.poll = stopped
+    runtime.run(cycles=10)
+    assert bool(runtime.guards.latched) == (missed > 10)
+    if not asleep:
+        assert runtime.missed == missed
+
+
 def test_a_watcher_that_raises_is_left_out_and_the_others_go_on():
     seen = []
 

@@ -50,7 +50,8 @@ class Runtime(Stepped):
             several messages, name a signal of the last one: a cycle begins with the first message that has the signal,
             and steps with the values that the later ones had a cycle ago.
         patience: in periods, see ``pace``. It has to cover the machine's jitter, and be shorter than the sensor
-            signals' largest ages, so that a silent machine is noticed by a cycle.
+            signals' largest ages, so that a silent machine is noticed by a cycle. A paced loop that is held up for
+            longer has missed cycles.
         continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more.
         ready: says why the machine is not ready to be commanded, or None.
@@ -137,13 +138,12 @@ class Runtime(Stepped):
             while not self._stop.is_set():
                 if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                     return
-                woke = self._await(deadline)
-                lateness = 0.0 if self.pace is not None else woke - deadline
+                due, lateness = self._await(deadline)
                 self.cycle(lateness=lateness)
                 done += 1
                 if until():
                     return
-                deadline = self._next(deadline)
+                deadline = self._next(due)
         except BaseException:
             self.send_fallback("the loop ended")
             raise
@@ -161,9 +161,10 @@ class Runtime(Stepped):
         """Ends `run` after the present cycle; from any thread."""
         self._stop.set()
 
-    def _await(self, deadline: float) -> float:
+    def _await(self, deadline: float) -> tuple[float, float]:
+        """Waits for the next cycle; gives when it was due, and how late it is."""
         if self.pace is None:
-            return self.clock.wait_until(deadline)
+            return deadline, self.clock.wait_until(deadline) - deadline
         reception = self.bridge.sensed[self.pace]
         count, limit = reception.count, self.clock.now() + self._patience
         while reception.count == count:
@@ -171,19 +172,22 @@ class Runtime(Stepped):
             if left <= 0.0:
                 break
             self.bridge.poll(left)
-        return self.clock.now()
+        woke = self.clock.now()
+        return woke, max(woke - limit, 0.0)
 
-    def _next(self, deadline: float) -> float:
+    def _next(self, due: float) -> float:
         """The next deadline; those that have passed already are left out and counted."""
-        if self.pace is not None:
-            return self.clock.now()
+        now = self.clock.now()
         # The one that is due just now can still be kept.
-        behind = max(floor((self.clock.now() - deadline) / self.period), 0)
+        behind = max(floor((now - due) / self.period), 0)
+        if self.pace is not None:
+            self.statistics.miss(behind if now - due > self._patience else 0)
+            return now
         self.statistics.miss(behind)
-        return deadline + (behind + 1) * self.period
+        return due + (behind + 1) * self.period
 
     def cycle(self, *, lateness: float = 0.0) -> Cycle:
-        """One cycle, now."""
+        """One cycle, now; ``lateness`` is how many seconds after it was due."""
         begin = self.clock.now()
         self.bridge.poll()
         now = self.clock.now()
@@ -201,7 +205,8 @@ class Runtime(Stepped):
             commands,
             active,
             error=error,
-            missed=self.statistics.run,
+            # Who slept for long wakes up to old messages: those deadlines count before anything is sent.
+            missed=self.statistics.run + int(lateness / self.period),
             not_ready=self.ready() if active else None,
         )
         if verdict.commands:
