@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -73,5 +74,13 @@ def test_file_gives_back_what_was_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"mean": {}}', '{"other": 1}'])
 def test_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "nominal.json").write_text(text)
+    with pytest.raises(CalibrationError, match="no calibration"):
+        Calibration.load(tmp_path / "nominal.json")
+
+
+@pytest.mark.parametrize("mean", [[], None, {"sense.level": [float("nan")]}, {"sense.level": ["a"]}])
+def test_file_whose_numbers_are_none_is_refused(tmp_path: Path, mean: object) -> None:
+    content = {"mean": mean, "deviation": {"sense.level": [1.0]}, "windows": 200, "horizon": 10, "period": 0.001}
+    (tmp_path / "nominal.json").write_text(json.dumps(content))
     with pytest.raises(CalibrationError, match="no calibration"):
         Calibration.load(tmp_path / "nominal.json")

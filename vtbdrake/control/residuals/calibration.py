@@ -51,8 +51,12 @@ class Calibration:
             CalibrationError: the file is not one that `save` has written.
         """
         try:
-            return cls(**json.loads(Path(path).read_text()))
-        except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
+            calibration = cls(**json.loads(Path(path).read_text()))
+            # One that is not finite would make a residual that never alarms.
+            for entries in (*calibration.mean.values(), *calibration.deviation.values()):
+                np.asarray_chkfinite(entries, dtype=float)
+            return calibration
+        except (ValueError, TypeError, AttributeError) as error:
             raise CalibrationError(
                 f"{path} is no calibration of residuals as Calibration.save writes it: {error}"
             ) from None
