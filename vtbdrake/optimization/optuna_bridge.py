@@ -16,8 +16,8 @@ from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import encode
 from vtbdrake.optimization.study_error import StudyError
+from vtbdrake.optimization.study_file import encode
 
 if TYPE_CHECKING:
     import optuna

@@ -142,7 +142,7 @@ class Choice:
 
     def __init__(self, address: str, options: Sequence[Any]) -> None:
         object.__setattr__(self, "address", address)
-        object.__setattr__(self, "options", tuple(options))
+        object.__setattr__(self, "options", tuple(o.item() if isinstance(o, np.generic) else o for o in options))
         for option in self.options:
             if not isinstance(option, bool | int | float | str):
                 raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")

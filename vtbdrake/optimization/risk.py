@@ -93,3 +93,4 @@ def make_risk(risk: str | Risk) -> Risk:
 def _check_level(risk: Quantile | CVaR) -> None:
     if not 0.0 < risk.level <= 1.0:
         raise ValueError(f"the level of {type(risk).__name__} lies in (0, 1], unlike {risk.level}")
+    object.__setattr__(risk, "level", float(risk.level))

@@ -8,12 +8,12 @@ from concurrent.futures import Executor as FuturesExecutor
 from math import ceil
 from typing import TYPE_CHECKING, Any, Self
 
-from vtbdrake.optimization.identity import describe, differences, revision, versions
+from vtbdrake.optimization.identity import describe, differences, plain_options, revision, versions
 from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
 from vtbdrake.optimization.solvers.solver import Solver
-from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.optimization.study_error import StudyError
+from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.optimization.study_record import StudyRecord
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
@@ -66,7 +66,7 @@ class Study(StudyRecord):
             "problem": describe(problem),
             "solver": solver or "auto",
             "seed": 0 if seed is None else int(seed),
-            "options": dict(options or {}),
+            "options": plain_options(options or {}),
             "versions": versions(),
             "revision": revision(problem.scenario),
             "units": list(problem.units),

@@ -1,0 +1,138 @@
+"""When a problem is the same one: it is not the way in which it is written that counts, but what it means."""
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.optimization.studies import DAMPING, THETA, pendulum_problem
+from vtbdrake.optimization import Choice, CVaR, Risk, StudyError
+from vtbdrake.optimization.identity import describe
+from vtbdrake.rollout import Constraint, Quality
+
+ROOT = Path(__file__).resolve().parents[2]
+WANTED = 0.3
+
+
+def away_from(wanted):
+    return lambda theta: abs(theta - wanted)
+
+
+def distance(theta, wanted):
+    return abs(theta - wanted)
+
+
+def square(theta, wanted):
+    return (theta - wanted) ** 2
+
+
+def from_the_wanted(theta):
+    return distance(theta, WANTED)
+
+
+class Distance:
+    def __init__(self, wanted):
+        self.wanted = wanted
+
+    def __call__(self, theta):
+        return abs(theta - self.wanted)
+
+
+class Best(Risk):
+    def __call__(self, h):
+        return float(h.max())
+
+
+def typed(text):
+    """A function that was typed into an interpreter: it has no source."""
+    return eval(text, {})
+
+
+def quality(function):
+    return pendulum_problem(quality=Quality(function, THETA, minimize=True))
+
+
+@pytest.mark.parametrize(
+    ("one", "same", "other"),
+    [
+        (away_from(0.3), away_from(np.float64(0.3)), away_from(0.4)),
+        (
+            functools.partial(distance, wanted=0.3),
+            functools.partial(distance, wanted=0.3),
+            functools.partial(distance, wanted=0.4),
+        ),
+        (
+            functools.partial(distance, wanted=0.3),
+            functools.partial(distance, wanted=0.3),
+            functools.partial(square, wanted=0.3),
+        ),
+        (Distance(0.3), Distance(0.3), Distance(0.4)),
+        (Distance(0.3).__call__, Distance(0.3).__call__, Distance(0.4).__call__),
+        (typed("lambda x: abs(x)"), typed("lambda x: abs(x)"), typed("lambda x: x * x")),
+        (abs, abs, np.square),
+    ],
+)
+def test_a_quality_function_is_what_it_computes(tmp_path, one, same, other):
+    path = tmp_path / "a.db"
+    quality(one).study(path).close()
+    quality(same).study(path).close()
+    with pytest.raises(StudyError, match="has other code, or uses other values|qualities"):
+        quality(other).study(path)
+
+
+def test_a_constant_of_the_module_belongs_to_a_quality_function(monkeypatch):
+    before = describe(quality(from_the_wanted))
+    monkeypatch.setattr(sys.modules[__name__], "WANTED", 0.5)
+    assert describe(quality(from_the_wanted)) != before
+
+
+def test_another_process_knows_the_same_functions():
+    code = (
+        "from tests.optimization.test_identity import *\n"
+        "made = [away_from(0.3), Distance(0.3), from_the_wanted, functools.partial(square, wanted=0.3)]\n"
+        "print([describe(quality(f))['qualities'] for f in made], describe(pendulum_problem(risk=Best()))['risk'])"
+    )
+    first, second = (
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert first == second != ""
+
+
+def test_numbers_of_numpy_and_whole_numbers_are_numbers():
+    def problem(number, conditions):
+        return pendulum_problem(
+            horizon=number(1),
+            sample_period=number(1),
+            quality=Quality(abs, THETA, upper=number(4)),
+            constraints=[Constraint(abs, THETA, at_most=number(2))],
+            risk=CVaR(number(1)),
+            conditions=conditions,
+        )
+
+    expected = describe(problem(float, [{DAMPING: 0.0}]))
+    for number in (int, np.int64, np.float64, np.float32):
+        assert describe(problem(number, [{DAMPING: np.float64(0.0)}])) == expected
+
+
+def test_options_of_numpy_are_options():
+    assert Choice(DAMPING, np.arange(3)).options == (0, 1, 2)
+    assert Choice(DAMPING, np.arange(3)) == Choice(DAMPING, [0, 1, 2])
+
+
+@pytest.mark.parametrize(("solver", "options"), [("grid", {"points": (2, 3)}), ("cmaes", {"population": np.int64(5)})])
+def test_a_study_with_options_is_resumed_with_the_same_options(tmp_path, solver, options):
+    for rollouts in (3, 6):
+        with pendulum_problem().study(tmp_path / "a.db", solver=solver, options=options) as study:
+            study._file.set("evaluations", 6)
+            study._meta = study._file.meta
+            assert len(study.run(rollouts=rollouts, executor="serial", progress=False)) == rollouts
+
+
+def test_an_option_that_cannot_be_kept_is_refused_before_there_is_a_file(tmp_path):
+    with pytest.raises(ValueError, match="a study keeps the options of its solver, which are numbers, words"):
+        pendulum_problem().study(tmp_path / "a.db", solver="TPE", options={"sampler_options": {"gamma": len}})
+    assert not (tmp_path / "a.db").exists()
