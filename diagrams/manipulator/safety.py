@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from diagrams.manipulator.arm import JOINTS, Arm
 from diagrams.manipulator.dynamics import ArmDynamics, function
 from diagrams.manipulator.laws import LAWS
-from vtbdrake.control.fallback import Fallback, FallbackController, Zero
+from vtbdrake.control.fallback import Fallback, Zero
 
 # The switch to real is refused where the command is further than this from the measured torque (N m).
 CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
@@ -21,14 +21,16 @@ SLIP = 0.02
 """How far the held pose may be from the arm (rad)."""
 
 
-class FloatInPlace:
+class FloatInPlace(Fallback):
     """Carries the arm's weight, and holds it by the joint impedance law's springs and dampers, tau = g(q) + K (h - q)
     - D v.
 
     The pose h is dragged along where the arm is more than `SLIP` away: the arm is held wherever it was when this takes
     over, and gives way to who pushes it. Without a fresh position it carries the weight of the last one (which does not
-    accelerate the arm much, unlike no torque at all); without any, it cannot command.
+    accelerate the arm much, unlike no torque at all); without any, there is no torque.
     """
+
+    otherwise = Zero()
 
     def __init__(self, arm: Arm | None = None) -> None:
         model = ArmDynamics(arm)
@@ -39,8 +41,10 @@ class FloatInPlace:
         self._position: NDArray[np.float64] | None = None
         self._held: NDArray[np.float64] | None = None
 
-    def __call__(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> NDArray[np.float64]:
-        """A command of a `FallbackController`."""
+    def take_over(self) -> None:
+        self._position = self._held = None
+
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> NDArray[np.float64]:
         fresh = "joint_position" in sensed and "joint_velocity" in sensed
         if fresh:
             self._position = q = np.array(sensed["joint_position"])
@@ -55,4 +59,4 @@ class FloatInPlace:
 
 def arm_fallback() -> dict[str, Fallback]:
     """What commands the arm after a fault: it floats in place."""
-    return {"joint_torque": FallbackController(FloatInPlace(), otherwise=Zero())}
+    return {"joint_torque": FloatInPlace()}

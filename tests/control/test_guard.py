@@ -297,6 +297,26 @@ def test_fallback_learns_how_much_time_has_passed() -> None:
     assert spans == pytest.approx([0.003, T, 0.006])
 
 
+def test_fallback_is_told_once_per_latch_that_it_takes_over() -> None:
+    class Counting(Hold):
+        times = 0
+
+        def take_over(self) -> None:
+            self.times += 1
+
+    counting = Counting()
+    loop = Loop(TORQUE, fallback={"torque": counting})
+    told = []
+    for commands in ([1.0, 1.0], [nan, 0.0], [1.0, 1.0]):
+        loop.cycle({"torque": commands})
+        told.append(counting.times)
+    loop.reset()
+    for commands in ([1.0, 1.0], [nan, 0.0]):
+        loop.cycle({"torque": commands})
+        told.append(counting.times)
+    assert told == [0, 1, 1, 1, 2]
+
+
 def test_fault_that_is_told_latches_and_gives_the_fallback_commands() -> None:
     loop = Loop(TORQUE)
     loop.cycle({"torque": [0.1, 0.1]})

@@ -28,6 +28,9 @@ class Fallback(ABC):
             ValueError: it cannot command ``signal``.
         """
 
+    def take_over(self) -> None:  # noqa: B027 - most remember nothing
+        """Called before its first command after a fault: what it remembers of an earlier one is long over."""
+
     @abstractmethod
     def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
         """What is to be sent.

@@ -98,6 +98,7 @@ class Guards:
         self._latched: tuple[Fault, ...] = ()
         self._faults: tuple[Fault, ...] = ()
         self._causes: tuple[Fault, ...] = ()  # Those of them that are not about sensor signals.
+        self._begun: set[Fallback] = set()
         self._failed: set[Fallback] = set()
         self._active: frozenset[str] = frozenset()
         self._last: float | None = None
@@ -235,6 +236,7 @@ class Guards:
 
     def _latch(self, faults: tuple[Fault, ...]) -> None:
         self._latched = faults
+        self._begun.clear()
         self._failed.clear()
         _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
 
@@ -258,6 +260,9 @@ class Guards:
         last_sent = guard.last_sent
         for fallback in self._fallbacks[name]:
             try:
+                if fallback not in self._begun:
+                    self._begun.add(fallback)
+                    fallback.take_over()
                 return guard.limit(fallback.command(last_sent, sensed, dt))
             except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
                 if fallback not in self._failed:

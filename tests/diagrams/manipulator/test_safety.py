@@ -31,17 +31,17 @@ def sensed(q: np.ndarray, v: np.ndarray = REST) -> dict[str, np.ndarray]:
 
 
 def test_resting_arm_is_carried() -> None:
-    torque = FloatInPlace()(np.zeros(7), sensed(HOME), 0.001)
+    torque = FloatInPlace().command(np.zeros(7), sensed(HOME), 0.001)
     np.testing.assert_allclose(torque, gravity(HOME), atol=1e-9)
 
 
 def test_arm_that_moves_is_braked_and_pulled_back() -> None:
     floating = FloatInPlace()
-    floating(np.zeros(7), sensed(HOME), 0.001)
+    floating.command(np.zeros(7), sensed(HOME), 0.001)
     q, v = HOME + 0.01, np.full(7, 0.1)
-    pull = floating(np.zeros(7), sensed(q, v), 0.001) - gravity(q)
+    pull = floating.command(np.zeros(7), sensed(q, v), 0.001) - gravity(q)
     assert (pull < 0.0).all()
-    slower = floating(np.zeros(7), sensed(q), 0.001) - gravity(q)
+    slower = floating.command(np.zeros(7), sensed(q), 0.001) - gravity(q)
     assert (slower < 0.0).all()
     assert (pull < slower).all()
 
@@ -49,19 +49,35 @@ def test_arm_that_moves_is_braked_and_pulled_back() -> None:
 def test_pose_far_away_is_no_goal() -> None:
     """The arm was moved while somebody else commanded it: the springs pull no harder than at the slip."""
     floating, pushed = FloatInPlace(), FloatInPlace()
-    floating(np.zeros(7), sensed(HOME), 0.001)
-    pushed(np.zeros(7), sensed(HOME), 0.001)
+    floating.command(np.zeros(7), sensed(HOME), 0.001)
+    pushed.command(np.zeros(7), sensed(HOME), 0.001)
     far, near = HOME + 1.0, HOME + SLIP
-    torques = [f(np.zeros(7), sensed(q), 0.001) - gravity(q) for f, q in ((floating, far), (pushed, near))]
+    torques = [f.command(np.zeros(7), sensed(q), 0.001) - gravity(q) for f, q in ((floating, far), (pushed, near))]
     np.testing.assert_allclose(torques[0], torques[1], atol=1e-9)
 
 
 def test_weight_of_the_last_known_pose_is_carried_blindly() -> None:
     floating = FloatInPlace()
-    floating(np.zeros(7), sensed(HOME), 0.001)
-    np.testing.assert_allclose(floating(np.zeros(7), {}, 0.001), gravity(HOME), atol=1e-9)
+    floating.command(np.zeros(7), sensed(HOME), 0.001)
+    np.testing.assert_allclose(floating.command(np.zeros(7), {}, 0.001), gravity(HOME), atol=1e-9)
+
+
+def test_arm_is_held_where_it_was_when_this_took_over() -> None:
+    floating = FloatInPlace()
+    floating.command(np.zeros(7), sensed(HOME), 0.001)
+    floating.take_over()
+    moved = HOME + 0.3
+    np.testing.assert_allclose(floating.command(np.zeros(7), sensed(moved), 0.001), gravity(moved), atol=1e-9)
+
+
+def test_pose_of_an_earlier_fault_is_forgotten() -> None:
+    floating = FloatInPlace()
+    floating.command(np.zeros(7), sensed(HOME), 0.001)
+    floating.take_over()
+    with pytest.raises(RuntimeError, match="no position"):
+        floating.command(np.zeros(7), {}, 0.001)
 
 
 def test_arm_that_was_never_seen_cannot_be_carried() -> None:
     with pytest.raises(RuntimeError, match="no position"):
-        FloatInPlace()(np.zeros(7), {}, 0.001)
+        FloatInPlace().command(np.zeros(7), {}, 0.001)
