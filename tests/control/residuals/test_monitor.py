@@ -6,15 +6,18 @@ import os
 import select
 import signal
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, System
 
 from tests.control.residuals.line import Ear, Line, Together, loop
-from tests.control.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
+from tests.control.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
+from tests.control.scripted import ServoScenario
 from vtbdrake.control.residuals import ResidualConfig, ResidualMonitor, residuals_of
-from vtbdrake.testbed import DpsAlone
+from vtbdrake.state import parameter
+from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
 
 TOLERANCE = {"sense.position": 1e-4, "sense.velocity": 1e-3, "act.torque": 1e-3}
 CONFIG = ResidualConfig(period=PERIOD, tolerance=TOLERANCE)
@@ -140,6 +143,83 @@ def test_idle_dps_is_not_compared() -> None:
         runtime.cycle()
     monitor.close()
     assert not monitor.history
+
+
+class Moody(Rhythm):
+    """A rhythm that commands only while it is in the mood."""
+
+    def __init__(self) -> None:
+        super().__init__(PERIOD)
+        mood = self.DeclareNumericParameter(BasicVector([1.0]))
+        self.DeclareVectorOutputPort("wish", 1, self._wish)
+        self.variables = (*self.variables, parameter("mood", mood))
+
+    def _wish(self, context: Context, output: BasicVector) -> None:
+        if not context.get_numeric_parameter(0).value()[0]:
+            raise RuntimeError("not in the mood")
+        output.SetFromVector(context.get_discrete_state(0).value())
+
+
+@dataclass
+class MoodyPendulum(DrivenPendulum):
+    believes: bool = False
+
+    def make_dps(self) -> System:
+        builder = DiagramBuilder()
+        rhythm = builder.AddNamedSystem("rhythm", Moody())
+        for name in ("position", "velocity"):
+            builder.ExportInput(rhythm.GetInputPort(name), name)
+        builder.ExportOutput(rhythm.GetOutputPort("wish"), "torque")
+        return builder.Build()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        builder.believe("sim.sys.Pendulum.theta.position", of=["dps.rhythm.seen[0]"])
+        builder.believe("sim.sys.Pendulum.theta.velocity", of=["dps.rhythm.seen[1]"])
+
+
+def test_shadow_goes_on_behind_a_dps_that_raised_and_tells_it_once(caplog: pytest.LogCaptureFixture) -> None:
+    together = Together(SCENARIO, machine(SCENARIO), shadowing=MoodyPendulum())
+    shadow = together.shadow
+    assert shadow is not None
+    monitor = ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+    together.run(200)
+    before = len(monitor.history)
+    shadow.write({"dps.rhythm.mood": 0.0})
+    together.run(20)
+    shadow.write({"dps.rhythm.mood": 1.0})
+    together.run(200)
+    assert caplog.text.count("the DPS raised RuntimeError when it was asked for its answer: ") == 1
+    assert len(monitor.history) - before >= 18 and monitor.skipped >= 2
+    assert "sense.position" not in [alarm.signal for alarm in monitor.alarms]
+
+
+class HalfTimeless(Line):
+    """A way on which only the position tells its time."""
+
+    def poll(self, timeout: float = 0.0) -> int:
+        count = super().poll(timeout)
+        self.sensed["velocity"].sent = float("nan")
+        return count
+
+
+def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
+    def residuals(kind: type[Line]) -> np.ndarray:
+        line = kind(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+        driver = loop(DpsAlone(SCENARIO), line, PERIOD)
+        monitor = ResidualMonitor(driver, "twin", config=CONFIG, aside=False)
+        driver.run(cycles=300)
+        assert monitor.arrays()["time"].size > 10
+        return monitor.arrays()["sense.velocity"]
+
+    np.testing.assert_array_equal(residuals(HalfTimeless), residuals(Line))
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_world_of_other_signals_is_refused(aside: bool) -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match=r"ServoScenario predicts other signals than sense.position"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), aside=aside)
 
 
 @pytest.mark.parametrize("aside", [True, False])

@@ -20,6 +20,7 @@ from vtbdrake.control.residuals.config import SHADOW, ResidualConfig, check_mode
 from vtbdrake.control.residuals.predictor import Predictor
 from vtbdrake.control.residuals.rows import Array, RowLayout, Sampler
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import Interface
 
 _log = logging.getLogger(__name__)
 
@@ -57,8 +58,9 @@ class ResidualMonitor:
         failed: those whose prediction failed; ``error`` says how the last one did.
 
     Raises:
-        ValueError: the scenario declares no belief, or has a signal that is no vector; a signal of a tolerance or
-            calibration is unknown, or has no scale; the machine does not report what a shadow needs.
+        ValueError: the scenario declares no belief, has other signals than the loop's target, or one that is no
+            vector; a signal of a tolerance or calibration is unknown, or has no scale; the machine does not report
+            what a shadow needs.
         ResidualError: the other process does not begin.
     """
 
@@ -80,6 +82,12 @@ class ResidualMonitor:
         if scenario is None:
             raise ValueError(
                 "the loop's target was not built by a scenario: say which one predicts, by ResidualConfig.scenario"
+            )
+        signals = _sizes(runtime.target.interface)
+        if _sizes(scenario.interface()) != signals:
+            raise ValueError(
+                f"{scenario.name()} predicts other signals than {', '.join(signals)} of the loop's target: "
+                "ResidualConfig.scenario needs the same interface"
             )
         if config.period != runtime.period:
             raise ValueError(
@@ -236,3 +244,11 @@ class ResidualMonitor:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _sizes(interface: Interface) -> dict[str, int | None]:
+    return {
+        f"{side}.{signal.name}": signal.size
+        for side, signals in (("sense", interface.sense), ("act", interface.act))
+        for signal in signals
+    }

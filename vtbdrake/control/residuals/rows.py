@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
@@ -12,6 +13,8 @@ from vtbdrake.control.residuals.config import TWIN
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import Interface, VirtualTestbed
 from vtbdrake.testbed.switch import REAL
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -85,6 +88,7 @@ class Sampler:
         self._reported = [(name, runtime.bridge.reported[name]) for name in layout.reported]
         self._counts = dict.fromkeys(layout.reported, 0)
         self._first = np.nan
+        self._trouble = ""
 
     def listens(self) -> bool:
         """Whether the DPS is fed by the machine alone, so that what it believes is about the machine."""
@@ -103,15 +107,26 @@ class Sampler:
             row[INDEX], row[TIME] = index, cycle.time
             for name in groups[index]:
                 row[self._layout.sense[name]] = cycle.fed[name]
-        self._answer(rows[len(groups) - 1], max(groups), cycle)
+        try:
+            self._answer(rows[len(groups) - 1], max(groups), cycle)
+            self._trouble = ""
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # What is not known then is missing in its window. What happens in every cycle is told once.
+            if str(error) != self._trouble:
+                self._trouble = str(error)
+                _log.warning("the DPS raised %s when it was asked for its answer: %s", type(error).__name__, error)
         return len(groups)
 
     def _by_index(self, cycle: Cycle) -> dict[int, list[str]]:
-        """The signals that are new, by the index of their samples."""
+        """The signals that are new, by the index of their samples; one that does not tell its time is as new as the
+        newest that does."""
         times = {name: self._sensed[name].sent for name in cycle.fed}
+        if any(sent != sent for sent in times.values()):
+            told = [reception.sent for reception in self._sensed.values() if reception.sent == reception.sent]
+            if not told:
+                return {cycle.number: list(times)}
+            times = {name: sent if sent == sent else max(told) for name, sent in times.items()}
         oldest = min(times.values())
-        if oldest != oldest:
-            return {cycle.number: list(times)}
         if not self._first <= oldest:  # also at first, when it is NaN, and where the sender's time was set back
             self._first = oldest
         groups: dict[int, list[str]] = {}
@@ -121,14 +136,14 @@ class Sampler:
 
     def _answer(self, row: Array, index: int, cycle: Cycle) -> None:
         """What the DPS made of the newest sample, and what is reported beside it."""
-        for name, place in self._layout.command.items():
-            command = cycle.verdict.commands.get(name) if self._sends else self._runtime.command(name)
-            if command is not None:
-                row[place] = command
         for name, reception in self._reported:
             if reception.count != self._counts[name]:
                 self._counts[name] = reception.count
                 row[self._layout.reported[name]] = reception.value
+        for name, place in self._layout.command.items():
+            command = cycle.verdict.commands.get(name) if self._sends else self._runtime.command(name)
+            if command is not None:
+                row[place] = command
         for age, estimates in self._estimates:
             if (index - age) % self._horizon == 0:
                 for place, read in estimates:
