@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import lcm
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
@@ -17,7 +18,7 @@ from click.testing import CliRunner, Result
 from diagrams.manipulator import ManipulatorScenario
 from tests.cli.program import ROOT, run
 from tests.control.scripted import PERIOD
-from tests.control.servo_machine import PATIENCE, ServoMachineScenario
+from tests.control.servo_machine import COMMAND, PATIENCE, ServoMachineScenario
 from tests.control.test_loop import Ear
 from vtbdrake.cli import main
 from vtbdrake.control.hub import Hub
@@ -198,6 +199,22 @@ def test_a_machine_that_does_not_speak_is_waited_for_and_then_given_up(hub: Hub)
     last = errors.splitlines()[-1]
     assert last.startswith("Error: not switched to the machine after 1.0 s: ")
     assert "position" in last and "speed" in last
+
+
+def test_a_frozen_owner_of_the_commands_is_succeeded_only_on_request() -> None:
+    with Hub(port=0, protect=[COMMAND], lease=0.05) as hub:
+        owner, options = lcm.LCM(hub.url), ("--url", hub.url, "--no-live", "--pace", "", *FAR)
+        owner.publish(COMMAND, b"the last one before it froze")
+        with start(SERVO, *options, "--wait", 3.0) as program:
+            _, errors = program.communicate(timeout=PATIENCE)
+        assert program.returncode == 1
+        assert f"the hub protects {COMMAND} for somebody else" in errors.splitlines()[-1]
+        ear = Ear(hub.url)
+        with MachineProcess(ServoMachineScenario(), hub.url), start(SERVO, *options, "--take-over") as program:
+            ear.listen(lambda: len(ear.torques) >= 40)
+            program.send_signal(signal.SIGINT)
+            _, errors = program.communicate(timeout=PATIENCE)
+        assert program.returncode == 0, errors
 
 
 def another_snapshot(folder: Path) -> Path:

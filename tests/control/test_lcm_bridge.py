@@ -404,6 +404,8 @@ def test_bridge_whose_commands_the_hub_refuses_counts_and_logs_it(caplog: pytest
         wait(first, lambda: hub.statistics().protected["IIWA_COMMAND"].owner is not None)
         assert wait(second, both_publish)
         assert first.sent["position"].withheld == {}
+        assert first.hindrance is None
+        assert second.hindrance == "the hub protects IIWA_COMMAND for somebody else"
         [record] = [record for record in caplog.records if "refused by the hub" in record.message]
         assert hub.statistics().protected["IIWA_COMMAND"].owner in record.message
 

@@ -283,6 +283,28 @@ def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
     assert bridge.sensed["position"].count >= before + 30
 
 
+def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
+    class Contended(ScriptedBridge):
+        hindrance = None
+
+    scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
+    bridge = Contended(scenario.interface(), clock, still)
+    runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
+    runtime.write({"u.target": TARGET})
+    runtime.cycle()
+    bridge.hindrance = "it belongs to somebody else"
+    assert "belongs to somebody else" in refusal(runtime)
+    bridge.hindrance = None
+    runtime.switch("real")
+    runtime.run(cycles=2)
+    bridge.hindrance = "it belongs to somebody else"
+    runtime.run(cycles=1)
+    bridge.hindrance = None
+    runtime.run(cycles=2)
+    assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True, True, False, False, False]
+    assert runtime.guards.latched[0].kind == "not ready"
+
+
 def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():
     runtime, bridge, _ = switched(rate=0.0, lateness=[0.0] * 4 + [50.4 * PERIOD])
     runtime.run(cycles=6)

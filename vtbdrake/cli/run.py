@@ -62,6 +62,12 @@ MOST_FAULTS = 20
     "--wait", type=float, default=60.0, show_default=True, metavar="S", help="Give up if the machine is not ready then."
 )
 @click.option(
+    "--take-over",
+    "succeed",
+    is_flag=True,
+    help="Ask the hub for command channels whose owner has fallen silent: a frozen DPS, say.",
+)
+@click.option(
     "--priority",
     type=click.IntRange(0, 99),
     default=PRIORITY,
@@ -88,6 +94,7 @@ def run_dps(
     pace: str | None,
     seconds: float | None,
     wait: float,
+    succeed: bool,
     priority: int,
     lock_memory: bool,
     live: bool,
@@ -123,6 +130,8 @@ def run_dps(
         except BridgeError as error:
             raise FailedError(one_line(error)) from error
         stack.callback(bridge.close)
+        if succeed:
+            bridge.take_over()
         if live:
             stack.enter_context(LiveService(runtime, url))
         if record is not None:

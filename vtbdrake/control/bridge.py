@@ -95,6 +95,11 @@ class Bridge(ABC):
     def connected(self) -> bool:
         """Whether messages can come and go at present. A bridge that lost its connection seeks a new one in `poll`."""
 
+    @property
+    def hindrance(self) -> str | None:
+        """Why commands that leave do not reach the machine, as far as is known; None if nothing is."""
+        return None
+
     @abstractmethod
     def close(self) -> None:
         """Gives the connection back; it may be opened again."""

@@ -135,6 +135,12 @@ class LcmBridge(Bridge):
     def connected(self) -> bool:
         return self._link.connected
 
+    @property
+    def hindrance(self) -> str | None:
+        if not self._ownership.foreign:
+            return None
+        return f"the hub protects {', '.join(sorted(self._ownership.foreign))} for somebody else"
+
     def open(self) -> None:
         self._link.open()
 

@@ -207,7 +207,7 @@ class Runtime(Stepped):
             error=error,
             # Who slept for long wakes up to old messages: those deadlines count before anything is sent.
             missed=self.statistics.run + int(lateness / self.period),
-            not_ready=self.ready() if active else None,
+            not_ready=self.not_ready() if active else None,
         )
         if verdict.commands:
             self.bridge.publish(verdict.commands)
@@ -231,6 +231,10 @@ class Runtime(Stepped):
         farewell = {name: command for name, command in verdict.commands.items() if name in self.active}
         if farewell:
             self.bridge.publish(farewell)
+
+    def not_ready(self) -> str | None:
+        """Why the machine is not to be commanded at present: it is not ready, or somebody else commands it."""
+        return self.bridge.hindrance or self.ready()
 
     # -- switches
 

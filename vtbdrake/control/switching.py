@@ -76,7 +76,7 @@ def prepare(
         reasons += runtime.guards.doubts(name, now, runtime.bridge.sensed[name])
     if commanding:
         reasons += [f"the guards are latched ({fault.reason}): reset them first" for fault in runtime.guards.latched]
-        not_ready = runtime.ready()
+        not_ready = runtime.not_ready()
         if not_ready is not None:
             reasons.append(f"the machine is not ready: {not_ready}")
         reasons += _jumps(runtime, becoming)
