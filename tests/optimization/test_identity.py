@@ -127,8 +127,6 @@ def test_options_of_numpy_are_options():
 def test_a_study_with_options_is_resumed_with_the_same_options(tmp_path, solver, options):
     for rollouts in (3, 6):
         with pendulum_problem().study(tmp_path / "a.db", solver=solver, options=options) as study:
-            study._file.set("evaluations", 6)
-            study._meta = study._file.meta
             assert len(study.run(rollouts=rollouts, executor="serial", progress=False)) == rollouts
 
 

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -144,13 +145,61 @@ def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
     whole.run(rollouts=45, executor="serial", progress=False)
     path = tmp_path / "parts.db"
     first = pendulum_problem().study(path, solver=solver, seed=2)
-    # The budget that the solver is made for is that of the first run.
+    # As if it had been interrupted: the budget that the solver is made for is that of the run.
     first._file.set("evaluations", 45)
-    first._meta = first._file.meta
     first.run(rollouts=17, executor="serial", progress=False).close()
     with pendulum_problem().study(path) as second:
         assert second.run(rollouts=45, executor="threads", progress=False).reason == whole.reason
         assert table(second) == table(whole)
+
+
+@pytest.mark.parametrize("solver", ["cmaes", "TPE", "LN_COBYLA", "SNOPT", "differential-evolution", "sobol", "random"])
+def test_a_study_with_a_larger_budget_goes_on_as_if_it_had_had_it_from_the_start(tmp_path, solver):
+    whole = pendulum_problem().study(solver=solver, seed=2).run(rollouts=45, executor="serial", progress=False)
+    study = pendulum_problem().study(tmp_path / "parts.db", solver=solver, seed=2)
+    for rollouts in (1, 17, 20, 45):
+        study.run(rollouts=rollouts, executor="serial", progress=False)
+        assert len(study) == min(rollouts, len(whole))
+    assert study.rollouts == _without_times(study, whole)
+    points = [(tuple(t.parameters.values()), t.values) for t in study.trials]
+    assert dict(points) == {tuple(t.parameters.values()): t.values for t in whole.trials}
+    assert len(points) == len(set(points))
+
+
+def _without_times(study, whole):
+    """The rollouts of ``whole``, with the times that those of ``study`` took."""
+    return {row: replace(o, wall_time=study.rollouts[row].wall_time) for row, o in whole.rollouts.items()}
+
+
+def test_a_larger_budget_loses_no_point_where_it_means_another_sequence(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db", seed=3)
+    seen = {}
+    for rollouts in (20, 90, 200):
+        study.run(rollouts=rollouts, executor="serial", progress=False)
+        points = {tuple(t.parameters.values()): t.values for t in study.trials}
+        assert len(study) == rollouts == len(points) and seen.items() <= points.items()
+        seen = points
+    with pendulum_problem().study(tmp_path / "a.db") as again:
+        before = table(study)
+        again.run(rollouts=200, executor="serial", progress=False)
+        assert table(again) == before
+
+
+def test_points_given_between_two_budgets_are_told_where_the_study_goes_on(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db", solver="TPE", seed=1)
+    study.run(rollouts=24, executor="serial", progress=False)
+    study.add([0.25, 0.0])
+    study.run(rollouts=40, executor="serial", progress=False)
+    assert len(study) == len(study.trials) == 40
+    assert [t.number for t in study.trials if t.origin == "user"] == [24 + 4]
+
+
+def test_a_study_of_a_solver_that_cannot_be_told_again_ends_with_a_spent_budget_too():
+    conditions = [{DAMPING: damping} for damping in np.linspace(0.0, 1.0, 24)]
+    study = pendulum_problem(conditions=conditions).study(solver="GN_CRS2_LM")
+    for rollouts in (100, 110, 120):
+        assert study.run(rollouts=rollouts, executor="serial", progress=False).reason == "budget"
+        assert len(study) == rollouts
 
 
 def test_a_study_that_is_complete_runs_nothing_more(tmp_path):
@@ -193,7 +242,6 @@ def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
         resumed = table(study)
     whole = pendulum_problem().study(solver="cmaes", seed=3)
     whole._file.set("evaluations", 100_000)
-    whole._meta = whole._file.meta
     whole.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
     assert resumed == table(whole)
 
@@ -284,6 +332,7 @@ def test_a_solver_that_asks_only_for_what_is_known_ends_a_study():
         ({}, "give rollouts=, seconds= or target="),
         ({"rollouts": 0}, "at least one rollout, not 0"),
         ({"seconds": -1.0}, "positive and finite, not -1.0 s"),
+        ({"target": float("nan")}, "a target is a number, not nan"),
     ],
 )
 def test_a_budget_that_makes_no_sense_is_refused(budget, message):

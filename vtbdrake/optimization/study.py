@@ -32,7 +32,8 @@ class Study(StudyRecord):
 
     What it examines depends on the problem, the solver, the seed and the budget that the solver was made for, and not
     on the executor: a study that is resumed makes its solver anew and tells it what is known, so that it goes on as if
-    it had not been interrupted.
+    it had not been interrupted. For a larger budget than before, the solver is made anew; what it asks for again is
+    known, and costs nothing.
 
     Attributes:
         reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``interrupted``.
@@ -150,11 +151,13 @@ class Study(StudyRecord):
         return self
 
     def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
-        # The budget that the solver was first made for belongs to the study: another one would be another sequence.
-        if "evaluations" not in self._meta:
-            # With racing, a point may take one rollout only.
-            evaluations = None if rollouts is None else ceil(rollouts / (1 if racing else len(problem.conditions)))
-            self._file.set("evaluations", evaluations)
+        # With racing, a point may take one rollout only.
+        wanted = None if rollouts is None else ceil(rollouts / (1 if racing else len(problem.conditions)))
+        self._meta = self._file.meta
+        made_for = self._meta.get("evaluations", 0)
+        # Another budget may be another sequence: a smaller one only ends the same one earlier.
+        if made_for is not None and (wanted is None or wanted > made_for):
+            self._file.begin_anew(evaluations=wanted)
             self._meta = self._file.meta
         return _solver(problem, self._meta, budget=self._meta["evaluations"])
 

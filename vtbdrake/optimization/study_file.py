@@ -224,6 +224,15 @@ class StudyFile:
             if told is not None:
                 self._db.execute("INSERT OR REPLACE INTO meta VALUES ('told', ?)", (json.dumps(told),))
 
+    def begin_anew(self, *, evaluations: int | None) -> None:
+        """The solver is told from the start, for another budget. Trials so far stay, at positions below 0."""
+        (first, last) = self._read("SELECT min(position), max(position) FROM trials")[0]
+        with self._transaction():
+            if first is not None:
+                self._db.execute("UPDATE trials SET position = position - ?", (last - first + 1,))
+            rows = [("evaluations", json.dumps(evaluations)), ("told", json.dumps(0))]
+            self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows)
+
     def trials(self) -> list[TrialRow]:
         """All judged points, in the order of the study."""
         return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 
 from tqdm.auto import tqdm
 
@@ -45,6 +45,10 @@ class StudyRun:
         self._gradients = Gradients(problem) if solver.wants_gradient else None
         self._slopes = file.gradients()
         self._told = file.told()
+        # What the solver had asked for before it was made for a larger budget: point -> whether it is exact.
+        earlier = [row for row in file.trials() if row[1] < 0]
+        self._earlier = {row[2]: row[5] for row in sorted(earlier, key=lambda row: row[5])}
+        self._new_from = max([self._told, *(row[0] + 1 for row in earlier)])
         self._progress = progress
         self._bar: tqdm | None = None  # type: ignore[type-arg]
         self._limit: float = inf
@@ -74,7 +78,7 @@ class StudyRun:
             method = self._solver.method
             asked = [self._problem.point(point) for point in self._solver.ask()]
             # A batch that was told before gets no new points by hand: it is to be what it was.
-            given = self._file.take(batch, new=batch >= self._told)
+            given = self._file.take(batch, new=batch >= self._new_from)
             if not asked and not given:
                 return SOLVER, self._solvers_end()
             points = [*asked, *given]
@@ -94,6 +98,7 @@ class StudyRun:
             self._solver.tell([self._with_gradient(evaluation) for evaluation in evaluations])
             if batch >= self._told:
                 self._record(batch, evaluations, len(asked), method, ended=True)
+            if batch >= self._new_from:
                 silent = 0 if len(self._known) > before else silent + 1
             self._show()
             batch += 1
@@ -102,7 +107,8 @@ class StudyRun:
         """The batch to begin with: the first for a solver that can be told again, else the one where the study is."""
         if self._solver.reproducible or not self._told:
             return 0
-        points = list(dict.fromkeys(row[2] for row in self._file.trials()))
+        # Of those that racing has dropped, more would have to be rolled out.
+        points = list(dict.fromkeys(row[2] for row in self._file.trials() if row[5]))
         evaluations = self._judge.judge(points)
         self._solver.tell(evaluations)
         self._show()
@@ -169,9 +175,14 @@ class StudyRun:
                 method if position < asked else "by hand",
             )
             for position, evaluation in enumerate(evaluations)
-            if ended or evaluation.exact
+            if (ended or evaluation.exact) and not self._recorded(evaluation)
         ]
         self._file.save_trials(rows, told=batch + 1 if ended else None)
+
+    def _recorded(self, evaluation: Evaluation) -> bool:
+        """Whether it was recorded before the solver was made for a larger budget, and nothing more is known now."""
+        exact = self._earlier.get(evaluation.point)
+        return exact is not None and (exact or not evaluation.exact)
 
     def _show(self) -> None:
         if self._judge.best is not None:
@@ -183,12 +194,14 @@ class StudyRun:
 def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:
     """
     Raises:
-        ValueError: there is no budget at all, one is not positive, or a target is given for several qualities.
+        ValueError: there is no budget at all, one is not positive or NaN, or a target is given for several qualities.
     """
     if rollouts is None and seconds is None and target is None:
         raise ValueError("a study needs to know when it is enough: give rollouts=, seconds= or target=")
     if rollouts is not None and rollouts < 1:
         raise ValueError(f"a budget is at least one rollout, not {rollouts}")
+    if target is not None and isnan(target):
+        raise ValueError("a target is a number, not nan: no point would ever reach it")
     if seconds is not None and not (isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"a budget of wall time is positive and finite, not {seconds} s")
     if target is not None and len(problem.objectives) > 1:
