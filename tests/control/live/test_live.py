@@ -205,6 +205,11 @@ def test_unknown_addresses_are_not_watched(shared: Rig, address: str, reason: st
         shared.during(watched, shared.url, ["dps.ticks", address], 1)
 
 
+def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> None:
+    with served(hub.url) as (rig, _), pytest.raises(SilenceError, match="or 1000000000 cycles of it take longer"):
+        rig.during(lambda: list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=3.0)))
+
+
 def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
     bus = lcm.LCM(hub.url)
     with served(hub.url) as (rig, service):

@@ -168,7 +168,7 @@ def samples(
     channels = (WATCH + ANSWER, f"{WATCHED}{request['id']}")
     link = LcmLink(url, dict.fromkeys(channels, hear), connect_timeout=_CONNECT_TIMEOUT)
     link.open()
-    renewed, heard = -np.inf, time.monotonic()
+    renewed, heard, begun = -np.inf, time.monotonic(), False
     try:
         while stop is None or not stop.is_set():
             now = time.monotonic()
@@ -183,9 +183,15 @@ def samples(
                     raise LiveError(message["error"])
                 if "ended" in message:
                     return
+                begun = True
                 if "values" in message:
                     yield message
             if time.monotonic() >= heard + timeout:
+                if begun and link.connected:
+                    raise SilenceError(
+                        f"no value has come for {timeout:g} s: the loop stands still, or {every} cycles of it take "
+                        "longer; then choose a longer timeout"
+                    )
                 raise _silence(link, timeout)
     finally:
         link.publish((WATCH, to_json({**request, "watch": []})))
