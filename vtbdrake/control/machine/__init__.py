@@ -5,8 +5,9 @@ scenario's method ``protocol`` returns, a `vtbdrake.control.protocol.Protocol`: 
 bridge and, read in the other direction, the machine.
 
 * **Cycles.** At the time k periods it tells its state: one message per channel of ``Protocol.sense``, whose time is
-  ``epoch + k periods``. Until k + 1 periods it takes commands, and then it simulates that period under the newest of
-  them: against the wall clock; or in lock-step, where one message on every command channel makes a cycle.
+  ``epoch + k periods``. Then it simulates the period that begins, under the newest command that has come: against the
+  wall clock, of those that have come by k periods; or in lock-step, where it waits for one message on every command
+  channel, the answer to its state.
 * **Its own safety.** Commands are checked as any machine checks them: type, length, finite, within the limits of the
   signals, newer than the last. Without a command for ``timeout`` seconds it brakes, until the next one; before the
   first command, too.

@@ -54,8 +54,8 @@ class MachineStatus:
 class Machine:
     """A scenario's world as a machine, with perturbed parameters, noise, delays, a brake and faults.
 
-    Cycle k takes it from k periods to k + 1, under the newest of the commands that came since the state of k periods
-    was told; so that a controller which answers at once commands it as a testbed's DPS commands the simulated world.
+    Cycle k takes it from k periods to k + 1, under the newest of the commands that were received before. If the answer
+    to the state of k periods is among them, a controller commands it as a testbed's DPS commands the simulated world.
     Nothing in it depends on a clock: equal commands in equal cycles, and equal requests, give equal messages.
 
     Args:

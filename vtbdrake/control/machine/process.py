@@ -198,7 +198,8 @@ class MachineProcess:
         self._paused = True
 
     def resume(self) -> None:
-        """Lets it go on after `pause`; its world catches up with the time that has passed."""
+        """Lets it go on after `pause`; its world catches up with the time that has passed, if that was short, and loses
+        the rest (see `MachineStatistics.lost`)."""
         os.kill(self.pid, signal.SIGCONT)
         self._paused = False
 
