@@ -69,10 +69,14 @@ def test_sweep_finds_the_best_point_and_stops_where_the_threshold_is_exceeded():
     assert point == {OMEGA: speeds[int(np.argmax(sweep.h))]}
 
 
-def test_two_parameters_make_a_grid():
-    problem = _problem(
+def _two():
+    return _problem(
         parameters=[vtb.Parameter(OMEGA, 0.0, 2.0), vtb.Parameter(THETA, 0.0, 0.5)], threshold=inf, horizon=2.0
     )
+
+
+def test_two_parameters_make_a_grid():
+    problem = _two()
     sweep = problem.sweep(points=(3, 2), executor="serial", progress=False)
     np.testing.assert_array_equal(sweep.points, [[0, 0], [0, 0.5], [1, 0], [1, 0.5], [2, 0], [2, 0.5]])
     # h is the amplitude: energies add up.
@@ -80,6 +84,8 @@ def test_two_parameters_make_a_grid():
         expected = np.sqrt(omega**2 + _speed_to_reach(theta) ** 2)
         assert _speed_to_reach(h) == pytest.approx(expected, rel=2e-3, abs=1e-6)
     assert sweep.best()[0] == {OMEGA: 2.0, THETA: 0.5}
+    squares = problem.sweep(np.int64(2), executor="serial", progress=False)
+    np.testing.assert_array_equal(squares.points, [[0, 0], [0, 0.5], [2, 0], [2, 0.5]])
 
 
 def test_the_worst_condition_counts_for_the_best_point():
@@ -158,6 +164,9 @@ def test_a_problem_that_makes_no_sense_is_refused(changes, message):
         (lambda p: p.sweep(), "either the number of points"),
         (lambda p: p.sweep(points=1), "at least two points"),
         (lambda p: p.sweep(points=3, executor="gpu"), "not 'gpu'"),
+        (lambda p: p.sweep(values=np.zeros((3, 4))), r"have shape \(n, 1\), not \(3, 4\)"),
+        (lambda p: _two().sweep(values=np.zeros((3, 4))), r"have shape \(n, 2\), not \(3, 4\)"),
+        (lambda p: _two().sweep(values=[0.0, 0.1, 0.2]), r"have shape \(n, 2\), not \(3,\)"),
         (lambda p: p.boundary(resolution=2.0, coarse=1.0), "0 < resolution <= coarse"),
         (lambda p: _problem(threshold=inf).boundary(resolution=1.0, coarse=1.0), "finite threshold"),
         (lambda p: _problem(parameters=[]).sweep(points=3), "one or two parameters, not 0"),

@@ -66,6 +66,8 @@ def test_an_executor_or_a_pool_that_is_there_is_taken(pendulum):
         (3, {}, "a Dask Client, not 3"),
         ("serial", {"time_limit": 2.0}, "executor='serial' cannot keep a time limit of 2 s"),
         ("threads", {"time_limit": 2.0}, "executor='threads' cannot keep a time limit of 2 s"),
+        ("serial", {"workers": 2}, "executor='serial' has no workers, but workers=2 was given"),
+        ("auto", {"workers": 0}, "at least one worker, not 0"),
         ("processes", {"time_limit": 0.0}, "time limit must be positive, not 0.0 s"),
         ("processes", {"workers": 0}, "at least one worker, not 0"),
         ("threads", {"workers": 0}, "at least one worker, not 0"),

@@ -31,8 +31,7 @@ class ProblemFunction(casadi.Callback):
     ``hessian_approximation="limited-memory"``, as there is no second derivative. Keep it alive while they work.
 
     A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers swallow what a
-    function
-    raises: call `check` after them, which raises it as itself.
+    function raises: call `check` after them, which raises it as itself.
 
     Attributes:
         error: what was raised last while it was evaluated, or None.

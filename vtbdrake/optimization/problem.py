@@ -16,7 +16,7 @@ from vtbdrake.optimization.motion import Motion, ProblemRollout
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.sweep import Sweep, grid
+from vtbdrake.optimization.sweep import Sweep, as_points, grid
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
 from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
@@ -218,7 +218,7 @@ class Problem:
             assert points is not None
             table = grid(numeric, points)
         else:
-            table = np.asarray(values, dtype=float).reshape(-1, len(numeric))
+            table = as_points(numeric, values)
         task = replace(self.task, record=tuple(record), run_on=run_on)
         return examine.sweep(self, task, table, executor=executor, workers=workers, progress=progress)
 

@@ -9,6 +9,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vtbdrake.optimization.boundary import Boundary, boundary_of
 from vtbdrake.optimization.parameter import Parameter
@@ -215,8 +216,23 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     """
     if not 1 <= len(parameters) <= 2:
         raise ValueError(f"a sweep goes over one or two parameters, not {len(parameters)}")
-    counts = [points] * len(parameters) if isinstance(points, int) else list(points)
+    counts = [int(points)] * len(parameters) if isinstance(points, int | np.integer) else list(points)
     if len(counts) != len(parameters) or min(counts) < 2:
         raise ValueError(f"a sweep has at least two points for each of its {len(parameters)} parameters, not {points}")
     axes = [np.linspace(p.lower, p.upper, count) for p, count in zip(parameters, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
+
+
+def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
+    """Points that are given, shape (n, p) or, of a single parameter, (n,); shape (n, p).
+
+    Raises:
+        ValueError: they have another shape.
+    """
+    table = np.asarray(values, dtype=float)
+    count = len(parameters)
+    if table.ndim < 2 and (count == 1 or not table.size):
+        table = table.reshape(-1, count)
+    if table.ndim != 2 or table.shape[1] != count:
+        raise ValueError(f"the values of {count} parameters have shape (n, {count}), not {table.shape}")
+    return table

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Any
 
-from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, cores
+from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, checked_workers
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.processes import ProcessExecutor
 from vtbdrake.testbed import VirtualTestbed
@@ -43,8 +43,9 @@ def make_executor(
         ValueError: the executor is unknown, or has no use for ``workers`` or ``time_limit``.
     """
     if executor == "auto":
-        alone = min(rollouts, workers if workers is not None else cores()) <= 1
+        alone = min(rollouts, checked_workers(workers)) <= 1
         executor = "processes" if time_limit is not None else "serial" if alone else choose_executor(testbed)
+        workers = None if executor == "serial" else workers
     if isinstance(executor, str):
         return _by_name(executor, testbed=testbed, workers=workers, time_limit=time_limit)
     if isinstance(executor, Executor):
@@ -66,6 +67,8 @@ def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_li
             f"executor={name!r} cannot keep a time limit of {time_limit:g} s, for nothing ends a rollout inside its "
             "own process: use 'processes' or 'dask'"
         )
+    if name == "serial" and workers is not None:
+        raise ValueError(f"executor='serial' has no workers, but workers={workers} was given: use 'threads', say")
     makers: dict[str, Callable[[], Executor]] = {
         "serial": lambda: SerialExecutor(testbed),
         "threads": lambda: ThreadExecutor(workers, testbed=testbed),
