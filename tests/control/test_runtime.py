@@ -205,6 +205,16 @@ def test_a_switch_to_a_machine_out_of_reach_or_not_ready_is_refused():
     assert "the bridge is not connected" in reasons and "its brakes are closed" in reasons
 
 
+def test_a_switch_that_was_prepared_in_an_earlier_cycle_is_refused():
+    runtime, _, _ = make(rate=0.0)
+    runtime.cycle()
+    preparation = runtime.prepare("real")
+    runtime.run(cycles=2)
+    with pytest.raises(SwitchRefusedError, match="2 cycles ago: prepare it anew"):
+        runtime.perform(preparation)
+    assert runtime.active == []
+
+
 def test_a_command_that_would_jump_is_refused():
     runtime, bridge, _ = make(continuity={"velocity": ("speed", 0.3)})
     runtime.cycle()

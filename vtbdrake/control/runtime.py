@@ -243,11 +243,14 @@ class Runtime(Stepped):
         return prepare(self, mode, **sides)
 
     def perform(self, preparation: Preparation) -> None:
-        """Second phase: throws the switches of a preparation that has nothing against it, between two cycles.
+        """Second phase: throws the switches of a preparation that has nothing against it, between the same two cycles.
 
         Raises:
-            SwitchRefusedError: it has.
+            SwitchRefusedError: it has, or there were cycles since: who knows what speaks against it now.
         """
+        if preparation.cycle != self.cycles:
+            age = self.cycles - preparation.cycle
+            raise SwitchRefusedError(f"the switch was prepared {age} cycles ago: prepare it anew")
         if preparation.reasons:
             raise SwitchRefusedError("; ".join(preparation.reasons))
         preparation.perform()

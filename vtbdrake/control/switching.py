@@ -28,10 +28,12 @@ class Preparation:
 
     Attributes:
         reasons: empty if nothing speaks against it.
+        cycle: of the runtime, to which they belong.
         perform: throws it.
     """
 
     reasons: tuple[str, ...]
+    cycle: int
     perform: Callable[[], None]
 
 
@@ -84,7 +86,7 @@ def prepare(
     def perform() -> None:
         _throw(runtime, senses, acts)
 
-    return Preparation(tuple(reasons), perform)
+    return Preparation(tuple(reasons), runtime.cycles, perform)
 
 
 def _positions(
