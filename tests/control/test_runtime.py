@@ -341,11 +341,12 @@ def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cy
         assert runtime.missed == missed
 
 
-def test_a_watcher_that_raises_is_left_out_and_the_others_go_on():
+@pytest.mark.parametrize("error", [OSError("disk full"), SystemExit("a failed assertion in Drake")])
+def test_a_watcher_that_raises_is_left_out_and_the_others_go_on(error):
     seen = []
 
     def broken(cycle):
-        raise OSError("disk full")
+        raise error
 
     runtime, _, _ = make(watchers=(broken, seen.append))
     runtime.run(cycles=5)
@@ -368,6 +369,18 @@ def test_requests_of_other_threads_are_served_between_cycles():
     with pytest.raises(ValueError, match="nowhere"):
         futures[1].result(timeout=1)
     assert sent(bridge)[-1] == pytest.approx(5.0 * np.array([-0.05, 0.0]))
+
+
+def test_a_request_that_fails_an_assertion_inside_drake_does_not_end_the_loop():
+    runtime, _, _ = switched()
+
+    def fail():
+        raise SystemExit("a failed assertion in Drake")
+
+    future = runtime.request(fail)
+    runtime.run(cycles=1)
+    with pytest.raises(SystemExit):
+        future.result(timeout=1)
 
 
 def test_a_request_that_was_given_up_is_left_out():

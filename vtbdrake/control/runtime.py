@@ -219,7 +219,7 @@ class Runtime(Stepped):
         for watcher in self._watchers[:]:
             try:
                 watcher(done)
-            except Exception:
+            except (Exception, SystemExit):  # A failed assertion inside Drake arrives as SystemExit.
                 _log.exception("a watcher of the loop raised, and is left out from now on")
                 self._watchers.remove(watcher)
         return done
@@ -281,7 +281,7 @@ class Runtime(Stepped):
                 continue
             try:
                 future.set_result(action())
-            except Exception as error:
+            except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
                 future.set_exception(error)
         self.look()
 
