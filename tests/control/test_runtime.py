@@ -142,6 +142,18 @@ def test_a_sensor_that_goes_back_to_sim_finds_the_world_where_the_dps_believes_t
     assert np.array_equal(runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0"), [0.05, 0.0])
 
 
+def test_a_dps_that_has_lost_its_senses_is_switched_to_sim_all_the_same(caplog):
+    runtime, bridge, _ = switched(rate=0.0)
+    bridge.sensors = lambda t: {**still(t), "position": [np.nan, 0.0]}
+    runtime.run(cycles=3)
+    count = len(bridge.sent)
+    runtime.switch("sim")
+    runtime.cycle()
+    assert len(bridge.sent) == count == 3
+    assert np.isfinite(runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")).all()
+    assert "cannot be where the DPS believes" in caplog.text
+
+
 def test_a_world_that_drives_already_is_left_alone():
     runtime, _, _ = make()
     runtime.run(cycles=100)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,6 +17,8 @@ from vtbdrake.testbed.testbed import MODES, check_mode
 
 if TYPE_CHECKING:
     from vtbdrake.control.runtime import Runtime
+
+_log = logging.getLogger(__name__)
 
 
 class SwitchRefusedError(RuntimeError):
@@ -149,7 +152,7 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
 
 def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
     """Throws switches of a testbed that runs; where a signal goes back to sim, the simulated world goes on from where
-    the machine is."""
+    the DPS believes the machine to be, if it can."""
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)
     back = any(
@@ -158,4 +161,8 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
         for name, position in positions.items()
     )
     if back and target.believes:
-        target.start_from_belief(context)
+        try:
+            target.start_from_belief(context)
+        except Exception:
+            # The way back from the machine is always open, even for a DPS that has lost its senses.
+            _log.exception("the simulated world goes on from where it was: it cannot be where the DPS believes")
