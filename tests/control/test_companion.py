@@ -123,6 +123,20 @@ def test_one_that_is_killed_is_noticed_and_frames_are_counted():
     assert companion.close() == -signal.SIGKILL
 
 
+def test_one_that_ends_is_told_to_who_only_listens(caplog):
+    companion = Companion(fail, 3, name="failure")
+    select.select((companion,), (), (), TIMEOUT)
+    assert companion.take() == companion.take() == [] and not companion.alive
+    assert caplog.text.count(f"failure (process {companion.pid}) is gone: ") == 1
+    assert companion.close() == 3
+
+
+def test_one_that_is_closed_or_killed_is_no_news(caplog):
+    Companion(echo, name="echo").close()
+    Companion(fall_asleep, name="sleeper").kill()
+    assert not caplog.text
+
+
 def test_one_that_does_not_end_is_killed():
     companion = Companion(fall_asleep, name="sleeper")
     assert companion.close(timeout=1.0) == -signal.SIGKILL

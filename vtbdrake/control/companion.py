@@ -110,6 +110,7 @@ class Companion:
         self._frames = Frames()
         self._back: list[bytes] = []
         self._gone = False
+        self._ending = False  # because we want it to
         self._line, theirs = socket.socketpair()
         with theirs:
             for end in (self._line, theirs):
@@ -186,10 +187,11 @@ class Companion:
             self._lose(error)
             return 0
 
-    def _lose(self, error: OSError) -> None:
+    def _lose(self, reason: OSError | str) -> None:
         if not self._gone:
             self._gone = True
-            _log.error("%s (process %d) is gone: %s", self.name, self.pid, error)
+            if not self._ending:
+                _log.error("%s (process %d) is gone: %s", self.name, self.pid, reason)
 
     def take(self) -> list[bytes]:
         """The frames that came back since it was asked last, in order."""
@@ -210,7 +212,8 @@ class Companion:
                 self._lose(error)
                 return
             size = len(data)
-            self._gone |= not data
+            if not data:
+                self._lose("it has closed the line")
             self._back += self._frames.feed(data)
 
     def fileno(self) -> int:
@@ -238,6 +241,7 @@ class Companion:
             self._line.shutdown(socket.SHUT_WR)
         except OSError as error:
             self._lose(error)
+        self._ending = True
         # What it still has to say is taken in, for else it would wait for room.
         while not self._gone and (left := end - time.monotonic()) > 0.0:
             select.select((self._line,), (), (), left)
@@ -251,6 +255,7 @@ class Companion:
 
     def kill(self) -> None:
         """Ends it at once; what came back before may still be taken."""
+        self._ending = True
         self._process.kill()
         self._process.wait()
         if self._line.fileno() >= 0:
