@@ -43,6 +43,15 @@ def test_a_client_that_breaks_the_protocol_is_cut_off(hub, sent: bytes, reason: 
     assert client.received == [("STILL_HERE", b"")]
 
 
+def test_what_came_before_the_protocol_was_broken_passes(hub) -> None:
+    client = Client(hub.url, "A")
+    with raw_client(hub.url) as sock:
+        sock.sendall(record(1, b"A", b"1") + record(1, b"A", b"2") + record(4, b"A") + record(1, b"A", b"3"))
+        assert is_disconnected(sock)
+    client.sync()
+    assert client.received == [("A", b"1"), ("A", b"2")]
+
+
 def test_the_largest_message_passes_and_a_larger_one_does_not() -> None:
     with Hub(port=0, max_message=1000, max_queue=10_000) as hub:
         client = Client(hub.url, "A")

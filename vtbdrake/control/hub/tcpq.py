@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
+from collections.abc import Iterator
 
 MAGIC_SERVER = 0x287617FA
 MAGIC_CLIENT = 0x287617FB
@@ -85,37 +86,35 @@ class Reader:
         """Whether a record has begun and not ended."""
         return bool(self._buffer)
 
-    def feed(self, data: bytes | memoryview) -> list[Record]:
-        """The records that ``data`` completes.
+    def feed(self, data: bytes | memoryview) -> Iterator[Record]:
+        """The records that ``data`` completes; to be taken to the end before the next call.
 
         Raises:
-            ProtocolError: the client is of no use any more.
+            ProtocolError: the client is of no use any more, after the records that came before.
         """
         if self._buffer or len(data) < self._needed:
             self._buffer += data
             if len(self._buffer) < self._needed:
-                return []
+                return
             come: bytes | bytearray = self._buffer
         else:
             come = bytes(data)
         have, at = len(come), 0
-        records: list[Record] = []
         if not self.greeted:
             self._check_greeting(come)
             at = _PAIR.size
-            records.append((GREET, b"", bytes(come[:at])))
+            yield GREET, b"", bytes(come[:at])
         while True:
             kind, length, size = self._head(come, at, have - at)
             if size > have - at:
                 break
             # A large message is handed on as it is, not copied.
             record = come if size == have else bytes(come[at : at + size])
-            records.append((kind, bytes(come[at + 8 : at + 8 + length]), record))
+            yield kind, bytes(come[at + 8 : at + 8 + length]), record
             at += size
         self._needed = size
         if at or come is not self._buffer:
             self._buffer = bytearray(come[at:])
-        return records
 
     def _check_greeting(self, come: bytes | bytearray) -> None:
         magic, version = _PAIR.unpack_from(come)
