@@ -81,16 +81,18 @@ def outcome(value: float, violation: float | None = None, end: str = "horizon") 
     return Outcome(value, value, () if violation is None else (violation,), 0.0, end, "", 0.0)
 
 
-def judged(stated: Problem, table: dict, batches, *, racing: bool):
+def judged(stated: Problem, table: dict, batches, *, racing: bool, budget: float = np.inf):
     """(evaluations by point, rollouts run)."""
     known: dict = {}
-    judge = Judge(stated, known, lambda rows: known.update({row: table[row] for row in rows}), racing=racing)
+    judge = Judge(
+        stated, known, lambda rows: known.update({row: table[row] for row in rows}), racing=racing, budget=budget
+    )
     evaluations = {e.point: e for batch in batches for e in judge.judge(batch)}
     return evaluations, len(known)
 
 
-@given(st.integers(0, 10_000), risks, st.booleans())
-def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk, minimize):
+@given(st.integers(0, 10_000), risks, st.booleans(), st.sampled_from([10, 60, np.inf]))
+def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk, minimize, budget):
     rng = np.random.default_rng(seed)
     conditions = int(rng.integers(2, 8))
     stated = STATED[conditions, minimize]
@@ -98,7 +100,7 @@ def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk
     points = [(float(p),) for p in rng.permutation(24) / 24.0]
     table = {(p, c): outcome(float(rng.random())) for p in points for c in range(conditions)}
     batches = [points[i : i + 6] for i in range(0, 24, 6)]
-    raced, run = judged(stated, table, batches, racing=True)
+    raced, run = judged(stated, table, batches, racing=True, budget=budget)
     brute, all_run = judged(stated, table, batches, racing=False)
     assert all_run == 24 * conditions >= run
     winner = max(brute.values(), key=lambda e: e.values[0])
@@ -124,6 +126,25 @@ def test_racing_saves_what_the_worst_condition_tells():
     assert run == 8 * 15, "alone, a point meets all conditions in one round of eight"
     _, run = judged(problem(8, "worst"), table, [points[:1], points[1:]], racing=True)
     assert run == 8 + 14, "together, each meets the condition in which the best fares worst, and is dropped"
+
+
+@pytest.mark.parametrize("budget", [4, 10, 23, 40])
+def test_racing_finishes_points_within_a_budget_that_is_too_small_for_all(budget):
+    class SpentError(Exception):
+        pass
+
+    known: dict = {}
+
+    def run(rows):
+        known.update({row: outcome(row[0][0]) for row in rows[: budget - len(known)]})
+        if len(known) == budget:
+            raise SpentError
+
+    judge = Judge(problem(4, "mean"), known, run, racing=True, budget=budget)
+    points = [(i / 64.0,) for i in range(1, 41)]
+    with pytest.raises(SpentError):
+        judge.judge(points)
+    assert sum(judge.evaluation(point).exact for point in points) >= 1
 
 
 def test_a_point_that_breaks_a_constraint_is_dropped():

@@ -308,6 +308,12 @@ def test_a_budget_of_rollouts_is_kept_to_the_rollout():
     assert len(study) == 50 and study.reason == "budget"
 
 
+def test_a_small_budget_under_many_conditions_has_a_best_point():
+    conditions = [{DAMPING: d} for d in (0.0, 0.1, 0.2, 0.3)]
+    study = pendulum_problem(conditions=conditions).study().run(rollouts=40, executor="serial", progress=False)
+    assert len(study) == 40 and study.best.exact
+
+
 def test_a_target_ends_a_study():
     study = pendulum_problem().study(solver="sobol").run(target=0.05, executor="serial", progress=False)
     assert study.best.value <= 0.05 and study.reason == "target"

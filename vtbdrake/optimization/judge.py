@@ -35,7 +35,13 @@ class Judge:
     """
 
     def __init__(
-        self, problem: Problem, known: Outcomes, run: Callable[[Sequence[Row]], None], *, racing: bool = False
+        self,
+        problem: Problem,
+        known: Outcomes,
+        run: Callable[[Sequence[Row]], None],
+        *,
+        racing: bool = False,
+        budget: float = inf,
     ) -> None:
         if racing and len(problem.objectives) > 1:
             raise ValueError(
@@ -45,23 +51,40 @@ class Judge:
         self._known = known
         self._run = run
         self._racing = racing and len(problem.conditions) > 1
+        self._budget = budget
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
         self.best: Evaluation | None = None
+        # Not what is known, of which a study that is resumed has more.
+        self._needed: set[Row] = set()
 
     def judge(self, points: Sequence[Point]) -> list[Evaluation]:
         """One evaluation per point, in their order."""
-        distinct = list(dict.fromkeys(points))
-        if self._racing:
-            evaluations = self._race(distinct)
-        else:
-            self._complete([(point, condition) for point in distinct for condition in self._conditions])
-            evaluations = {point: self.evaluation(point) for point in distinct}
-        for evaluation in evaluations.values():
-            self._remember(evaluation)
+        evaluations: dict[Point, Evaluation] = {}
+        waiting = list(dict.fromkeys(points))
+        while waiting:
+            count = self._affordable(len(waiting))
+            evaluations |= self._judge_together(waiting[:count])
+            waiting = waiting[count:]
         return [evaluations[point] for point in points]
 
+    def _affordable(self, count: int) -> int:
+        """How many of ``count`` points are judged together."""
+        left = (self._budget - len(self._needed)) / len(self._conditions)
+        return max(1, int(min(left, count))) if self._racing else count
+
+    def _judge_together(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
+        if self._racing:
+            evaluations = self._race(points)
+        else:
+            self._complete([(point, condition) for point in points for condition in self._conditions])
+            evaluations = {point: self.evaluation(point) for point in points}
+        for evaluation in evaluations.values():
+            self._remember(evaluation)
+        return evaluations
+
     def _complete(self, rows: Sequence[Row]) -> None:
+        self._needed.update(rows)
         missing = [row for row in rows if row not in self._known]
         if missing:
             self._run(missing)

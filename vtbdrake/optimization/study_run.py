@@ -41,7 +41,11 @@ class StudyRun:
         self._solver = solver
         self._executor = executor
         self._known: dict[Row, Outcome] = file.outcomes()
-        self._judge = Judge(problem, self._known, self._roll_out, racing=racing)
+        # Not that of this run: how points are judged must not depend on where a study is interrupted.
+        budget = file.meta["evaluations"]
+        self._judge = Judge(
+            problem, self._known, self._roll_out, racing=racing, budget=inf if budget is None else budget
+        )
         self._gradients = Gradients(problem) if solver.wants_gradient else None
         self._slopes = file.gradients()
         self._told = file.told()
