@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ from vtbdrake.control.machine import (
     Machine,
     MachineConfig,
     MachineError,
+    MachineLoop,
     MachineProcess,
     NoBrake,
     Reorder,
@@ -293,6 +296,22 @@ def test_requests_over_lcm(hub: Hub) -> None:
 
 
 # -- its end
+
+
+def test_machine_that_waits_in_lock_step_ends_with_who_started_it_however_much_it_hears() -> None:
+    ours, theirs = socket.socketpair()
+    # It hears its own status, takes it for a request, and answers by its status.
+    config = MachineConfig(control_channel="TALK", status_channel="TALK")
+    loop = MachineLoop(Machine(RobotScenario(), config), "memq://", control=theirs)
+    thread = Thread(target=loop.run, kwargs={"lock_step": True})
+    thread.start()
+    ours.close()
+    thread.join(10.0)
+    went_on = thread.is_alive()
+    loop.stop()
+    thread.join()
+    loop.close()
+    assert not went_on
 
 
 def test_machine_dies_when_told(hub: Hub) -> None:

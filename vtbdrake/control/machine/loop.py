@@ -183,8 +183,8 @@ class MachineLoop:
         repeat = time.monotonic() + _REPEAT
         while not self._arrived >= channels and not self._stop.is_set():
             # One at a time: what is ahead of its cycle waits on the line.
-            if not self._link.take(_SLICE, 1):
-                self._serve()
+            self._link.take(_SLICE, 1)
+            self._serve()
             # Who comes to a new bus after the state was told would wait for it, and the machine for him.
             self._alone |= self._link.reconnections > self._reconnections
             if self._alone and time.monotonic() >= repeat:
