@@ -248,6 +248,31 @@ def test_a_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     assert len(read_log(tmp_path / "run.lcm")) == 0
 
 
+def test_who_has_read_a_log_keeps_it_when_it_is_overwritten(tmp_path: Path) -> None:
+    servo, path = Servo(), tmp_path / "run.lcm"
+    with Recorder(servo.runtime, path):
+        servo.runtime.run(cycles=50)
+    content, file, log = path.read_bytes(), path.stat().st_ino, read_log(path)
+    with Recorder(servo.runtime, path, overwrite=True):
+        assert path.stat().st_ino != file, "a file that is cut off ends the process of who has mapped it"
+        assert bytes(log.events.content) == content
+
+
+def test_recorders_of_one_loop_may_end_in_any_order(tmp_path: Path, hub: Hub) -> None:
+    with Loop(hub, lock_step=True) as loop:
+        first = Recorder(loop.runtime, tmp_path / "first.lcm")
+        second = Recorder(loop.runtime, tmp_path / "second.lcm")
+        loop.sense()
+        loop.runtime.switch("real")
+        loop.runtime.cycle()
+        first.close()
+        loop.runtime.run(cycles=20)
+        second.close()
+        assert not first._events, "nothing piles up in one that is closed"
+    log = read_log(tmp_path / "second.lcm")
+    assert len(list(log.messages("IIWA_STATUS"))) > len(list(read_log(tmp_path / "first.lcm").messages("IIWA_STATUS")))
+
+
 def test_a_folder_that_is_not_there_is_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Recorder(Servo().runtime, tmp_path / "nowhere" / "run.lcm")

@@ -84,6 +84,9 @@ class Recorder:
         self._told = False
         self._closed = False
         begin = [self._header_event(header), self._state_event()]
+        if overwrite and self.path.is_file():
+            # A new file: who has read the old one still has it open, and must not lose it under his hands.
+            self.path.unlink()
         self.path.open("wb" if overwrite else "xb").close()
         self._companion = Companion(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
@@ -121,6 +124,8 @@ class Recorder:
     def _tap(self, channel: str, data: bytes) -> None:
         if self._next_tap is not None:
             self._next_tap(channel, data)
+        if self._closed:  # before another recorder that began later, and still calls it
+            return
         self._cycle.hear(channel, self._count)
         self._add(channel, data, self._utime())
 
@@ -212,6 +217,7 @@ class Recorder:
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
         self._events.append(self._single(END, message))
         self._companion.post(*self._events)
+        self._events.clear()
         code = self._companion.close()
         self._take_losses()
         if code or self.lost:
