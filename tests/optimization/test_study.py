@@ -130,10 +130,10 @@ def test_fields_choices_and_integers_can_be_varied():
 @pytest.mark.parametrize("solver", ["cmaes", "TPE", "sobol"])
 def test_a_study_is_the_same_in_series_and_in_parallel(solver):
     studies = []
-    for executor in ("serial", "threads", "processes"):
+    for executor, workers in (("serial", None), ("threads", 2), ("processes", 2)):
         problem = pendulum_problem(conditions=[{DAMPING: 0.0}, {DAMPING: 0.2}, {DAMPING: 0.4}])
         studies.append(
-            problem.study(solver=solver, seed=5).run(rollouts=60, executor=executor, workers=2, progress=False)
+            problem.study(solver=solver, seed=5).run(rollouts=60, executor=executor, workers=workers, progress=False)
         )
     assert table(studies[0])[0] == table(studies[1])[0] == table(studies[2])[0]
     assert table(studies[0])[1] == table(studies[1])[1] == table(studies[2])[1]
