@@ -111,8 +111,8 @@ def test_a_script_without_a_main_guard_and_with_its_own_functions_uses_processes
     assert eval(done.stdout.replace("np.float64", "")) == [0.25, 1.0]
 
 
-@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
-def test_ctrl_c_keeps_what_is_finished(executor, tmp_path):
+@pytest.mark.parametrize(("executor", "workers"), [("serial", None), ("threads", 2), ("processes", 2)])
+def test_ctrl_c_keeps_what_is_finished(executor, workers, tmp_path):
     """A real SIGINT to a whole group of processes, as a terminal sends it."""
     script = tmp_path / "sweep.py"
     script.write_text(
@@ -143,7 +143,7 @@ def test_ctrl_c_keeps_what_is_finished(executor, tmp_path):
 
             from vtbdrake.rollout import Executor
             Executor.register(Telling)
-            inner = make_executor({executor!r}, testbed=problem.testbed, rollouts=1000, workers=2)
+            inner = make_executor({executor!r}, testbed=problem.testbed, rollouts=1000, workers={workers})
             sweep = problem.sweep(points=1000, executor=Telling(inner))
             inner.close()
             print("kept", len(sweep), sweep.complete, sweep.h[0] >= 0.0, flush=True)
