@@ -116,8 +116,7 @@ def reference(
     following = {"motion": motion, "clock": clock + period, "start": start}
     in_joints = 1 - is_press - is_circle
     x = clock / (is_press * p["press_duration"] + is_circle * p["circle_duration"] + in_joints)
-    x = casadi.fmin(casadi.fmax(x, 0), 1)
-    ease = (1 - in_joints) * (4 * x * (1 - x)) ** 2
+    ease = (1 - in_joints) * 8 / 15 * _flank(x, 1)[1]
     return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, FOLLOW), ease, following)
 
 

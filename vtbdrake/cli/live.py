@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import click
 import numpy as np
 
@@ -24,11 +27,8 @@ def set_values(values: tuple[Setting, ...], url: str, timeout: float) -> None:
     Example:
       vtbdrake set --url tcpq://127.0.0.1:7700 u.motion=2 "dps.impl.stiffness=[20,20,20,900,900,900]"
     """
-    try:
-        with LiveClient(url, timeout=timeout) as client:
-            client.set(settings(values))
-    except (BridgeError, LiveError, SilenceError) as error:
-        raise FailedError(one_line(error)) from error
+    with _client(url, timeout) as client:
+        client.set(settings(values))
 
 
 @click.command("get")
@@ -42,11 +42,8 @@ def get_values(addresses: tuple[str, ...], url: str, timeout: float) -> None:
     Example:
       vtbdrake get --url tcpq://127.0.0.1:7700 u.motion dps.impl.stiffness
     """
-    try:
-        with LiveClient(url, timeout=timeout) as client:
-            values = client.get(addresses)
-    except (BridgeError, LiveError, SilenceError) as error:
-        raise FailedError(one_line(error)) from error
+    with _client(url, timeout) as client:
+        values = client.get(addresses)
     for address, value in values.items():
         click.echo(f"{address} = {np.asarray(value).tolist()}")
 
@@ -63,12 +60,22 @@ def reset_guards(url: str, timeout: float) -> None:
     Example:
       vtbdrake reset --url tcpq://127.0.0.1:7700
     """
-    try:
-        with LiveClient(url, timeout=timeout) as client:
-            released = client.reset()
-    except (BridgeError, LiveError, SilenceError) as error:
-        raise FailedError(one_line(error)) from error
+    with _client(url, timeout) as client:
+        released = client.reset()
     for reason in released:
         click.echo(f"over: {reason}")
     if not released:
         click.echo("nothing had latched")
+
+
+@contextmanager
+def _client(url: str, timeout: float) -> Iterator[LiveClient]:
+    """
+    Raises:
+        FailedError: there is no bus, nobody answers, or what is asked for is refused.
+    """
+    try:
+        with LiveClient(url, timeout=timeout) as client:
+            yield client
+    except (BridgeError, LiveError, SilenceError) as error:
+        raise FailedError(one_line(error)) from error

@@ -120,11 +120,7 @@ class Relay:
                 self._statistics.delivered += 1
 
     def _send(self, client: Connection, content: bytes | bytearray) -> None:
-        leaving = self._leaving.get(client)
-        if leaving is None:
-            self._leaving[client] = [content]
-        else:
-            leaving.append(content)
+        self._leaving.setdefault(client, []).append(content)
 
     def deliver(self, now: float) -> None:
         """Sends what was collected."""
