@@ -48,10 +48,10 @@ class TimedRuntime(Runtime):
         self.overheads: list[float] = []
         self.lateness: list[float] = []
 
-    def cycle(self, *, lateness: float = 0.0) -> Cycle:
+    def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
         steps = self.statistics.histograms["step"]
         before, begin = steps.total, self.clock.now()
-        done = super().cycle(lateness=lateness)
+        done = super().cycle(lateness=lateness, poll=poll)
         took = self.clock.now() - begin
         self.overheads.append(took - (steps.total - before))
         self.lateness.append(lateness + took)

@@ -338,15 +338,17 @@ def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():
 @pytest.mark.parametrize("asleep", [False, True])
 def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cycles(held_up, missed, asleep):
     runtime, bridge, clock = switched(rate=0.0, pace="position")
-    poll = bridge.poll
+    # While it waits for a message, or while it works.
+    held = "poll" if asleep else "publish"
+    call = getattr(bridge, held)
 
-    def stopped(timeout=0.0):
-        if runtime.cycles == 5 and bool(timeout) == asleep:
+    def stopped(argument):
+        if runtime.cycles == 5:
             clock.advance(held_up * PERIOD)
-            bridge.poll = poll
-        return poll(timeout)
+            setattr(bridge, held, call)
+        return call(argument)
 
-    bridge.poll = stopped
+    setattr(bridge, held, stopped)
     runtime.run(cycles=10)
     assert bool(runtime.guards.latched) == (missed > 10)
     if not asleep:

@@ -139,7 +139,8 @@ class Runtime(Stepped):
                 if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                     return
                 due, lateness = self._await(deadline)
-                self.cycle(lateness=lateness)
+                # One that is paced by messages has just taken them in.
+                self.cycle(lateness=lateness, poll=self.pace is None)
                 done += 1
                 if until():
                     return
@@ -186,10 +187,16 @@ class Runtime(Stepped):
         self.statistics.miss(behind)
         return due + (behind + 1) * self.period
 
-    def cycle(self, *, lateness: float = 0.0) -> Cycle:
-        """One cycle, now; ``lateness`` is how many seconds after it was due."""
+    def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
+        """One cycle, now.
+
+        Args:
+            lateness: how many seconds after it was due.
+            poll: whether to take in first what has arrived.
+        """
         begin = self.clock.now()
-        self.bridge.poll()
+        if poll:
+            self.bridge.poll()
         now = self.clock.now()
         self._serve()
         self.take_commands()
