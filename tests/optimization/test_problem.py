@@ -148,6 +148,20 @@ def test_a_range_that_is_empty_or_reversed_is_refused(lower, upper):
         ({"conditions": [{DAMPING: -1.0}]}, "must lie in"),
         ({"quality": vtb.Quality(_angle, "sim.sys.Pendulum.thta.position")}, "did you mean"),
         ({"horizon": -1.0}, "horizon t_m must be positive"),
+        ({"quality": _angle}, r"give quality as Quality\(f, of=.* not as <function _angle"),
+        ({"quality": None}, "give quality as .* not as None"),
+        ({"quality": [vtb.Constraint(_angle, THETA, at_most=1.0)]}, "give quality as .* Constraint.* has no place"),
+        ({"constraints": vtb.Constraint(_angle, THETA, at_most=1.0)}, "give constraints as .* not as Constraint"),
+        ({"constraints": [vtb.Quality(_angle, THETA)]}, "give constraints as .* Quality.* has no place there"),
+        ({"parameters": OMEGA}, r"give parameters as \[Parameter\(address, lower, upper\), ...\], not as 'sim"),
+        ({"parameters": [OMEGA]}, "give parameters as .* 'sim.*' has no place there"),
+        ({"conditions": {DAMPING: 0.1}}, r"give conditions as \[{address: value, ...}, ...\], not as {"),
+        ({"conditions": [DAMPING]}, "give conditions as .* has no place there"),
+        ({"risk": ["worst"]}, r"not by \['worst'\]"),
+        ({"scenario": PendulumScenario}, "a scenario is an instance.*, unlike <class .*MyScenario"),
+        ({"start": "file.vtb"}, "Snapshot.load.* not 'file.vtb'"),
+        ({"horizon": "3"}, "the horizon t_m is a number, not '3'"),
+        ({"threshold": True}, "the threshold f_m is a number, not True"),
     ],
 )
 def test_a_problem_that_makes_no_sense_is_refused(changes, message):
@@ -170,11 +184,22 @@ def test_a_problem_that_makes_no_sense_is_refused(changes, message):
         (lambda p: p.boundary(resolution=2.0, coarse=1.0), "0 < resolution <= coarse"),
         (lambda p: _problem(threshold=inf).boundary(resolution=1.0, coarse=1.0), "finite threshold"),
         (lambda p: _problem(parameters=[]).sweep(points=3), "one or two parameters, not 0"),
+        (lambda p: p.sweep(points=3.5), "a number of points is a whole number, not 3.5"),
+        (lambda p: p.sweep(points="3"), "give points as one whole number, .* not as '3'"),
+        (lambda p: p.sweep(values="fast"), r"numbers of shape \(n, p\), not 'fast'"),
+        (lambda p: p.sweep(points=3, executor="threads", workers=1.5), "workers is a whole number, not 1.5"),
+        (lambda p: p.rollout([1.0], condition=1), "no condition 1: it has 1"),
+        (lambda p: p.rollout([1.0], condition=-1), "no condition -1"),
+        (lambda p: p.boundary(resolution="1", coarse=1.0), "the resolution is a number, not '1'"),
     ],
 )
 def test_a_question_that_makes_no_sense_is_refused(ask, message):
     with pytest.raises(ValueError, match=message):
         ask(_problem())
+
+
+def test_what_to_record_may_be_one_address():
+    assert list(_problem().rollout([1.0], record=THETA).record) == [THETA]
 
 
 def test_a_sweep_of_failures_has_no_best_point():

@@ -339,6 +339,8 @@ def test_a_solver_that_asks_only_for_what_is_known_ends_a_study():
         ({"rollouts": 0}, "at least one rollout, not 0"),
         ({"seconds": -1.0}, "positive and finite, not -1.0 s"),
         ({"target": float("nan")}, "a target is a number, not nan"),
+        ({"rollouts": 1.5}, "a budget of rollouts is a whole number, not 1.5"),
+        ({"seconds": "3"}, "a budget of wall time is a number, not '3'"),
     ],
 )
 def test_a_budget_that_makes_no_sense_is_refused(budget, message):
@@ -410,6 +412,20 @@ def test_a_quality_function_that_has_changed_is_refused(tmp_path):
 
     with pytest.raises(StudyError, match="the function f has other code"):
         pendulum_problem(quality=Quality(f, THETA)).study(path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"solver": 3}, "a solver is known by its name, unlike 3; one of auto, "),
+        ({"seed": 1.5}, "a seed is a whole number, not 1.5"),
+        ({"seed": True}, "a seed is a number, not True"),
+        ({"options": 3}, "the options of a solver are given as {name: value, ...}, not as 3"),
+    ],
+)
+def test_a_study_is_told_what_its_arguments_are(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        pendulum_problem().study(**wrong)
 
 
 def test_an_unknown_solver_is_told_the_known_ones(tmp_path):

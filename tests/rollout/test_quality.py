@@ -94,6 +94,8 @@ def test_what_is_not_a_quality_is_an_error_that_says_when_and_where(f, message):
 def test_a_quality_is_a_function_of_something():
     with pytest.raises(QualityError, match="not 3"):
         Quality(3, "time")
+    with pytest.raises(ValueError, match=r"give what a quality is a function of as \[address, ...\]"):
+        Quality(abs, 3)
     with pytest.raises(QualityError, match="at least one quality variable"):
         Quality(abs, [])
 

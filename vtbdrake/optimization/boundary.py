@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vtbdrake.rollout.arguments import as_number
+
 if TYPE_CHECKING:
     from vtbdrake.optimization.sweep import Sweep
 
@@ -97,6 +99,7 @@ class Refinement:
     """
 
     def __init__(self, lower: float, upper: float, *, resolution: float, coarse: float) -> None:
+        resolution, coarse = as_number("the resolution", resolution), as_number("the coarse step", coarse)
         if not 0.0 < resolution <= coarse <= upper - lower:
             raise ValueError(
                 f"it takes 0 < resolution <= coarse <= {upper - lower:g}, the width of the range, not a resolution of "

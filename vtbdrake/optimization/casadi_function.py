@@ -14,6 +14,7 @@ from vtbdrake.optimization.judge import Judge
 from vtbdrake.optimization.outcome import Outcome, Row
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.rollout import Executor, make_executor
+from vtbdrake.rollout.arguments import as_number
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.problem import Problem
@@ -60,7 +61,7 @@ class ProblemFunction(casadi.Callback):
         super().__init__()
         if gradient not in (CENTRAL, AUTODIFF):
             raise ValueError(f"a gradient is taken by one of {CENTRAL}, {AUTODIFF}, not by {gradient!r}")
-        if not 0.0 < step <= 0.1:
+        if not 0.0 < as_number("the step", step) <= 0.1:
             raise ValueError(f"the step is a part of each range, in (0, 0.1], not {step}")
         if len(problem.objectives) > 1:
             raise ValueError("a CasADi function has one value, but the problem has several qualities")

@@ -52,6 +52,8 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: one is neither a number, nor a word, nor made of these.
     """
+    if not isinstance(options, Mapping):
+        raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(options), default=lambda value: value.tolist()))
     except (AttributeError, TypeError) as error:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.rollout.arguments import all_of, as_number
 from vtbdrake.rollout.testbeds import FIELD
 from vtbdrake.state import Variable, Variables
 
@@ -38,6 +39,9 @@ class Parameter:
 
     def __post_init__(self) -> None:
         kind = int if self.integer else float
+        _check_address(self.address)
+        for end in ("lower", "upper"):
+            as_number(f"the {end} end of {self.address}", getattr(self, end))
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
             raise ValueError(
                 f"the range of {self.address} must be finite and not empty, lower < upper, but it is "
@@ -141,8 +145,10 @@ class Choice:
     options: tuple[Any, ...]
 
     def __init__(self, address: str, options: Sequence[Any]) -> None:
+        _check_address(address)
+        given: tuple[Any, ...] = all_of(object, options, name=f"the options of {address}", form="[option, option, ...]")
         object.__setattr__(self, "address", address)
-        object.__setattr__(self, "options", tuple(o.item() if isinstance(o, np.generic) else o for o in options))
+        object.__setattr__(self, "options", tuple(o.item() if isinstance(o, np.generic) else o for o in given))
         for option in self.options:
             if not isinstance(option, bool | int | float | str):
                 raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")
@@ -218,6 +224,11 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
         raise ValueError(f"a point has {len(addresses)} entries, but the one given has shape {shape}")
     entries = list(point) if isinstance(point, list | tuple) else np.atleast_1d(np.asarray(point)).tolist()
     return tuple(parameter.check(value) for parameter, value in zip(parameters, entries, strict=True))
+
+
+def _check_address(address: Any) -> None:
+    if not isinstance(address, str):
+        raise ValueError(f"what is varied is named by its address, a text, not by {address!r}")
 
 
 def _scalar(address: str, variables: Variables) -> Variable:

@@ -18,6 +18,7 @@ from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, grid
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
+from vtbdrake.rollout.arguments import all_of, as_number, as_whole
 from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
@@ -49,7 +50,7 @@ class Problem:
 
     Raises:
         ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets what is varied,
-            or the horizon, threshold or sample period makes no sense.
+            the horizon, threshold or sample period makes no sense, or an argument is of another kind than it says.
     """
 
     def __init__(
@@ -66,10 +67,16 @@ class Problem:
         constraints: Sequence[Constraint] = (),
         start: Snapshot | None = None,
     ) -> None:
-        self.parameters = tuple(parameters)
-        self.conditions = tuple({**condition} for condition in conditions)
-        self.objectives = (quality,) if isinstance(quality, Quality) else tuple(quality)
-        self.constraints = tuple(constraints)
+        self.parameters: tuple[Dimension, ...] = all_of(
+            Dimension, parameters, name="parameters", form="[Parameter(address, lower, upper), ...]"
+        )
+        given = all_of(Mapping, conditions, name="conditions", form="[{address: value, ...}, ...]")
+        self.conditions = tuple({**condition} for condition in given)
+        qualities = (quality,) if isinstance(quality, Quality) else quality
+        self.objectives = all_of(Quality, qualities, name="quality", form="Quality(f, of=[address, ...]) or several")
+        self.constraints = all_of(
+            Constraint, constraints, name="constraints", form="[Constraint(f, of=[address, ...], at_most=...), ...]"
+        )
         self.risk = make_risk(risk)
         if not self.objectives:
             raise ValueError("a problem has at least one quality")
@@ -137,10 +144,16 @@ class Problem:
         """What `point` sets in s0, as address -> value; and what the condition sets, if one is named.
 
         Raises:
-            ValueError: as `point`.
+            ValueError: as `point`, or there is no such condition.
         """
         chosen = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
-        return chosen if condition is None else {**self.conditions[condition], **chosen}
+        return chosen if condition is None else {**self._condition(condition), **chosen}
+
+    def _condition(self, number: int) -> Condition:
+        count = len(self.conditions)
+        if not 0 <= as_whole("the number of a condition", number) < count:
+            raise ValueError(f"the problem has no condition {number}: it has {count}, counted from 0")
+        return self.conditions[number]
 
     def rollout(
         self,
@@ -157,7 +170,7 @@ class Problem:
             record: addresses and ports (``path.port``) to record at the sample times.
             run_on: simulate to t_m although the threshold was exceeded.
         """
-        task = replace(self.task, record=tuple(record), run_on=run_on, keep_state=True)
+        task = replace(self.task, record=record, run_on=run_on, keep_state=True)
         parameters = self.values(point, condition=condition)
         result = replace(self._runner(task, parameters).run(split(parameters)[1]), parameters=parameters)
         return ProblemRollout(**vars(result), problem=self, condition=self.conditions[condition])
@@ -219,7 +232,7 @@ class Problem:
             table = grid(numeric, points)
         else:
             table = as_points(numeric, values)
-        task = replace(self.task, record=tuple(record), run_on=run_on)
+        task = replace(self.task, record=record, run_on=run_on)
         return examine.sweep(self, task, table, executor=executor, workers=workers, progress=progress)
 
     def boundary(
@@ -283,6 +296,7 @@ class Problem:
 
 def _f_m(objectives: Sequence[Quality], threshold: float | None) -> float:
     """f_m of the threshold in the user's terms."""
+    threshold = None if threshold is None else as_number("the threshold f_m", threshold)
     if threshold is None or (threshold == inf and not objectives[0].minimize):
         return inf
     if len(objectives) > 1:

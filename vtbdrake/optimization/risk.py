@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vtbdrake.rollout.arguments import as_number
+
 
 class Risk(ABC):
     """Aggregates qualities h, larger is better, of shape (n,): one decision under n conditions.
@@ -83,7 +85,7 @@ def make_risk(risk: str | Risk) -> Risk:
     """
     if isinstance(risk, Risk):
         return risk
-    if risk not in RISKS:
+    if not isinstance(risk, str) or risk not in RISKS:
         raise ValueError(
             f"conditions are aggregated by {', '.join(RISKS)}, Quantile(level) or CVaR(level), not by {risk!r}"
         )
@@ -91,6 +93,7 @@ def make_risk(risk: str | Risk) -> Risk:
 
 
 def _check_level(risk: Quantile | CVaR) -> None:
-    if not 0.0 < risk.level <= 1.0:
-        raise ValueError(f"the level of {type(risk).__name__} lies in (0, 1], unlike {risk.level}")
-    object.__setattr__(risk, "level", float(risk.level))
+    level = as_number(f"the level of {type(risk).__name__}", risk.level)
+    if not 0.0 < level <= 1.0:
+        raise ValueError(f"the level of {type(risk).__name__} lies in (0, 1], unlike {level}")
+    object.__setattr__(risk, "level", level)

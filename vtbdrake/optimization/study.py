@@ -17,6 +17,7 @@ from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.optimization.study_record import StudyRecord
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
+from vtbdrake.rollout.arguments import as_whole
 
 if TYPE_CHECKING:
     from optuna.storages import BaseStorage
@@ -65,8 +66,8 @@ class Study(StudyRecord):
         """See `Problem.study`."""
         meta: dict[str, Any] = {
             "problem": describe(problem),
-            "solver": solver or "auto",
-            "seed": 0 if seed is None else int(seed),
+            "solver": "auto" if solver is None else solver,
+            "seed": 0 if seed is None else as_whole("a seed", seed),
             "options": plain_options(options or {}),
             "versions": versions(),
             "revision": revision(problem.scenario),

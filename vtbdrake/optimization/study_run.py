@@ -16,6 +16,7 @@ from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver
 from vtbdrake.optimization.study_file import StudyFile, TrialRow
 from vtbdrake.rollout import Executor
+from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.many import watched
 
 _log = logging.getLogger(__name__)
@@ -202,11 +203,11 @@ def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | Non
     """
     if rollouts is None and seconds is None and target is None:
         raise ValueError("a study needs to know when it is enough: give rollouts=, seconds= or target=")
-    if rollouts is not None and rollouts < 1:
+    if rollouts is not None and as_whole("a budget of rollouts", rollouts) < 1:
         raise ValueError(f"a budget is at least one rollout, not {rollouts}")
-    if target is not None and isnan(target):
+    if target is not None and isnan(as_number("a target", target)):
         raise ValueError("a target is a number, not nan: no point would ever reach it")
-    if seconds is not None and not (isfinite(seconds) and seconds > 0.0):
+    if seconds is not None and not (isfinite(as_number("a budget of wall time", seconds)) and seconds > 0.0):
         raise ValueError(f"a budget of wall time is positive and finite, not {seconds} s")
     if target is not None and len(problem.objectives) > 1:
         raise ValueError("a target belongs to one quality, but the problem has several")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from vtbdrake.optimization.boundary import Boundary, boundary_of
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout.arguments import all_of, as_whole
 from vtbdrake.state.archive import read_archive, write_archive
 
 if TYPE_CHECKING:
@@ -216,7 +217,9 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     """
     if not 1 <= len(parameters) <= 2:
         raise ValueError(f"a sweep goes over one or two parameters, not {len(parameters)}")
-    counts = [int(points)] * len(parameters) if isinstance(points, int | np.integer) else list(points)
+    each = [points] * len(parameters) if isinstance(points, int | float | np.number) else points
+    form = "one whole number, or one for each parameter"
+    counts = [as_whole("a number of points", count) for count in all_of(object, each, name="points", form=form)]
     if len(counts) != len(parameters) or min(counts) < 2:
         raise ValueError(f"a sweep has at least two points for each of its {len(parameters)} parameters, not {points}")
     axes = [np.linspace(p.lower, p.upper, count) for p, count in zip(parameters, counts, strict=True)]
@@ -227,9 +230,12 @@ def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
     """Points that are given, shape (n, p) or, of a single parameter, (n,); shape (n, p).
 
     Raises:
-        ValueError: they have another shape.
+        ValueError: they have another shape, or are no numbers.
     """
-    table = np.asarray(values, dtype=float)
+    try:
+        table = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the values of a sweep are numbers of shape (n, p), not {values!r}") from error
     count = len(parameters)
     if table.ndim < 2 and (count == 1 or not table.size):
         table = table.reshape(-1, count)

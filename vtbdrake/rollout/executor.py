@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+from vtbdrake.rollout.arguments import as_whole
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.task import RolloutTask
@@ -168,8 +169,9 @@ def checked_workers(workers: int | None) -> int:
     """How many workers; the number of cores if left out.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there are none, or it is no number.
     """
-    if workers is not None and workers < 1:
+    count = cores() if workers is None else as_whole("the number of workers", workers)
+    if count < 1:
         raise ValueError(f"an executor needs at least one worker, not {workers}")
-    return workers if workers is not None else cores()
+    return count

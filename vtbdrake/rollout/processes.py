@@ -14,6 +14,7 @@ from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from vtbdrake.rollout.arguments import as_number
 from vtbdrake.rollout.blob import Blobs
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.result import RolloutResult
@@ -221,6 +222,7 @@ def checked_time_limit(time_limit: float) -> float:
     Raises:
         ValueError: it is not positive.
     """
+    time_limit = as_number("the time limit", time_limit)
     if not time_limit > 0.0:
         raise ValueError(f"the time limit must be positive, not {time_limit} s")
     return time_limit

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.rollout.arguments import as_addresses, as_number
 from vtbdrake.rollout.readings import READINGS, check_reading
 
 
@@ -34,9 +35,9 @@ class Measure:
     reading: str = field(default="best", kw_only=True)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "of", (self.of,) if isinstance(self.of, str) else tuple(self.of))
         if not callable(self.f):
-            raise QualityError(f"a quality is a function of {', '.join(self.of)}, not {self.f!r}")
+            raise QualityError(f"a quality is a function of variables, Quality(f, of=[address, ...]), not {self.f!r}")
+        object.__setattr__(self, "of", as_addresses("what a quality is a function of", self.of))
         if not self.of:
             raise QualityError("a quality needs at least one quality variable: give of=[address, ...]")
         check_reading(self.reading)
@@ -89,6 +90,7 @@ class Quality(Measure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "upper", as_number("the most that a quality can be", self.upper))
         if isnan(self.upper) or self.upper <= 0.0:
             raise QualityError(f"the most that a quality can be is positive, not {self.upper}")
         if self.minimize and self.upper != inf:
@@ -135,6 +137,8 @@ class Constraint(Measure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("at_most", "at_least"):
+            object.__setattr__(self, name, as_number(name, getattr(self, name)))
         limits = f"at_least {self.at_least:g}, at_most {self.at_most:g}"
         if not self.at_least <= self.at_most or (self.at_least == -inf and self.at_most == inf):
             raise QualityError(f"a constraint takes at_most, at_least or both, in this order, not {limits}")

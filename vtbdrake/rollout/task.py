@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, isnan
 
 import numpy as np
 
+from vtbdrake.rollout.arguments import as_addresses, as_number
 from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
@@ -37,14 +39,24 @@ class RolloutTask:
     quality: Quality | None = None
     threshold: float = inf
     sample_period: float = 0.05
-    record: tuple[str, ...] = ()
+    record: Sequence[str] = ()
     run_on: bool = False
     start: Snapshot | None = None
     keep_state: bool = False
     measures: tuple[Measure, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "record", tuple(self.record))
+        if not isinstance(self.scenario, Scenario):
+            raise ValueError(
+                f"a scenario is an instance, of a class or from load_scenario(), unlike {self.scenario!r}: "
+                "make one, MyScenario(), say"
+            )
+        if not isinstance(self.start, Snapshot | None):
+            raise ValueError(f"the start of rollouts is a snapshot, from Snapshot.load(file), say, not {self.start!r}")
+        numbers = {"horizon": "the horizon t_m", "sample_period": "the sample period", "threshold": "the threshold f_m"}
+        for name, what in numbers.items():
+            object.__setattr__(self, name, as_number(what, getattr(self, name)))
+        object.__setattr__(self, "record", as_addresses("what to record", self.record))
         object.__setattr__(self, "measures", tuple(self.measures))
         # Its own: a scenario that is changed afterwards is another one.
         object.__setattr__(self, "scenario", copy.deepcopy(self.scenario))

@@ -79,6 +79,8 @@ def make_solver(
 
 
 def _find(name: str) -> str:
+    if not isinstance(name, str):
+        raise SolverError(f"a solver is known by its name, unlike {name!r}; one of {', '.join(CATALOGUE)}")
     names = {_plain(known): known for known in CATALOGUE}
     if _plain(name) in names:
         return names[_plain(name)]

@@ -1,0 +1,57 @@
+"""Arguments of the wrong kind, told where they are given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+def as_number(name: str, value: Any) -> float:
+    """
+    Raises:
+        ValueError: it is no number; a text is none, nor is True.
+    """
+    if not isinstance(value, str | bytes | bool):
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            pass
+    raise ValueError(f"{name} is a number, not {value!r}")
+
+
+def as_whole(name: str, value: Any) -> int:
+    """
+    Raises:
+        ValueError: it is no whole number; 1e4 is one, 1.5 is none.
+    """
+    if not as_number(name, value).is_integer():
+        raise ValueError(f"{name} is a whole number, not {value!r}")
+    return int(value)
+
+
+def as_addresses(name: str, values: Any) -> tuple[str, ...]:
+    """One address, or several.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    return all_of(str, (values,) if isinstance(values, str) else values, name=name, form="[address, ...]")
+
+
+def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
+    """The values, each of which is a ``kind``.
+
+    Args:
+        name: of the argument.
+        form: how it is given.
+
+    Raises:
+        ValueError: they are no list, or one is of another kind.
+    """
+    if not isinstance(values, Iterable) or isinstance(values, str | Mapping):
+        raise ValueError(f"give {name} as {form}, not as {values!r}")
+    found = tuple(values)
+    for value in found:
+        if not isinstance(value, kind):
+            raise ValueError(f"give {name} as {form}; {value!r} has no place there")
+    return found
