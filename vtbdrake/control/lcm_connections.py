@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import time
@@ -12,6 +13,7 @@ from urllib.parse import urlsplit
 
 import lcm
 
+from vtbdrake.control.hub.shortcut import take_shortcut
 from vtbdrake.control.hub.tcpq import (
     MAGIC_CLIENT,
     MAGIC_SERVER,
@@ -78,7 +80,7 @@ def connect(url: str, handlers: Mapping[str, Handler], timeout: float, *, stampe
     """A connection to the bus at ``url``, subscribed to the channels of ``handlers``.
 
     Args:
-        stamped: whether the kernel is to stamp what arrives; it does for tcpq.
+        stamped: whether the kernel is to stamp what arrives; it does for tcpq, by TCP.
 
     Raises:
         OSError: there is no bus.
@@ -118,7 +120,7 @@ class LibraryConnection(Connection):
 
 
 class TcpqConnection(Connection):
-    """To a tcpq hub, by a socket of its own that is never waited for.
+    """To a tcpq hub, by a socket of its own that is never waited for: the hub's shortcut if there is one, or TCP.
 
     liblcm's client writes a message in five sends, waits inside of a message for as long as the hub does, connects anew
     (and waits again) in whatever call comes after a loss, even in the destructor, and believes any length that it is
@@ -131,9 +133,8 @@ class TcpqConnection(Connection):
         self._reader.greeted = True  # the hub's greeting is read below; what follows has the form of a client's records
         self._records: deque[Record] = deque()
         self._unsent = b""
-        self._socket = socket.create_connection(tcpq_address(url), timeout)
+        self._socket = _open(tcpq_address(url), timeout, stamped=stamped)
         try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.name = address_name(self._socket.getsockname())
             self._greet()
             for channel in handlers:
@@ -162,6 +163,9 @@ class TcpqConnection(Connection):
         return self._socket.fileno()
 
     def take(self, limit: int) -> int:
+        if self._unsent:
+            with contextlib.suppress(BlockingIOError):
+                self._send_rest()
         count = self._dispatch(limit) if self._records else 0
         chunk_size = _RECEIVE
         while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
@@ -201,14 +205,28 @@ class TcpqConnection(Connection):
 
     def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
         if self._unsent:
-            self._unsent = self._unsent[self._socket.send(self._unsent) :]
+            self._send_rest()
             if self._unsent:
                 raise BlockingIOError("an earlier message is still on its way")
         records = b"".join([publication(channel.encode(), data) for channel, data in messages])
         self._unsent = records[self._socket.send(records) :]
 
+    def _send_rest(self) -> None:
+        self._unsent = self._unsent[self._socket.send(self._unsent) :]
+
     def close(self) -> None:
         self._socket.close()
+
+
+def _open(address: tuple[str, int], timeout: float, *, stamped: bool) -> socket.socket:
+    """A connection to the hub, with a time-out, until it is told otherwise."""
+    # The kernel does not stamp what comes by a Unix socket.
+    sock = None if stamped else take_shortcut(*address)
+    if sock is None:
+        sock = socket.create_connection(address, timeout)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.settimeout(timeout)
+    return sock
 
 
 def tcpq_address(url: str) -> tuple[str, int]:

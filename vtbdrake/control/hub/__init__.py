@@ -22,7 +22,9 @@ to all clients that subscribed to its channel, the publisher included.
   A time in which the hub itself was held up does not count against a lease.
 * **Status.** The hub publishes its `Statistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within
   10 ms when the owner of a channel changes or something is refused. Clients have the names of their sockets,
-  ``127.0.0.1:41234``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.
+  ``127.0.0.1:41234`` or ``local:00a3f``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.
+* **Shortcut.** Beside a loopback address the hub listens on a Unix socket, by which a message costs less; this
+  package's own clients take that way by themselves, and are clients like all others.
 
 * **Beside a control loop** it does best on the loop's own processor (``cpus``), at a lower ``priority``. On another
   one, every command that leaves has to wake that up, and at a higher priority the hub interrupts the cycle that sends.

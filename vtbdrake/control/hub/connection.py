@@ -24,7 +24,7 @@ class Connection:
         now: the time, on the hub's clock, in seconds.
 
     Attributes:
-        name: ``host:port`` of the client.
+        name: of the client; see `address_name`.
         reader: of what comes from it.
         progressed: when it connected, when its queue began, or when it last took something off it.
         watched: whether the hub waits for it to take more.
@@ -45,14 +45,17 @@ class Connection:
         self._queue: deque[bytes | bytearray] = deque()
         self._offset = 0  # of the first message of the queue: so much of it is sent
         self._subscriptions: list[tuple[bytes, Callable[[str], object]]] = []
+        self._by_tcp = sock.family == socket.AF_INET
         sock.setblocking(False)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._by_tcp:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def acknowledge(self) -> None:
         """Acknowledges at once what was read: liblcm writes a message in five pieces, and leaves Nagle's algorithm on,
         which holds back the second piece until the first is acknowledged (by default 40 ms later).
         The kernel forgets the option, so it takes one call for every piece read."""
-        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        if self._by_tcp:
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def subscribe(self, pattern: bytes) -> None:
         """

@@ -63,11 +63,12 @@ class Hub:
         program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.hub.process import main; main()"
         control, theirs = socket.socketpair()
         try:
-            with theirs, listen(self.config) as listener:
-                filenos = [listener.fileno(), theirs.fileno()]
-                self._url = f"tcpq://{address_name(listener.getsockname())}"
+            with theirs, contextlib.ExitStack() as stack:
+                listeners = [stack.enter_context(listener) for listener in listen(self.config)]
+                filenos = [theirs.fileno(), *(listener.fileno() for listener in listeners)]
+                self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
                 self._process = subprocess.Popen(
-                    [sys.executable, "-c", program, *map(str, filenos), json.dumps(asdict(self.config))],
+                    [sys.executable, "-c", program, json.dumps(asdict(self.config)), *map(str, filenos)],
                     pass_fds=filenos,
                     stdin=subprocess.DEVNULL,
                 )
@@ -201,9 +202,9 @@ class _DroppingHandler(QueueHandler):
 
 def main() -> None:
     """The process of a `Hub`."""
-    listener, control = (socket.socket(fileno=int(fileno)) for fileno in sys.argv[1:3])
+    control, *listeners = (socket.socket(fileno=int(fileno)) for fileno in sys.argv[2:])
     logging.basicConfig(format="hub: %(message)s")
     # Ctrl-C reaches the whole group of processes; the one that started the hub decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    server = HubServer(HubConfig(**json.loads(sys.argv[3])), listener=listener, control=control)
+    server = HubServer(HubConfig(**json.loads(sys.argv[1])), listeners=listeners, control=control)
     serve(server)

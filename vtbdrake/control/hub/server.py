@@ -8,17 +8,17 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from vtbdrake.control.hub import tcpq
 from vtbdrake.control.hub.config import HubConfig
 from vtbdrake.control.hub.connection import SLICE, Connection
 from vtbdrake.control.hub.relay import Relay
+from vtbdrake.control.hub.shortcut import LOOPBACK, open_shortcut
 from vtbdrake.control.hub.statistics import Statistics
 
 _log = logging.getLogger(__name__)
-
-_LOOPBACK = "127."
 
 _READS = 8  # liblcm writes a message in five pieces
 _NEWS_PERIOD = 0.01
@@ -29,19 +29,25 @@ class HubAddressError(ValueError):
     """The hub cannot listen at its address."""
 
 
-def listen(config: HubConfig) -> socket.socket:
-    """A socket that listens where the hub is told to.
+def listen(config: HubConfig) -> list[socket.socket]:
+    """Sockets that listen where the hub is told to: by TCP, and the shortcut if there is one.
 
     Raises:
-        HubAddressError: it cannot.
+        HubAddressError: it cannot listen there.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listeners = [sock]
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((config.host, config.port))
+        # The shortcut opens first: who seeks the hub and finds no shortcut yet must not stay with TCP.
+        shortcut = open_shortcut(*sock.getsockname())
+        if shortcut is not None:
+            listeners.append(shortcut)
         sock.listen()
     except OSError as error:
-        sock.close()
+        for listener in listeners:
+            listener.close()
         if error.errno == errno.EADDRINUSE:
             raise HubAddressError(
                 f"port {config.port} of {config.host} is in use, perhaps by another hub: end that one, or choose "
@@ -51,9 +57,9 @@ def listen(config: HubConfig) -> socket.socket:
             f"the hub cannot listen on port {config.port} of {config.host!r} ({error.strerror}): choose an IPv4 "
             "address of this machine, and a port that you may use"
         ) from error
-    if not sock.getsockname()[0].startswith(_LOOPBACK):
+    if not sock.getsockname()[0].startswith(LOOPBACK):
         _log.warning("listens on %s, not on loopback: whoever reaches that address is a client", config.host)
-    return sock
+    return listeners
 
 
 class HubServer:
@@ -64,7 +70,7 @@ class HubServer:
 
     Args:
         config: address, protected channels and limits.
-        listener: a listening socket to use instead of one at the configured address; the hub owns it.
+        listeners: what `listen` returned; the hub owns them. None: it listens itself.
         control: a connected socket, which the hub owns: for every byte that comes in, the statistics go out as a line
             of JSON; when its other end closes, the hub stops.
 
@@ -73,16 +79,22 @@ class HubServer:
     """
 
     def __init__(
-        self, config: HubConfig, *, listener: socket.socket | None = None, control: socket.socket | None = None
+        self,
+        config: HubConfig,
+        *,
+        listeners: Sequence[socket.socket] | None = None,
+        control: socket.socket | None = None,
     ) -> None:
         self.config = config
-        self._listener = listen(config) if listener is None else listener
-        self._listener.setblocking(False)
-        self.url = f"tcpq://{tcpq.address_name(self._listener.getsockname())}"
+        self._listeners = listen(config) if listeners is None else listeners
+        self.url = f"tcpq://{tcpq.address_name(self._listeners[0].getsockname())}"
         self._control = control
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._epoll = select.epoll()
-        self._others: dict[int, Callable[[], None]] = {self._listener.fileno(): self._accept, self._wake: self._stop}
+        self._others: dict[int, Callable[[], None]] = {self._wake: self._stop}
+        for listener in self._listeners:
+            listener.setblocking(False)
+            self._others[listener.fileno()] = partial(self._accept, listener)
         if control is not None:
             control.setblocking(False)
             self._others[control.fileno()] = self._answer
@@ -138,7 +150,8 @@ class HubServer:
         self._clients.clear()
         if not self._epoll.closed:
             self._epoll.close()
-            self._listener.close()
+            for listener in self._listeners:
+                listener.close()
             os.close(self._wake)
             if self._control is not None:
                 self._control.close()
@@ -165,15 +178,16 @@ class HubServer:
         if not asked:
             self._running = False
 
-    def _accept(self) -> None:
+    def _accept(self, listener: socket.socket) -> None:
         try:
-            sock, _ = self._listener.accept()
+            sock, _ = listener.accept()
         except (BlockingIOError, ConnectionError):
             return
         except OSError as error:
             # Such as: no more file descriptors. The connection stays at the door, and would wake the hub for ever.
             _log.warning("no client is accepted for %g s: %s", _ACCEPT_PAUSE, error)
-            self._epoll.unregister(self._listener.fileno())
+            for listener in self._listeners:
+                self._epoll.unregister(listener.fileno())
             self._paused = self._now
             return
         if len(self._clients) >= self.config.max_clients:
@@ -260,4 +274,5 @@ class HubServer:
                 self._disconnect(client, "greeting", f"has not greeted for {patience:g} s")
         if self._paused is not None and now >= self._paused + _ACCEPT_PAUSE:
             self._paused = None
-            self._epoll.register(self._listener.fileno(), select.EPOLLIN)
+            for listener in self._listeners:
+                self._epoll.register(listener.fileno(), select.EPOLLIN)

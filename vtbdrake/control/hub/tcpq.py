@@ -61,9 +61,12 @@ def client_name(fileno: int) -> str:
         return address_name(own.getsockname())
 
 
-def address_name(address: tuple[str, int]) -> str:
-    """``host:port``."""
-    return f"{address[0]}:{address[1]}"
+def address_name(address: tuple[str, int] | str | bytes) -> str:
+    """``host:port`` of a TCP socket, ``local:name`` of a Unix socket."""
+    if isinstance(address, tuple):
+        return f"{address[0]}:{address[1]}"
+    name = os.fsencode(address).removeprefix(b"\0")  # of an abstract socket
+    return f"local:{repr(name)[2:-1]}"  # It may be any bytes, and it is logged.
 
 
 class Reader:
