@@ -16,6 +16,7 @@ from vtbdrake.optimization.outcome import Outcome
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study_error import StudyError, damaged, explained
 from vtbdrake.optimization.study_lock import claim
+from vtbdrake.optimization.study_name import sqlite_name
 
 VERSION = 1
 _APPLICATION = 0x56544253  # "VTBS"
@@ -43,6 +44,8 @@ TrialRow = tuple[int, int, Point, tuple[float, ...], tuple[float, ...], bool, st
 class StudyFile:
     """The file of one study. Several processes may have it open; one of them may `run` it.
 
+    One that exists can be read in a folder that cannot be written to as well, as long as nobody else runs it.
+
     Args:
         path: None keeps the study in memory.
         meta: what a new study is about; None opens one that exists.
@@ -59,7 +62,11 @@ class StudyFile:
         with explained(self.path):
             # Commits are explicit; the lock of this object keeps threads apart.
             self._db = sqlite3.connect(
-                self.path or ":memory:", timeout=30.0, isolation_level=None, check_same_thread=False
+                sqlite_name(self.path, new=meta is not None),
+                uri=True,
+                timeout=30.0,
+                isolation_level=None,
+                check_same_thread=False,
             )
         try:
             with explained(self.path):
