@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,13 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def number(value: float) -> str:
     """Six digits, without a negative zero."""
     return f"{value + 0.0:.6g}"
+
+
+def finite(value: Any) -> Any:
+    """A number, or nested lists of them, for JSON, which knows no NaN and no infinity: null stands for these."""
+    if isinstance(value, list):
+        return [finite(item) for item in value]
+    return value if isfinite(value) else None
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:

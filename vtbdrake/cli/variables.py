@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from math import isfinite
 from typing import Any
 
 import click
@@ -11,6 +10,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.cli.group import BadInputError
 from vtbdrake.cli.options import scenario_argument
+from vtbdrake.cli.text import finite
 from vtbdrake.state import Variable
 from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed import Scenario
@@ -52,12 +52,6 @@ def _plain(variable: Variable, context: Context) -> dict[str, Any]:
         "derived": variable.derived,
         "shape": list(variable.shape),
         "unit": variable.unit,
-        "bounds": [_finite(bound) for bound in variable.bounds],
-        "value": _finite(value if isinstance(value, float) else value.tolist()),
+        "bounds": [finite(bound) for bound in variable.bounds],
+        "value": finite(value if isinstance(value, float) else value.tolist()),
     }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return value if isfinite(value) else None

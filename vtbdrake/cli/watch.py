@@ -10,6 +10,7 @@ import numpy as np
 
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import timeout_option, url_option
+from vtbdrake.cli.text import finite
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.live.client import LiveError, SilenceError, watch
 
@@ -30,7 +31,7 @@ from vtbdrake.control.live.client import LiveError, SilenceError, watch
 def watch_values(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
     """Print variables and output ports of a DPS that runs by vtbdrake run, until Ctrl-C or its end.
 
-    One JSON object a line: the DPS's time in seconds, and the values by address.
+    One JSON object a line: the DPS's time in seconds, and the values by address; null for what is not finite.
 
     \b
     Example:
@@ -38,7 +39,7 @@ def watch_values(addresses: tuple[str, ...], url: str, every: int, count: int | 
     """
     try:
         for time, values in islice(watch(url, addresses, every=every, timeout=timeout), count):
-            plain = {address: np.asarray(value).tolist() for address, value in values.items()}
+            plain = {address: finite(np.asarray(value).tolist()) for address, value in values.items()}
             click.echo(json.dumps({"time": time, **plain}))
     except (BridgeError, LiveError, SilenceError) as error:
         raise FailedError(one_line(error)) from error
