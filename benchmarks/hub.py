@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import lcm
@@ -14,6 +15,7 @@ import numpy as np
 
 from benchmarks.measure import LOWER, Benchmark
 from vtbdrake.control.hub import Hub
+from vtbdrake.control.lcm_connections import TcpqConnection
 from vtbdrake.control.realtime import RealTime
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 GOAL = 100e-6
 TIMEOUT_MS = 10_000
 SIZE = 200  # bytes, about those of a robot's state
+
+_UNKNOWN_TO_THE_SHORTCUT = "0x7f.0.0.1"  # is 127.0.0.1, too
 
 # Another process that sends back what it gets.
 _ECHO = """
@@ -35,9 +39,9 @@ while True:
 
 def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: int = 8) -> list[Benchmark]:
     """The median time from a client's publication to its arrival at the same client, an unmodified `lcm.LCM`, through
-    the hub and through a naive one, in turns; and, printed only, that to another client and back: twice through the
-    hub."""
-    times: dict[str, list[float]] = {"hub": [], "naive": [], "echo": []}
+    the hub and through a naive one, in turns; and, printed only, that to another client and back (twice through the
+    hub), and that of this package's own client, by the hub's shortcut and by TCP."""
+    times: dict[str, list[float]] = {"hub": [], "naive": [], "echo": [], "shortcut": [], "own by TCP": []}
     with Hub(port=0) as hub, _naive_hub() as naive_url, contextlib.ExitStack() as stack:
         rights = stack.enter_context(RealTime(priority=None, lock_memory=False))
         ours, naive, pinger = lcm.LCM(hub.url), lcm.LCM(naive_url), lcm.LCM(hub.url)
@@ -45,10 +49,14 @@ def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: i
             bus.subscribe(channel, lambda *_: None)
         stack.enter_context(_echo(hub.url))
         _await(pinger)
+        shortcut = stack.enter_context(_own_client(hub.url))
+        by_tcp = stack.enter_context(_own_client(hub.url.replace("127.0.0.1", _UNKNOWN_TO_THE_SHORTCUT)))
         for _ in range(rounds):
-            times["hub"] += _round_trips(ours, "SELF", messages // rounds)
-            times["naive"] += _round_trips(naive, "SELF", naive_messages // rounds)
-            times["echo"] += _round_trips(pinger, "PING", messages // rounds)
+            times["hub"] += _round_trips(_turn(ours, "SELF"), messages // rounds)
+            times["naive"] += _round_trips(_turn(naive, "SELF"), naive_messages // rounds)
+            times["echo"] += _round_trips(_turn(pinger, "PING"), messages // rounds)
+            times["shortcut"] += _round_trips(shortcut, messages // rounds)
+            times["own by TCP"] += _round_trips(by_tcp, messages // rounds)
     p50 = {name: float(np.median(values)) for name, values in times.items()}
     against = "a naive hub, without TCP_NODELAY and TCP_QUICKACK"
     return [
@@ -74,19 +82,48 @@ def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: i
             better=LOWER,
             against="twice through the hub, by way of another process",
         ),
+        Benchmark(
+            name="hub_shortcut_round_trip_p50",
+            value=p50["shortcut"],
+            unit="s",
+            goal=None,
+            better=LOWER,
+            against=f"the same client by TCP: {1e6 * p50['own by TCP']:.3g} us",
+        ),
     ]
 
 
-def _round_trips(bus: lcm.LCM, channel: str, messages: int) -> list[float]:
-    """Seconds from a publication to what comes back, one message after another."""
-    data = bytes(SIZE)
+def _round_trips(turn: Callable[[], None], messages: int) -> list[float]:
+    """Seconds that turns take, each a publication and what comes back, one after another."""
     times = []
     for _ in range(messages):
         begin = time.perf_counter()
-        bus.publish(channel, data)
-        bus.handle()
+        turn()
         times.append(time.perf_counter() - begin)
     return times
+
+
+def _turn(bus: lcm.LCM, channel: str) -> Callable[[], None]:
+    data = bytes(SIZE)
+
+    def turn() -> None:
+        bus.publish(channel, data)
+        bus.handle()
+
+    return turn
+
+
+@contextlib.contextmanager
+def _own_client(url: str) -> Iterator[Callable[[], None]]:
+    with contextlib.closing(TcpqConnection(url, {url: lambda *_: None}, 1e-3 * TIMEOUT_MS)) as connection:
+        messages = [(url, bytes(SIZE))]  # a channel that nobody else hears
+
+        def turn() -> None:
+            connection.publish(messages)
+            select.select([connection], [], [])
+            connection.take(1)
+
+        yield turn
 
 
 def _await(bus: lcm.LCM) -> None:
