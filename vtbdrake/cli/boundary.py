@@ -10,7 +10,6 @@ import numpy as np
 
 from vtbdrake.cli.options import converted, parse_range
 from vtbdrake.cli.study import (
-    check_workers,
     condition_text,
     execution_options,
     make_problem,
@@ -58,7 +57,6 @@ def find_boundary(
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
-    check_workers(executor, workers)
     stated = make_problem(scenario, [vary], **problem)
     found = stated.boundary(resolution=resolution, coarse=coarse, executor=executor, workers=workers)
     sweep = found.sweep

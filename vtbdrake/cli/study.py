@@ -29,12 +29,11 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.quality import make_quality
 from vtbdrake.cli.text import number, table, write_csv
 from vtbdrake.optimization import Parameter, Problem, Sweep
+from vtbdrake.rollout.choice import NAMES
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-EXECUTORS = ("auto", "serial", "threads", "processes", "dask")
 
 _PROBLEM = (
     scenario_argument,
@@ -61,7 +60,7 @@ _PROBLEM = (
 )
 
 _EXECUTION = (
-    click.option("--executor", type=click.Choice(EXECUTORS), default=EXECUTORS[0], show_default=True),
+    click.option("--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True),
     click.option(
         "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
     ),
@@ -106,15 +105,6 @@ def make_problem(
         conditions=[settings([*common, *condition.items()]) for condition in conditions or ({},)],
         start=start,
     )
-
-
-def check_workers(executor: str, workers: int | None) -> None:
-    """
-    Raises:
-        click.UsageError: a number of workers is given to an executor that has none.
-    """
-    if executor == "serial" and workers is not None:
-        raise click.UsageError("--workers has no meaning with --executor serial")
 
 
 def points_table(sweep: Sweep) -> str:

@@ -11,7 +11,6 @@ import click
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import converted, parse_grid
 from vtbdrake.cli.study import (
-    check_workers,
     condition_text,
     execution_options,
     make_problem,
@@ -57,7 +56,6 @@ def run_sweep(
       vtbdrake sweep diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
     """
-    check_workers(executor, workers)
     stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
     sweep = stated.sweep([points for _, points in vary], executor=executor, workers=workers)
     click.echo(points_table(sweep))
