@@ -58,7 +58,7 @@ def error_of(arguments: list[str], code: int = 2) -> str:
         (["rollout", "--horizon", "1"], "Missing argument 'SCENARIO'"),
         ([*SWEEP, "--threshold", "-1"], "must not be negative"),
         ([*SWEEP, "--executor", "cluster"], "'auto', 'serial', 'threads', 'processes'"),
-        ([*SWEEP, "--executor", "serial", "--workers", "2"], "--workers has no meaning"),
+        ([*SWEEP, "--executor", "serial", "--workers", "2"], "executor='serial' has no workers, but workers=2"),
         ([*SWEEP, "--workers", "0"], "x>=1"),
         ([*SWEEP, "--of", RATE], "--of belongs to a quality module:function"),
         ([*SWEEP, "--vary", f"{ANGLE}=0:2:2"], "a parameter is given twice"),
@@ -85,6 +85,13 @@ def test_bad_input(arguments: list[str], expected: str, tmp_path: Path, monkeypa
     monkeypatch.chdir(tmp_path)
     assert expected in error_of(arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
+    (log := tmp_path / "run.lcm").write_text("dear")
+    servo = ["run", "tests.control.servo_machine:ServoMachineScenario", "--url", "tcpq://127.0.0.1:1"]
+    assert f"{log} exists, and is not overwritten: give another name" in error_of([*servo, "--record", str(log)])
+    assert log.read_text() == "dear"
 
 
 def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:

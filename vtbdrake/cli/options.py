@@ -87,8 +87,12 @@ def _numbers(text: str, kinds: Sequence[Callable[[str], Any]], form: str) -> tup
         raise click.BadParameter(f"it takes {form} in numbers, not {text!r}: {error}") from error
 
 
-def output(*suffixes: str) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """A callback that checks a file to be written: its folder exists, and its name ends as one of ``suffixes``."""
+def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """A callback that checks a file to be written: its folder exists, and its name ends as one of ``suffixes``.
+
+    Args:
+        new: it must not exist.
+    """
 
     def parse(text: str) -> Path:
         path = Path(text)
@@ -98,6 +102,8 @@ def output(*suffixes: str) -> Callable[[click.Context, click.Parameter, Any], An
             raise click.BadParameter(f"{path} is a folder")
         if not path.parent.is_dir():
             raise click.BadParameter(f"{path} lies in a folder that does not exist")
+        if new and path.exists():
+            raise click.BadParameter(f"{path} exists, and is not overwritten: give another name, or remove it")
         return path
 
     return converted(parse)

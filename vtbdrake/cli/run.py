@@ -82,7 +82,9 @@ MOST_FAULTS = 20
     help="Keep memory from being paged out, all of it: what is never used becomes resident, too.",
 )
 @click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set, watch and reset.")
-@click.option("--record", callback=output(".lcm"), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay.")
+@click.option(
+    "--record", callback=output(".lcm", new=True), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay."
+)
 @click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the loop's timing: .json.")
 def run_dps(
     scenario: Scenario,

@@ -241,7 +241,7 @@ def test_a_process_that_takes_nothing_loses_cycles_and_not_time(
 def test_a_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     (tmp_path / "run.lcm").write_text("dear")
     servo = Servo()
-    with pytest.raises(FileExistsError):
+    with pytest.raises(FileExistsError, match=r"run\.lcm exists: record to another file, or with overwrite=True"):
         Recorder(servo.runtime, tmp_path / "run.lcm")
     assert (tmp_path / "run.lcm").read_text() == "dear"
     Recorder(servo.runtime, tmp_path / "run.lcm", overwrite=True).close()

@@ -13,7 +13,8 @@ VTB_WATCH  ``{"id": ID, "watch": [ADDRESS, ...], "every": N,     ``{"id": ID, "o
 Who is refused gets ``{"id": ID, "error": REASON}``. Values watched are ``{"cycle": K, "since": T0, "time": T, "values":
 {...}}``: read between the cycles of the DPS's times T0 and T, which are one and the same as long as there is time for
 all of them in one cycle. What is not finite is there as Python's ``json`` writes and reads it: NaN, Infinity. Who
-watches nothing (an empty list) has ended. ``{"id": ID, "ended": true}`` tells that the DPS has. A reset releases the latch of the guards, unless a cause persists; what it had latched for is told.
+watches nothing (an empty list) has ended. ``{"id": ID, "ended": true}`` tells that the DPS has. A reset releases the
+latch of the guards, unless a cause persists; what it had latched for is told.
 
 Whoever is on the bus may say these things, but for the channels that a hub protects: ``vtbdrake hub --protect
 VTB_RESET``.

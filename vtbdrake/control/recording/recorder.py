@@ -87,7 +87,10 @@ class Recorder:
         if overwrite and self.path.is_file():
             # A new file: who has read the old one still has it open, and must not lose it under his hands.
             self.path.unlink()
-        self.path.open("wb" if overwrite else "xb").close()
+        try:
+            self.path.open("wb" if overwrite else "xb").close()
+        except FileExistsError:
+            raise FileExistsError(f"{self.path} exists: record to another file, or with overwrite=True") from None
         self._companion = Companion(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
