@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -37,8 +38,11 @@ Entry = tuple[str, str, int, dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def entries(log: ControlLog, tmp_path_factory: pytest.TempPathFactory) -> list[Entry]:
+    return exported(log, tmp_path_factory.mktemp("mcap") / "run.mcap")
+
+
+def exported(log: ControlLog, path: Path) -> list[Entry]:
     """Topic, schema, time and content of all messages."""
-    path = tmp_path_factory.mktemp("mcap") / "run.mcap"
     export(log, path)
 
     def strict(name: str) -> None:
@@ -90,6 +94,20 @@ def test_faults_are_entries_of_foxglove_s_log(log: ControlLog, entries: list[Ent
     [(schema, time, content)] = [(schema, time, c) for topic, schema, time, c in entries if topic == "/faults"]
     assert schema == "foxglove.Log" and "not finite" in content["message"] and content["level"] == 4
     assert 10**9 * content["timestamp"]["sec"] + content["timestamp"]["nsec"] == time == 1000 * log.utimes[20]
+
+
+def test_a_reset_of_the_guards_is_told_when_it_was(tmp_path: Path) -> None:
+    servo = Servo()
+    with Recorder(servo.runtime, tmp_path / "run.lcm"):
+        for trouble, cycles in ((0.0, 5), (2.0, 5), (0.0, 5)):
+            servo.runtime.write({"dps.trouble": trouble})
+            servo.runtime.run(cycles=cycles)
+        servo.runtime.reset()
+        servo.runtime.run(cycles=5)
+    log = read_log(tmp_path / "run.lcm")
+    entries = exported(log, tmp_path / "run.mcap")
+    [(schema, time, content)] = [(schema, time, c) for topic, schema, time, c in entries if topic == "/reset"]
+    assert (schema, time, content) == ("vtbdrake.Reset", 1000 * log.utimes[15], {"time": log.times[15]})
 
 
 def test_messages_are_in_the_order_of_time(entries: list[Entry]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.control.cycle import RESULT, SWITCH, WRITE, Change
+from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.state.files import whole_file
 
@@ -29,6 +29,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
     },
     "vtbdrake.Switches": {"time": _TIME, "positions": {"type": "object", "additionalProperties": {"type": "string"}}},
     "vtbdrake.Result": {"time": _TIME, "tick": {"type": "integer"}, "missing": {"type": "boolean"}},
+    "vtbdrake.Reset": {"time": _TIME},
     # As Foxglove's panel for logs expects it.
     "foxglove.Log": {
         "timestamp": {
@@ -54,8 +55,9 @@ def export_mcap(log: ControlLog, path: str | os.PathLike[str]) -> None:
 
     Topics: ``/sense/<signal>``, ``/command/<signal>`` (what the DPS commanded) and ``/sent/<signal>`` (after the
     guards), wherever they have a new value; ``/cycle``; and what happens now and then, ``/switches``,
-    ``/variable/<address>`` (of those that were changed, the commands u among them), ``/result/<slow part>`` and
-    ``/faults``. Their times are the log's times of day; what is not finite is null. Abstract signals are left out.
+    ``/variable/<address>`` (of those that were changed, the commands u among them), ``/result/<slow part>``, ``/faults``
+    and ``/reset`` (of the guards). Their times are the log's times of day; what is not finite is null. Abstract signals
+    are left out.
 
     Raises:
         ModuleNotFoundError: mcap is not installed.
@@ -158,6 +160,8 @@ def _told(change: Change) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
         for address, value in change.values.items():
             row = _plain(np.reshape(np.asarray(value, dtype=float), (1, -1)))[0]
             yield f"/variable/{address}", "vtbdrake.Value", {"value": row}
+    elif change.kind == RESET:
+        yield "/reset", "vtbdrake.Reset", {}
     elif change.kind == RESULT:
         for path, result in change.values.items():
             message = {"tick": int(result["tick"]), "missing": len(result) == 1}
