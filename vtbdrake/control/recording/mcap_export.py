@@ -55,9 +55,9 @@ def export_mcap(log: ControlLog, path: str | os.PathLike[str]) -> None:
 
     Topics: ``/sense/<signal>``, ``/command/<signal>`` (what the DPS commanded) and ``/sent/<signal>`` (after the
     guards), wherever they have a new value; ``/cycle``; and what happens now and then, ``/switches``,
-    ``/variable/<address>`` (of those that were changed, the commands u among them), ``/result/<slow part>``, ``/faults``
-    and ``/reset`` (of the guards). Their times are the log's times of day; what is not finite is null. Abstract signals
-    are left out.
+    ``/variable/<address>`` (of those that were changed, the commands u among them), ``/result/<slow part>``,
+    ``/faults`` and ``/reset`` (of the guards). Their times are the log's times of day; what is not finite is null.
+    Abstract signals are left out.
 
     Raises:
         ModuleNotFoundError: mcap is not installed.
