@@ -18,7 +18,7 @@ from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.control.recording.log_events import LogEvents
-from vtbdrake.control.recording.log_format import EVENT, SYNC, LogError
+from vtbdrake.control.recording.log_format import EVENT, SYNC, VERSION, LogError
 from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.recorder import Recorder
 from vtbdrake.control.recording.replay import replay
@@ -156,6 +156,17 @@ def test_what_comes_with_a_cycle_that_comes_twice_counts_once(
     assert len(log.damages) == 6 and replay(log).identical
 
 
+def test_what_a_damaged_end_says_of_cycles_does_not_count(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    [(_, _, begin, end)] = reference.events.on("VTB_END")
+    number = begin + 16
+    log = read(tmp_path, whole[:number] + (CYCLES + 1000).to_bytes(8, "big") + whole[number + 8 :])
+    assert_same(log, reference, list(range(CYCLES)))
+    assert not log.gaps
+    assert [(damage.offset, damage.what) for damage in log.damages] == [
+        (begin, "the checksum of the log's end is wrong")
+    ]
+
+
 def test_a_change_of_a_damaged_cycle_is_not_taken_for_another_cycles(
     whole: bytes, reference: ControlLog, tmp_path: Path
 ) -> None:
@@ -236,11 +247,11 @@ def test_a_log_of_another_version_is_refused(whole: bytes, reference: ControlLog
 
     _, _, begin, end = reference.events.on("VTB_LOG")[0]
     content = bytearray(whole)
-    at = whole.index(b'"version": 2', begin)
+    at = whole.index(b'"version": %d' % VERSION, begin)
     content[at + 11 : at + 12] = b"7"
     text = content[begin + 20 : end - 5]
     content[end - 4 : end] = zlib.crc32(text).to_bytes(4, "big")
-    with pytest.raises(LogError, match="the log has the format 7, this version of vtbdrake reads 2"):
+    with pytest.raises(LogError, match=f"the log has the format 7, this version of vtbdrake reads {VERSION}"):
         read(tmp_path, bytes(content))
 
 

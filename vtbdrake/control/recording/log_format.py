@@ -11,7 +11,7 @@ import numpy as np
 
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 
-VERSION = 2
+VERSION = 3
 LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END = (
     f"VTB_{name}" for name in ("LOG", "STATE", "CYCLE", "CHANGE", "FAULT", "DIGEST", "END")
 )

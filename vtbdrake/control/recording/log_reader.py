@@ -92,7 +92,7 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
             for message in _messages(events, DIGEST, lcmt_vtb_digest, damages, frames)
         ],
         damages=damages,
-        gaps=_gaps(header, records["number"], [m.number for m in _messages(events, END, lcmt_vtb_end, damages)]),
+        gaps=_gaps(header, records["number"], _last(events, damages)),
         clock_jumps=_jumps(records),
         closed=bool(events.on(END)),
         events=events,
@@ -177,6 +177,15 @@ def _messages(
         except (MalformedError, struct.error, ValueError) as error:
             damages.append(Damage(begin, f"an event on {channel} cannot be read ({error})"))
     return found
+
+
+def _last(events: LogEvents, damages: list[Damage]) -> list[int]:
+    """The number of the last cycle that was recorded or lost, where the end of the log tells it."""
+    ends = _messages(events, END, lcmt_vtb_end, damages)
+    whole = [end.number for end in ends if zlib.crc32(end.encode()[:-4]) == end.crc & 0xFFFFFFFF]
+    if len(whole) < len(ends):
+        damages.append(Damage(events.on(END)[-1][2], "the checksum of the log's end is wrong"))
+    return whole
 
 
 def _within(frames: list[range], places: Sequence[Place]) -> Iterator[Place]:

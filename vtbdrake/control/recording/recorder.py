@@ -218,6 +218,7 @@ class Recorder:
         self._take_losses()
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
+        message.crc = _signed_crc(message.encode()[:-4])
         self._events.append(self._single(END, message))
         self._companion.post(*self._events)
         self._events.clear()

@@ -10,11 +10,11 @@ import struct
 class lcmt_vtb_end(object):
     """ VTB_END, the last event of a log that was closed. """
 
-    __slots__ = ["utime", "number", "lost"]
+    __slots__ = ["utime", "number", "lost", "crc"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t"]
 
-    __dimensions__ = [None, None, None]
+    __dimensions__ = [None, None, None, None]
 
     def __init__(self):
         self.utime = 0
@@ -31,6 +31,12 @@ class lcmt_vtb_end(object):
         LCM Type: int64_t
         """
 
+        self.crc = 0
+        """
+        CRC-32 of what is encoded before it
+        LCM Type: int32_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -39,7 +45,7 @@ class lcmt_vtb_end(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqq", self.utime, self.number, self.lost))
+        buf.write(struct.pack(">qqqi", self.utime, self.number, self.lost, self.crc))
 
     @staticmethod
     def decode(data: bytes):
@@ -54,13 +60,13 @@ class lcmt_vtb_end(object):
     @staticmethod
     def _decode_one(buf):
         self = lcmt_vtb_end()
-        self.utime, self.number, self.lost = struct.unpack(">qqq", buf.read(24))
+        self.utime, self.number, self.lost, self.crc = struct.unpack(">qqqi", buf.read(28))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_vtb_end in parents: return 0
-        tmphash = (0x7e304b6380bc4386) & 0xffffffffffffffff
+        tmphash = (0xf0198133a8b336ee) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None
