@@ -2,18 +2,28 @@
 
 import random
 import socket
+from collections.abc import Callable
+
+import pytest
 
 from vtbdrake.control.hub.connection import Connection
 
 MAX_QUEUE = 100_000
 
 
-def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted() -> None:
-    choose = random.Random(1)
+def by_tcp() -> tuple[socket.socket, socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         client = socket.create_connection(server.getsockname())
-        sock, _ = server.accept()
+        return client, server.accept()[0]
+
+
+@pytest.mark.parametrize("connected", [by_tcp, socket.socketpair])
+def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted(
+    connected: Callable[[], tuple[socket.socket, socket.socket]],
+) -> None:
+    choose = random.Random(1)
+    client, sock = connected()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     hub = Connection(sock, max_message=MAX_QUEUE, max_queue=MAX_QUEUE, now=0.0)
     sent, received, dropped = [], b"", 0

@@ -85,13 +85,14 @@ class Connection:
         """
         begun = 0
         if not self._queue:
-            begun = self._send(messages[0] if len(messages) == 1 else b"".join(messages))
+            data = messages[0] if len(messages) == 1 else b"".join(messages)
+            begun = self._send(data)
+            if begun == len(data):
+                return 0
             done = 0
-            while done < len(messages) and begun >= len(messages[done]):
+            while begun >= len(messages[done]):
                 begun -= len(messages[done])
                 done += 1
-            if done == len(messages):
-                return 0
             messages = messages[done:]
             self.progressed = now
             self._offset = begun
