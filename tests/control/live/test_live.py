@@ -86,6 +86,20 @@ def test_what_cannot_be_set_is_refused_with_the_reason(shared: Rig, values: dict
     assert not any(change.kind == "write" for cycle in shared.cycles for change in cycle.changes)
 
 
+def test_what_fails_an_assertion_inside_drake_is_refused_with_the_reason(
+    hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(values: dict[str, Any]) -> None:
+        raise SystemExit("Failure at diagram.cc:1: condition 'it holds' failed.")
+
+    with served(hub.url) as (rig, _):
+        monkeypatch.setattr(rig.runtime, "write", write)
+        with pytest.raises(LiveError, match="condition 'it holds' failed"):
+            rig.during(asked, hub.url, "set", {"dps.gain": 3.0})
+        monkeypatch.undo()
+        rig.during(asked, hub.url, "set", {"dps.gain": 3.0})
+
+
 def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
     bus, answers = lcm.LCM(hub.url), []
     bus.subscribe("VTB_SET_ANSWER", lambda _, data: answers.append(json.loads(data)))

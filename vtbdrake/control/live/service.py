@@ -119,7 +119,8 @@ class LiveService:
     def _set(self, values: dict[str, Any]) -> dict[str, Any]:
         try:
             self._runtime.write(values)
-        except Exception as error:  # Whatever it is, it is the business of who asked, not the loop's.
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # Whatever it is, it is the business of who asked, not the loop's.
             return {"error": str(error)}
         return {"ok": True}
 
