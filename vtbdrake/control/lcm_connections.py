@@ -46,10 +46,12 @@ class Connection(ABC):
         name: under which a hub knows it; None where there is no hub.
         arrived: when the message that is handed on had arrived at this computer, by `time.monotonic`; if it was to be
             stamped and can be, else None.
+        pending: whether the rest of what was published waits for room; `take` sends it.
     """
 
     name: str | None = None
     arrived: float | None = None
+    pending: bool = False
 
     @abstractmethod
     def fileno(self) -> int:
@@ -163,9 +165,9 @@ class TcpqConnection(Connection):
         return self._socket.fileno()
 
     def take(self, limit: int) -> int:
-        if self._unsent:
+        if self.pending:
             with contextlib.suppress(BlockingIOError):
-                self._send_rest()
+                self._send(self._unsent)
         count = self._dispatch(limit) if self._records else 0
         chunk_size = _RECEIVE
         while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
@@ -204,15 +206,15 @@ class TcpqConnection(Connection):
         return count
 
     def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
-        if self._unsent:
-            self._send_rest()
-            if self._unsent:
+        if self.pending:
+            self._send(self._unsent)
+            if self.pending:
                 raise BlockingIOError("an earlier message is still on its way")
-        records = b"".join([publication(channel.encode(), data) for channel, data in messages])
-        self._unsent = records[self._socket.send(records) :]
+        self._send(b"".join([publication(channel.encode(), data) for channel, data in messages]))
 
-    def _send_rest(self) -> None:
-        self._unsent = self._unsent[self._socket.send(self._unsent) :]
+    def _send(self, records: bytes) -> None:
+        self._unsent = records[self._socket.send(records) :]
+        self.pending = bool(self._unsent)
 
     def close(self) -> None:
         self._socket.close()

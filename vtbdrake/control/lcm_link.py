@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import threading
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -140,9 +141,11 @@ class LcmLink:
             return 0
         try:
             count = connection.take(limit)
-            if not count and timeout > 0:
-                select.select((connection,), (), (), timeout)
+            end = time.monotonic() + timeout
+            while not count and timeout > 0:
+                select.select((connection,), (connection,) if connection.pending else (), (), timeout)
                 count = connection.take(limit)
+                timeout = end - time.monotonic()
             return count
         except OSError:
             self._lose()

@@ -57,7 +57,8 @@ class Own:
     def wait(self, condition: Callable[[], bool]) -> None:
         """Takes in messages (and sends the rest of what it has published) until the condition holds."""
         while not condition():
-            assert select.select([self.connection], [], [], TIMEOUT)[0], "waited in vain"
+            sending = [self.connection] if self.connection.pending else []
+            assert any(select.select([self.connection], sending, [], TIMEOUT)), "waited in vain"
             self.connection.take(100)
 
     def sync(self) -> None:
@@ -235,6 +236,18 @@ def test_what_the_socket_does_not_take_at_once_leaves_while_messages_are_taken(h
         own.publish("A", b"next")
         client.wait(lambda: len(client.received) == 2)
     assert client.received == [("A", data), ("A", b"next")]
+
+
+def test_a_link_that_waits_for_messages_sends_the_rest_of_its_own(hub) -> None:
+    received: list[tuple[str, bytes]] = []
+    data = random.Random(1).randbytes(MEBIBYTE)
+    link = LcmLink(hub.url, {"A": lambda *message: received.append(message)}, connect_timeout=TIMEOUT)
+    with closing(link):
+        link.open()
+        with socket.socket(fileno=os.dup(link.sources[0].fileno())) as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+        assert link.publish(("A", data))
+        assert (link.take(TIMEOUT, 1), received) == (1, [("A", data)])
 
 
 def test_one_that_never_reads_holds_up_nobody_and_is_cut_off() -> None:
