@@ -72,6 +72,15 @@ def test_update_is_the_recursion_and_matrices_travel_row_after_row():
     np.testing.assert_array_equal(_eval(system, context, "matrix"), A0.ravel())
 
 
+def test_states_that_follow_from_each_other_change_at_once():
+    a, b = casadi.SX.sym("a", 2), casadi.SX.sym("b", 2)
+    exchange = casadi.Function("exchange", [a, b], [b, a], ["a", "b"], ["a_next", "b_next"])
+    system = CasadiSystem(update=exchange, state={"a": [1.0, 2.0], "b": [3.0, 4.0]}, period=0.1)
+    context = system.CreateDefaultContext()
+    Simulator(system, context).AdvanceTo(0.25)
+    assert [context.get_discrete_state(i).value().tolist() for i in (0, 1)] == [[3.0, 4.0], [1.0, 2.0]]
+
+
 def test_without_an_output_the_states_are_the_ports():
     update = casadi.Function("hold", [U], [U], ["u"], ["torque_next"])
     system = CasadiSystem(update=update, state={"torque": [0.0, 5.0]}, period=0.1)

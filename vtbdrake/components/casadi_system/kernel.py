@@ -46,10 +46,10 @@ class Kernel:
 
     def value(self, blocks: Sequence[ArrayLike]) -> NDArray[np.float64]:
         """y where z is the blocks one after the other. The thread's next call overwrites it."""
-        buffers = self._value
-        np.concatenate(blocks, out=buffers.z)
-        buffers.evaluate()
-        return buffers.y
+        z, evaluate, y = self._value.parts
+        np.concatenate(blocks, out=z)
+        evaluate()
+        return y
 
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
         """y of AutoDiffXd, by the chain rule dy = (dy/dz) dz, where dy/dz is CasADi's."""
@@ -65,10 +65,10 @@ class Kernel:
             if self._jacobian is None:
                 parts = [casadi.jacobian(self._y, argument) for argument in self._arguments]
                 self._jacobian = self._buffers(f"{self._name}_jacobian", casadi.densify(casadi.horzcat(*parts)))
-        buffers = self._jacobian
-        buffers.z[:] = z
-        buffers.evaluate()
-        return buffers.y.reshape(z.size, -1).T
+        arguments, evaluate, y = self._jacobian.parts
+        arguments[:] = z
+        evaluate()
+        return y.reshape(z.size, -1).T
 
     def _buffers(self, name: str, expression: Expression) -> _Buffers:
         function = casadi.Function(name, self._arguments, [expression])
@@ -78,22 +78,27 @@ class Kernel:
 
 
 class _Buffers(threading.local):
-    """The arrays on which one thread evaluates a function: ``z`` holds its arguments, ``y`` its result."""
+    """The arrays on which one thread evaluates a function.
+
+    Attributes:
+        parts: z, which holds the arguments; what evaluates; y, which holds the result. To look them up costs.
+    """
 
     def __init__(self, function: casadi.Function, may_fail: bool) -> None:
         # What evaluates keeps the buffer alive as little as the buffer keeps the arrays.
         buffer: Any  # whose stubs ask for a size that it does not take
         buffer, evaluate = function.buffer()
         self._buffer = buffer
-        self.z = np.zeros(function.nnz_in())
-        self.y = np.zeros(function.nnz_out())
+        z, y = np.zeros(function.nnz_in()), np.zeros(function.nnz_out())
         start = 0
         for i in range(function.n_in()):
             end = start + function.nnz_in(i)
-            buffer.set_arg(i, self.z[start:end].data)
+            buffer.set_arg(i, z[start:end].data)
             start = end
-        buffer.set_res(0, self.y.data)
-        self.evaluate = partial(_checked, buffer, evaluate, function.name(), self.z) if may_fail else evaluate
+        buffer.set_res(0, y.data)
+        if may_fail:
+            evaluate = partial(_checked, buffer, evaluate, function.name(), z)
+        self.parts = z, evaluate, y
 
 
 def _checked(buffer: casadi.FunctionBuffer, evaluate: Callable[[], None], name: str, z: NDArray[np.float64]) -> None:

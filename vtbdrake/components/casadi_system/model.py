@@ -30,7 +30,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Result:
-    """Something to be computed from ``blocks``, of ``size`` entries. ``shows`` names the state that it is, if any."""
+    """Something to be computed from ``blocks``, of ``size`` entries. ``shows`` names the state that it is, if any.
+
+    Blocks of state come first, in order.
+    """
 
     size: int
     blocks: tuple[Block, ...]
@@ -48,7 +51,7 @@ class Model:
         inputs: the names of the arguments that are input ports.
         state, parameters: default values, by name; flat, row after row.
         outputs: by name.
-        update: all next states, one after the other, or None.
+        update: all next states, one after the other, from all states; or None.
     """
 
     def __init__(
@@ -89,16 +92,16 @@ class Model:
         given = {*state, *parameters, time}
         self.inputs = tuple(name for name in arguments if name not in given)
         self._blocks = (
+            *(Block(STATE, (name,)) for name in state),
             *([Block(TIME, clock)] if clock else []),
             *([Block(PARAMETER, tuple(parameters))] if parameters else []),
-            *(Block(STATE, (name,)) for name in state),
             *(Block(INPUT, (name,)) for name in self.inputs),
         )
         self.update = None
         if update is not None:
             symbols, values = self._evaluated(update)
             following = casadi.vertcat(*(values[f"{name}{NEXT}"] for name in state))
-            self.update = self._result(update.name(), symbols, following, compile)
+            self.update = self._result(update.name(), symbols, following, compile, always=tuple(state))
         if output is not None:
             prefix = output.name()
             symbols, values = self._evaluated(output)
@@ -144,10 +147,18 @@ class Model:
         names = function.name_out()
         return symbols, {n: casadi.vec(casadi.densify(v).T) for n, v in zip(names, values, strict=True)}
 
-    def _result(self, name: str, symbols: Mapping[str, Expression], y: Expression, compile: bool | None) -> Result:
+    def _result(
+        self,
+        name: str,
+        symbols: Mapping[str, Expression],
+        y: Expression,
+        compile: bool | None,
+        always: tuple[str, ...] = (),
+    ) -> Result:
+        """``y``, computed from the arguments that occur in it, and from those which it is ``always`` computed from."""
         # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
         occurring = {symbol.name() for symbol in casadi.symvar(y)}
-        used = {n for n, s in symbols.items() if occurring & {entry.name() for entry in casadi.symvar(s)}}
+        used = {*always, *(n for n, s in symbols.items() if occurring & {entry.name() for entry in casadi.symvar(s)})}
         blocks = tuple(block for block in self._blocks if used.intersection(block.names))
         arguments = [symbols[n] for block in blocks for n in block.names]
         shows = None

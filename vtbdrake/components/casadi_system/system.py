@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -15,13 +15,14 @@ from pydrake.systems.framework import (
     Context,
     DependencyTicket,
     DiscreteStateIndex,
+    DiscreteValues_,
     LeafSystem_,
     NumericParameterIndex,
     SystemScalarConverter,
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, Block, Model, Result
+from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
 
 
 @TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]
@@ -126,44 +127,54 @@ def CasadiSystem_(T: type) -> type:
                 self.DeclarePeriodicDiscreteUpdateEvent(model.period, 0.0, self._update(model.update))
 
         def _calc(self, result: Result) -> Callable[[Context, Any], None]:
-            evaluate, readers = self._evaluator(result), self._readers(result)
-
-            def calc(context: Context, output: Any) -> None:
-                output.set_value(evaluate([read(context) for read in readers]))
-
-            return calc
+            return Impl._handler(self, result, deliver=BasicVector_[T].set_value, updates=False)
 
         def _update(self, result: Result) -> Callable[[Context, Any], None]:
-            evaluate, readers = self._evaluator(result), self._readers(result)
             ends = np.cumsum([value.size for value in self._model.state.values()]).tolist()
             groups = [(i, slice(start, end)) for i, (start, end) in enumerate(pairwise([0, *ends]))]
 
-            def update(context: Context, state: Any) -> None:
-                following = evaluate([read(context) for read in readers])
+            def deliver(state: Any, following: NDArray[Any]) -> None:
                 for i, entries in groups:
                     state.set_value(i, following[entries])
 
-            return update
+            only_one = len(groups) == 1
+            return Impl._handler(
+                self, result, deliver=DiscreteValues_[T].set_value if only_one else deliver, updates=True
+            )
 
-        def _evaluator(self, result: Result) -> Callable[[Sequence[ArrayLike]], NDArray[Any]]:
-            return result.kernel.value if T is float else result.kernel.autodiff
+        def _handler(
+            self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None], updates: bool
+        ) -> Callable[[Context, Any], None]:
+            """What Drake calls with a context and a vector, or the discrete state if it ``updates`` that.
 
-        def _readers(self, result: Result) -> list[Callable[[Context], ArrayLike]]:
-            # All values are read before the kernel's arrays are touched: reading an input may evaluate this system too.
-            return [self._reader(block) for block in result.blocks] or [lambda context: ()]
-
-        def _reader(self, block: Block) -> Callable[[Context], ArrayLike]:
-            name = block.names[0]
+            To ``deliver`` is to write there. It runs in every step of a simulation, where each call of a function in
+            Python counts: so there are as few as possible.
+            """
+            compute = result.kernel.value if T is float else result.kernel.autodiff
+            states = [self._model.state_index(block.names[0]) for block in result.blocks if block.source == STATE]
+            inputs = [self._ports[block.names[0]].Eval for block in result.blocks if block.source == INPUT]
+            sources = {block.source for block in result.blocks}
+            clock, parameters = TIME in sources, PARAMETER in sources
             # A view is cheaper, but there is none of AutoDiffXd.
-            entries = BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector
-            if block.source == INPUT:
-                return self._ports[name].Eval
-            if block.source == STATE:
-                index = self._model.state_index(name)
-                return lambda context: entries(context.get_discrete_state(index))
-            if block.source == PARAMETER:
-                return lambda context: entries(context.get_numeric_parameter(0))
-            return lambda context: (context.get_time(),)
+            values = BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector
+
+            def handle(context: Context, target: Any) -> None:
+                blocks: list[ArrayLike] = []
+                if states:
+                    # What is to be updated comes with the values that it has in the context, and is at hand.
+                    state = target if updates else context.get_discrete_state()
+                    for i in states:
+                        blocks.append(state.value(i))
+                if clock:
+                    blocks.append((context.get_time(),))
+                if parameters:
+                    blocks.append(values(context.get_numeric_parameter(0)))
+                for read in inputs:
+                    blocks.append(read(context))
+                # All has been read before the kernel's arrays are touched: an input may evaluate this system too.
+                deliver(target, compute(blocks or [()]))
+
+            return handle
 
         def _ticket(self, block: Block) -> DependencyTicket:
             name = block.names[0]
