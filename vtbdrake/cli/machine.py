@@ -78,6 +78,15 @@ def _parse_noise(text: str) -> tuple[str, float]:
     help="Seconds without a command after which it brakes.",
 )
 @click.option(
+    "--max-delay",
+    type=float,
+    default=_DEFAULT.max_delay,
+    show_default=True,
+    metavar="S",
+    help="Refuse commands that took so much longer than the quickest one, by their sender's clock; inf: none. Not in "
+    "lock-step.",
+)
+@click.option(
     "--brake",
     type=click.Choice(BRAKES),
     help="Lock the joints (the default where the plant is discrete), give the idle commands (the default elsewhere) or "
@@ -104,6 +113,7 @@ def run_machine(
     sense_delay: float,
     act_delay: float,
     timeout: float,
+    max_delay: float,
     brake: str | None,
     priority: int,
 ) -> None:
@@ -127,6 +137,7 @@ def run_machine(
         sense_delay=1e-3 * sense_delay,
         act_delay=1e-3 * act_delay,
         timeout=timeout,
+        max_delay=max_delay,
         brake=brake or "",
     )
     machine = Machine(scenario, config, epoch=epoch(lock_step=lock_step))

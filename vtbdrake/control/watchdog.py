@@ -37,7 +37,7 @@ class Fault:
         return self.reason
 
 
-class _Delay:
+class Delay:
     """How much longer than the quickest one a message took, by its sender's clock; the clocks' zeros need not agree.
 
     Args:
@@ -90,7 +90,7 @@ class Watchdog:
         self._fault: Fault | None = None
         self._arrived = -inf
         self._value: np.ndarray | None = None
-        self._delay = None if max_delay is None else _Delay(max_delay)
+        self._delay = None if max_delay is None else Delay(max_delay)
         self._range = None if signal.size is None else Range(signal)
         self._tolerates = jump_tolerance is not None
         if jump_tolerance is not None:
@@ -156,7 +156,7 @@ class Watchdog:
         reason = f"sensor signal {self.signal.name} jumps within {1e3 * since:.1f} ms from {before} to {value}"
         return Fault(now, self.signal.name, "jump", reason)
 
-    def _delayed(self, now: float, reception: Reception, delay: _Delay) -> Fault | None:
+    def _delayed(self, now: float, reception: Reception, delay: Delay) -> Fault | None:
         more = delay.of(reception)
         if not more > delay.most:
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -214,6 +215,24 @@ def test_machine_brakes_before_the_first_command_and_after_its_timeout() -> None
     assert not robot.braking
 
 
+@pytest.mark.parametrize("timeout", [0.005, 10.0])
+def test_a_command_that_has_waited_neither_acts_nor_releases_the_brake(timeout: float) -> None:
+    robot, spared = (machine(timeout=timeout, max_delay=0.001) for _ in range(2))
+    robot.refuse_late(True)
+    begin, clock = time.monotonic(), 5_000_000  # us, of the sender: its zero is another one
+    for each in (robot, spared):
+        each.receive(COMMAND, torque(1.0, clock))
+    while robot.cycle < 20 or time.monotonic() < begin + 0.002:
+        assert run(robot, 1) == run(spared, 1)
+    robot.receive(COMMAND, torque(5.0, clock + 1))
+    assert run(robot, 10) == run(spared, 10)
+    assert robot.braking is (timeout < 0.02)
+    assert robot.status().rejected == {"torque": {"late": 1}}
+    robot.receive(COMMAND, torque(5.0, clock + 1_000_000))
+    assert run(robot, 10) != run(spared, 10)
+    assert robot.status().rejected == {"torque": {"late": 1}}
+
+
 def test_locked_joints_are_those_with_actuators() -> None:
     robot = machine(timeout=0.01)
     run(robot, 5, command=0.0)
@@ -334,6 +353,7 @@ def test_period_of_an_unknown_channel_is_refused() -> None:
         ({"noise": {"torque": 1.0}}, "vector sensor signals \\(position, velocity\\), not to 'torque'"),
         ({"brake": "soft"}, "brake is one of hold, idle, lock"),
         ({"act_delay": -1.0}, "act_delay of a machine"),
+        ({"max_delay": 0.0}, "max_delay of a machine is positive, or inf where none is late, not 0.0"),
         ({"values": {"sim.sys.Acrobot.elbow.pos": 1.0}}, "did you mean sim.sys.Acrobot.elbow.position"),
         ({"seed": -1}, "a seed is a whole number"),
     ],

@@ -8,11 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from threading import Thread
 
+import lcm
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_status
@@ -34,6 +36,7 @@ from vtbdrake.control.machine import (
     MachineError,
     MachineLoop,
     MachineProcess,
+    MachineStatus,
     NoBrake,
     Reorder,
 )
@@ -246,6 +249,33 @@ def test_machine_brakes_when_commands_stop_and_tells(hub: Hub) -> None:
         later = np.array([state(data) for data in listener.wait(lambda heard: len(heard) >= 20)])
         assert np.ptp(later[:, 1]) == 0.0
         assert np.ptp(later[:, 0]) > 0.0
+
+
+def test_what_waited_in_a_hub_that_stood_still_does_not_release_the_brake() -> None:
+    with Hub(port=0) as hub, MachineProcess(RobotScenario(), hub.url) as process:
+        bus = lcm.LCM(hub.url)
+
+        def command() -> None:
+            bus.publish(COMMAND, torque(0.5, round(1e6 * time.time())))
+
+        def heard(status: MachineStatus) -> bool:
+            command()
+            return not status.braking
+
+        process.until(heard)
+        os.kill(hub.pid, signal.SIGSTOP)
+        try:
+            for _ in range(50):
+                command()
+            process.until(lambda status: status.braking)
+            # Those that wait are older than 0.1 s by then, and so much older than the quickest.
+            later = process.status().time + 0.2
+            process.until(lambda status: status.time > later)
+        finally:
+            os.kill(hub.pid, signal.SIGCONT)
+        assert process.until(lambda status: "late" in status.rejected["torque"]).braking
+        assert process.status().braking
+        process.until(heard)
 
 
 def test_machine_that_does_not_brake(hub: Hub) -> None:

@@ -27,6 +27,7 @@ class MachineConfig:
     sense_delay: float = 0.0  # s that messages to the controller take, in whole cycles, rounded up
     act_delay: float = 0.0  # s that messages from the controller take
     timeout: float = 0.1  # s without a command after which the machine brakes
+    max_delay: float = 0.1  # s that a command may take longer than the quickest, by its sender's clock
     brake: str = ""  # hold, idle or lock (see `Brake`); empty: lock if the plant is discrete, else idle
     control_channel: str = "VTB_MACHINE"  # where it listens to requests
     status_channel: str = "VTB_MACHINE_STATUS"  # where it says how it is
@@ -36,6 +37,8 @@ class MachineConfig:
         for name in ("period", "timeout", "status_period"):
             if not 0.0 < getattr(self, name) < inf:
                 raise ValueError(f"{name} of a machine is a positive time in seconds, not {getattr(self, name)!r}")
+        if not self.max_delay > 0.0:
+            raise ValueError(f"max_delay of a machine is positive, or inf where none is late, not {self.max_delay!r}")
         for name in ("sense_delay", "act_delay"):
             if not 0.0 <= getattr(self, name) < inf:
                 raise ValueError(f"{name} of a machine is a time of at least 0 s, not {getattr(self, name)!r}")

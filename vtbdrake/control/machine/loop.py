@@ -116,6 +116,7 @@ class MachineLoop:
             RuntimeError: the simulation failed.
         """
         end = self.machine.cycle + cycles
+        self.machine.refuse_late(not lock_step)
         self._messages = self.machine.messages()
         begin = self._clock.now() - self.machine.time
         self._tell()

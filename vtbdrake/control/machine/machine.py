@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.control import watchdog
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.lcm_routes import Inlet
 from vtbdrake.control.machine.brake import Brake
@@ -34,7 +35,8 @@ class MachineStatus:
         braking: whether it braked in its last cycle.
         silent: command channels on which, by then, none had been accepted for longer than its timeout.
         accepted: by actuator signal, how many commands it took.
-        rejected: by actuator signal, how many it did not, by the reason; see `Reception`.
+        rejected: by actuator signal, how many it did not, by the reason; see `Reception`, and `Machine.refuse_late` for
+            those that are ``late``.
         faults: those that have begun, as `Fault.to_dict` gives them.
     """
 
@@ -56,7 +58,8 @@ class Machine:
 
     Cycle k takes it from k periods to k + 1, under the newest of the commands that were received before. If the answer
     to the state of k periods is among them, a controller commands it as a testbed's DPS commands the simulated world.
-    Nothing in it depends on a clock: equal commands in equal cycles, and equal requests, give equal messages.
+    Nothing in it depends on a clock: equal commands in equal cycles, and equal requests, give equal messages. Only
+    where it is told to `refuse_late`, commands have to come in time.
 
     Args:
         scenario: whose world it is, and whose method ``protocol`` says what it speaks (see `Protocol`).
@@ -105,6 +108,8 @@ class Machine:
         self._types = {map.channel: map.type for map in self.protocol.act}
         self._accepted: dict[str, float] = dict.fromkeys(self._receptions, -inf)
         self._counts = dict.fromkeys(self._receptions, 0)
+        self._commands: dict[str, Any] = dict.fromkeys(self._receptions)
+        self._delays: dict[str, watchdog.Delay] = {}
         self._patience = whole_cycles(config.timeout, config.period)
         self._silent: list[str] = []
 
@@ -136,6 +141,15 @@ class Machine:
         self.world.write(self._context, values)
         self.perturbed.update(values)
 
+    def refuse_late(self, refuse: bool) -> None:
+        """Whether commands are refused that took longer than the quickest one by more than the config's ``max_delay``.
+
+        They have waited somewhere: in a hub that stood still, say. Only for senders whose clock runs as this computer's
+        does, so not in lock-step; a sender that does not tell the time is not late.
+        """
+        wanted = refuse and self.config.max_delay < inf
+        self._delays = {name: watchdog.Delay(self.config.max_delay) for name in self._receptions} if wanted else {}
+
     # -- cycles
 
     def receive(self, channel: str, data: bytes) -> None:
@@ -153,14 +167,21 @@ class Machine:
         for name, reception in self._receptions.items():
             if reception.count > self._counts[name]:
                 self._counts[name] = reception.count
-                self._accepted[name] = self.cycle
+                self._accept(name, reception)
         coasting = NoBrake.name in self._lines[SENSE].faults
         self._silent = self._find_silent()
         self._brake.set(self._context, bool(self._silent) and not coasting)
-        for name, reception in self._receptions.items():
-            self._give(name, self._command(name, reception.value, coasting))
+        for name in self._receptions:
+            self._give(name, self._command(name, self._commands[name], coasting))
         self._simulator.AdvanceTo((self.cycle + 1) * self.config.period)
         self.cycle += 1
+
+    def _accept(self, name: str, reception: Reception) -> None:
+        delay = self._delays.get(name)
+        if delay is not None and delay.of(reception) > delay.most:
+            reception.reject("late")
+        else:
+            self._accepted[name], self._commands[name] = self.cycle, reception.value
 
     def _find_silent(self) -> list[str]:
         since = self.cycle - self._patience
