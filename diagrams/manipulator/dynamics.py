@@ -39,6 +39,10 @@ class ArmDynamics:
             com = M.get_com()
             I_cm = M.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
             self._bodies.append((M.get_mass(), _sparse(com), _sparse(I_cm)))
+        # Of joint k, in the frames of its link and of the one before.
+        self._axes = [_sparse(np.array(axis, dtype=float)) for axis in self.arm.axes]
+        # Of the origin of link k, in the frame of the one before.
+        self._offsets = [_sparse(np.array([0.0, 0.0, offset])) for offset in self.arm.offsets]
 
     def tip(self, q: Expression) -> TipMotion:
         """Of the tool's tip T, for q (7)."""
@@ -46,7 +50,7 @@ class ArmDynamics:
         axes, origins = [], []
         for k in range(JOINTS):
             p = p + self.arm.offsets[k] * R[:, 2]
-            axes.append(R @ self._axis(k))
+            axes.append(R @ self._axes[k])
             origins.append(p)
             R = R @ self._rotation(k, q[k])
         p = p + self.arm.tip_offset * R[:, 2]
@@ -59,7 +63,7 @@ class ArmDynamics:
         omega, alpha, acceleration = (casadi.SX.zeros(3) for _ in range(3))
         for k in range(JOINTS):
             acceleration += _turned(omega, alpha, self.arm.offsets[k] * R[:, 2])
-            turn = v[k] * (R @ self._axis(k))
+            turn = v[k] * (R @ self._axes[k])
             alpha += casadi.cross(omega, turn)
             omega += turn
             R = R @ self._rotation(k, q[k])
@@ -82,7 +86,7 @@ class ArmDynamics:
         rotations, forces, moments = [], [], []
         for k, (mass, com, inertia) in enumerate(self._bodies):
             R = self._rotation(k, q[k])
-            offset, axis = self._offset(k), self._axis(k)
+            offset, axis = self._offsets[k], self._axes[k]
             acceleration = R.T @ (acceleration + _turned(omega, alpha, offset))
             carried = R.T @ omega
             alpha = R.T @ alpha + casadi.cross(carried, axis) * v[k] + axis * a[k]
@@ -97,12 +101,12 @@ class ArmDynamics:
             own = forces[k]
             moment = moments[k] + casadi.cross(com, own) + moment
             force = own + force
-            tau[k] = casadi.dot(self._axis(k), moment)
+            tau[k] = casadi.dot(self._axes[k], moment)
             if rotors:
                 tau[k] += self.arm.reflected_inertias[k] * a[k]
             # In the frame of the link before, about its origin.
             force = rotations[k] @ force
-            moment = rotations[k] @ moment + casadi.cross(self._offset(k), force)
+            moment = rotations[k] @ moment + casadi.cross(self._offsets[k], force)
         return casadi.densify(casadi.vertcat(*tau))
 
     def momentum(self, q: Expression, v: Expression) -> tuple[Expression, Expression]:
@@ -119,10 +123,10 @@ class ArmDynamics:
         given, own = [], []
         for k, (mass, com, inertia) in enumerate(self._bodies):
             R = self._rotation(k, q[k])
-            velocity = R.T @ (velocity + casadi.cross(omega, self._offset(k)))
+            velocity = R.T @ (velocity + casadi.cross(omega, self._offsets[k]))
             carried, g = R.T @ omega, R.T @ g
             given.append((R, carried, velocity, g))
-            omega = carried + self._axis(k) * v[k]
+            omega = carried + self._axes[k] * v[k]
             linear = mass * (velocity + casadi.cross(omega, com))
             own.append((inertia @ omega + casadi.cross(com, linear), linear, mass * com))
         p, gradient = [casadi.SX(0)] * JOINTS, [casadi.SX(0)] * JOINTS
@@ -132,19 +136,11 @@ class ArmDynamics:
             angular, linear, first = angular + own[k][0], linear + own[k][1], first + own[k][2]
             R, carried, velocity, g = given[k]
             turning = casadi.cross(first, g) - casadi.cross(carried, angular) - casadi.cross(velocity, linear)
-            p[k], gradient[k] = casadi.dot(self._axis(k), angular), casadi.dot(self._axis(k), turning)
+            p[k], gradient[k] = casadi.dot(self._axes[k], angular), casadi.dot(self._axes[k], turning)
             # In the frame of the link before, about its origin.
-            linear, first = R @ linear, R @ first + mass * self._offset(k)
-            angular = R @ angular + casadi.cross(self._offset(k), linear)
+            linear, first = R @ linear, R @ first + mass * self._offsets[k]
+            angular = R @ angular + casadi.cross(self._offsets[k], linear)
         return casadi.densify(casadi.vertcat(*p)), casadi.densify(casadi.vertcat(*gradient))
-
-    def _offset(self, k: int) -> Expression:
-        """Of the origin of link k, in the frame of the one before."""
-        return _sparse(np.array([0.0, 0.0, self.arm.offsets[k]]))
-
-    def _axis(self, k: int) -> Expression:
-        """Of joint k, in the frames of its link and of the one before."""
-        return _sparse(np.array(self.arm.axes[k], dtype=float))
 
     def _rotation(self, k: int, angle: Expression) -> Expression:
         """Of link k in the one before."""

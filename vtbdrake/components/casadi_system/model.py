@@ -157,8 +157,9 @@ class Model:
     ) -> Result:
         """``y``, computed from the arguments that occur in it, and from those which it is ``always`` computed from."""
         # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
-        occurring = {symbol.name() for symbol in casadi.symvar(y)}
-        used = {*always, *(n for n, s in symbols.items() if occurring & {entry.name() for entry in casadi.symvar(s)})}
+        names = {f"a{k}": name for k, name in enumerate(symbols)}
+        # Of a vector a1, the entries are a1_0, a1_1, ...
+        used = {*always, *(names[symbol.name().partition("_")[0]] for symbol in casadi.symvar(y))}
         blocks = tuple(block for block in self._blocks if used.intersection(block.names))
         arguments = [symbols[n] for block in blocks for n in block.names]
         shows = None
