@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE
 from vtbdrake.cli import main
 
+SERVO, BUS = "tests.control.servo_machine:ServoMachineScenario", ["--url", "tcpq://127.0.0.1:1"]
 VARY = ["--vary", f"{ANGLE}=0:1:2", "--horizon", "1"]
 SWEEP = ["sweep", PENDULUM, *VARY, "--quality", RATE]
 ROLLOUT = ["rollout", ACROBOT, "--horizon", "0.1"]
@@ -33,6 +34,7 @@ def error_of(arguments: list[str], code: int = 2) -> str:
         (["variables", "nowhere.at_all:Scenario"], "cannot import nowhere.at_all"),
         (["variables", "tests.testbeds:Pendulum"], "it has: PendulumScenario"),
         (["variables", "tests.testbeds"], "package.module:Class"),
+        (["variables", "tests.testbeds:Scenario"], "no whole scenario: it lacks add_world, interface, make_dps"),
         (["variables", "none.yaml"], "no scenario file none.yaml"),
         (["variables", PENDULUM, "--match", "thetta"], "no address contains 'thetta'"),
         (["variable", PENDULUM], "No such command 'variable'"),
@@ -77,6 +79,16 @@ def error_of(arguments: list[str], code: int = 2) -> str:
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1:1"], "at least two points"),
         ([*BOUNDARY, "--resolution", "0.5", "--coarse", "0.1"], "0 < resolution <= coarse"),
         ([*BOUNDARY, "--resolution", "0.5"], "Missing option '--coarse'"),
+        (["get", "a", "--url", "nonsense"], "the form tcpq://127.0.0.1:7700, unlike 'nonsense'"),
+        (["watch", "a", "--url", ""], "the form tcpq://127.0.0.1:7700, unlike ''"),
+        (
+            ["machine", SERVO, "--url", "tcpq://127.0.0.1:99999"],
+            "'tcpq://127.0.0.1:99999' has no port that there can be",
+        ),
+        (["machine", SERVO, *BUS, "--noise", "position"], "it takes SIGNAL=STD, a number, not 'position'"),
+        (["get", "a", *BUS, "--timeout", "nan"], "'--timeout': it is a positive time in seconds, unlike nan"),
+        (["run", SERVO, *BUS, "--seconds", "-1"], "'--seconds': it is a positive time in seconds, unlike -1"),
+        (["run", SERVO, *BUS, "--wait", "0"], "'--wait': it is a positive time in seconds, unlike 0"),
         (["diagram", PENDULUM, "--mode", "dream"], "'sim', 'shadow', 'real', 'twin'"),
         (["diagram", PENDULUM, "--format", "png"], "'mermaid', 'svg'"),
     ],
@@ -89,8 +101,8 @@ def test_bad_input(arguments: list[str], expected: str, tmp_path: Path, monkeypa
 
 def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
     (log := tmp_path / "run.lcm").write_text("dear")
-    servo = ["run", "tests.control.servo_machine:ServoMachineScenario", "--url", "tcpq://127.0.0.1:1"]
-    assert f"{log} exists, and is not overwritten: give another name" in error_of([*servo, "--record", str(log)])
+    error = error_of(["run", SERVO, *BUS, "--record", str(log)])
+    assert f"{log} exists, and is not overwritten: give another name" in error
     assert log.read_text() == "dear"
 
 
@@ -98,6 +110,12 @@ def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:
     path = tmp_path / "typo.yaml"
     path.write_text(f"{PENDULUM}:\n  stiffnes: 3.0\n")
     assert "stiffnes" in error_of(["variables", str(path)])
+
+
+def test_scenario_file_that_names_no_class_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "odd.yaml"
+    path.write_text("a: 1\n")
+    assert error_of(["variables", str(path)]).startswith(f"Error: {path}: a scenario is named package.module:Class")
 
 
 def test_snapshot_of_another_scenario(tmp_path: Path) -> None:

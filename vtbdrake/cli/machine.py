@@ -28,7 +28,10 @@ _DEFAULT = MachineConfig()
 
 
 def _parse_noise(text: str) -> tuple[str, float]:
-    name, value = parse_setting(text)
+    try:
+        name, value = parse_setting(text)
+    except click.BadParameter as error:
+        raise click.BadParameter(f"it takes SIGNAL=STD, a number, not {text!r}") from error
     if isinstance(value, list):
         raise click.BadParameter(f"the noise of {name} is one standard deviation for all its entries, not {value}")
     return name, value

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 Setting = tuple[str, float | list[Any]]
 
 
-def converted(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
+def converted(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
     """A callback that makes of the text of an option, or of each of its texts, what the command takes."""
 
     def convert(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
@@ -58,6 +59,25 @@ def parse_field(text: str) -> tuple[str, Any]:
 def parse_condition(text: str) -> dict[str, Any]:
     """Settings that hold together: ``ADDRESS=VALUE[;ADDRESS=VALUE...]``."""
     return settings(parse_setting(part) for part in text.split(";"))
+
+
+def parse_url(text: str) -> str:
+    """The URL of an LCM bus."""
+    provider, separator, _ = text.partition("://")
+    if not (provider and separator):
+        raise click.BadParameter(f"the URL of a bus has the form tcpq://127.0.0.1:7700, unlike {text!r}")
+    try:
+        _ = urlsplit(text).port
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} has no port that there can be: {error}") from error
+    return text
+
+
+def positive(value: float) -> float:
+    """A time in seconds."""
+    if not value > 0.0:
+        raise click.BadParameter(f"it is a positive time in seconds, unlike {value:g}")
+    return value
 
 
 def parse_range(text: str) -> Parameter:
@@ -127,11 +147,16 @@ field_option = click.option(
     help="Set a field of the scenario: a number, true, false or a text. May be repeated.",
 )
 url_option = click.option(
-    "--url", required=True, metavar="URL", help="The LCM bus: tcpq://127.0.0.1:7700, of a hub, say."
+    "--url",
+    callback=converted(parse_url),
+    required=True,
+    metavar="URL",
+    help="The LCM bus: tcpq://127.0.0.1:7700, of a hub, say.",
 )
 timeout_option = click.option(
     "--timeout",
     type=float,
+    callback=converted(positive),
     default=5.0,
     show_default=True,
     metavar="S",

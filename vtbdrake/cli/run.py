@@ -19,6 +19,7 @@ from vtbdrake.cli.options import (
     converted,
     field_option,
     output,
+    positive,
     scenario_argument,
     set_option,
     settings,
@@ -57,9 +58,17 @@ MOST_FAULTS = 20
 @field_option
 @click.option("--period", type=float, metavar="S", help="Of a cycle, in seconds, instead of the scenario's.")
 @click.option("--pace", metavar="SIGNAL", help="Begin a cycle with each message of this sensor, not by the clock.")
-@click.option("--seconds", type=float, metavar="S", help="End after so long; endless by default.")
 @click.option(
-    "--wait", type=float, default=60.0, show_default=True, metavar="S", help="Give up if the machine is not ready then."
+    "--seconds", type=float, callback=converted(positive), metavar="S", help="End after so long; endless by default."
+)
+@click.option(
+    "--wait",
+    type=float,
+    callback=converted(positive),
+    default=60.0,
+    show_default=True,
+    metavar="S",
+    help="Give up if the machine is not ready then.",
 )
 @click.option(
     "--take-over",

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
+from inspect import isabstract
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args, get_type_hints
 
@@ -170,9 +171,11 @@ def _scenario_class(name: str) -> type[Scenario]:
             f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
         ) from error
     found = getattr(module, class_name, None)
+    if isinstance(found, type) and issubclass(found, Scenario) and isabstract(found):
+        raise ScenarioError(f"{name} is no whole scenario: it lacks {', '.join(sorted(found.__abstractmethods__))}")
     if not (isinstance(found, type) and issubclass(found, Scenario)):
         known = [
-            k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and v is not Scenario
+            k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and not isabstract(v)
         ]
         raise ScenarioError(f"{module_name} has no scenario {class_name!r}; it has: {', '.join(known) or 'none'}")
     return found
@@ -195,7 +198,7 @@ def _load_yaml(path: Path) -> Scenario:
         return yaml_load_typed(schema=schema, filename=path, child_name=name)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         if isinstance(error, ScenarioError):
-            raise
+            raise ScenarioError(f"{path}: {error}") from error
         raise ScenarioError(f"{path} does not fit {name}: {error}") from error
 
 
