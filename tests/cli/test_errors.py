@@ -6,6 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE
+from tests.folders import open_folder, that_cannot_be_written
 from vtbdrake.cli import main
 
 SERVO, BUS = "tests.control.servo_machine:ServoMachineScenario", ["--url", "tcpq://127.0.0.1:1"]
@@ -104,6 +105,12 @@ def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
     error = error_of(["run", SERVO, *BUS, "--record", str(log)])
     assert f"{log} exists, and is not overwritten: give another name" in error
     assert log.read_text() == "dear"
+
+
+def test_where_nothing_can_be_written_is_told_before_anything_is_done() -> None:
+    with open_folder() as folder, that_cannot_be_written(folder):
+        error = error_of([*SWEEP, "--csv", f"{folder}/a.csv"])
+    assert "'--csv'" in error and f"{folder}/a.csv lies in a folder that you cannot write to" in error
 
 
 def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:

@@ -1,12 +1,8 @@
 """The file of a study when it cannot be used: what is said, and that nothing is lost."""
 
-import os
-import tempfile
-from contextlib import contextmanager
-from pathlib import Path
-
 import pytest
 
+from tests.folders import open_folder, that_cannot_be_written
 from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study, StudyError
 
@@ -26,34 +22,19 @@ def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
         assert len(again.trials) == finished + 5
 
 
-@contextmanager
-def _that_cannot_be_written(folder):
-    folder.chmod(0o555)
-    privileged = os.geteuid() == 0  # To root, such a folder is like any other.
-    if privileged:
-        os.seteuid(65534)
-    try:
-        yield
-    finally:
-        if privileged:
-            os.seteuid(0)
-        folder.chmod(0o755)
-
-
 def test_a_study_in_a_folder_that_cannot_be_written_can_be_read():
-    # Not pytest's folder, into which only its owner can look.
-    with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / "a study?.db"
+    with open_folder() as folder:
+        path = folder / "a study?.db"
         with pendulum_problem().study(path, solver="sobol") as study:
             best = study.run(rollouts=4, executor="serial", progress=False).best
-        with _that_cannot_be_written(path.parent):
+        with that_cannot_be_written(folder):
             with Study.open(path) as study:
                 assert study.best == best
                 with pytest.raises(StudyError, match="the permissions of the file and its folder"):
                     study.add([0.0, 0.0])
             with pytest.raises(StudyError, match="the permissions of the file and its folder"):
                 pendulum_problem().study(path)
-        assert [file.name for file in path.parent.iterdir()] == [path.name]
+        assert [file.name for file in folder.iterdir()] == [path.name]
 
 
 def test_a_folder_is_no_study(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,7 +109,7 @@ def _numbers(text: str, kinds: Sequence[Callable[[str], Any]], form: str) -> tup
 
 
 def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """A callback that checks a file to be written: its folder exists, and its name ends as one of ``suffixes``.
+    """A callback that checks a file to be written: its folder takes it, and its name ends as one of ``suffixes``.
 
     Args:
         new: it must not exist.
@@ -122,6 +123,8 @@ def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.
             raise click.BadParameter(f"{path} is a folder")
         if not path.parent.is_dir():
             raise click.BadParameter(f"{path} lies in a folder that does not exist")
+        if not os.access(path.parent, os.W_OK, effective_ids=True):
+            raise click.BadParameter(f"{path} lies in a folder that you cannot write to")
         if new and path.exists():
             raise click.BadParameter(f"{path} exists, and is not overwritten: give another name, or remove it")
         return path
