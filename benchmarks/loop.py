@@ -114,20 +114,27 @@ def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
 
 
 def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
-    """The time that a cycle takes (messages in, checks, guards, statistics, messages out) less that of the DPS's step
-    (`Simulator.AdvanceTo` and its output), in the full loop, with the stripped DPS; and, printed only, the time of a
-    step of the full testbed with both switches on real against that of the stripped DPS, in turns."""
+    """The time that a cycle takes (last messages in, checks, guards, statistics, messages out) less that of the DPS's
+    step (`Simulator.AdvanceTo` and its output), in the full loop, with the stripped DPS; and, printed only, the time of
+    a step of the full testbed with both switches on real against that of the stripped DPS, in turns.
+
+    Most messages are taken in shortly before a cycle is due. That, too, is in the processor time of the loop's thread,
+    less that of the steps, which the note tells; so is the time for which it polls the clock.
+    """
     overheads: list[float] = []
+    worked = 0.0
     with loop_rig() as rig:
         alone, full = rig.runtime(DpsAlone(rig.scenario)), rig.runtime(rig.scenario.build())
         for _ in range(rounds):
             rig.run(alone, cycles // rounds)
             overheads += alone.overheads
+            worked += alone.worked
             rig.run(full, cycles // rounds)
         granted = rig.granted()
     steps = {name: runtime.statistics.histograms["step"] for name, runtime in (("alone", alone), ("full", full))}
     p50 = {name: histogram.percentile(50.0) for name, histogram in steps.items()}
     step = f"DPS: {percentiles(steps['alone'])}"
+    besides = worked / len(overheads) - steps["alone"].mean
     return [
         Benchmark(
             name="cycle_overhead",
@@ -136,7 +143,8 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
             goal=60e-6,
             better=LOWER,
             against=f"the DPS's own step: {1e6 * p50['alone']:.0f} us",
-            note=f"beyond the step: {percentiles(histogram(overheads))}; {granted}",
+            note=f"beyond the step: {percentiles(histogram(overheads))}; processor time beyond it, waiting included: "
+            f"{1e6 * besides:.0f} us; {granted}",
         ),
         Benchmark(
             name="strip_step_time",

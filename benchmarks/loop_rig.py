@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -41,12 +42,14 @@ class TimedRuntime(Runtime):
     Attributes:
         overheads: of each cycle, from its call to its return, less the DPS's step, in seconds.
         lateness: from each cycle's deadline to its end, in seconds.
+        worked: processor time of the loop's thread in all those cycles, and while it waited for them, in seconds.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.overheads: list[float] = []
         self.lateness: list[float] = []
+        self.worked = 0.0
 
     def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
         steps = self.statistics.histograms["step"]
@@ -91,8 +94,9 @@ class Rig:
         self.machine.reset_statistics()
         runtime.overheads.clear()
         runtime.lateness.clear()
-        missed = runtime.missed
+        missed, worked = runtime.missed, time.thread_time()
         runtime.run(cycles=cycles)
+        runtime.worked = time.thread_time() - worked
         if runtime.guards.latched:
             raise RuntimeError(f"the loop ended in a safe stop: {runtime.guards.latched[0]}")
         return runtime.missed - missed

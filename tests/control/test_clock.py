@@ -48,6 +48,21 @@ def test_wall_clock_polls_for_the_rest_if_it_is_to_spin() -> None:
     assert polled > 1e-3
 
 
+def test_what_is_to_be_done_meanwhile_is_done_before_the_clock_is_polled() -> None:
+    clock, done = WallClock(spin=0.1), []
+    deadline = clock.now() + 0.2
+    assert clock.wait_until(deadline, lambda: done.append(clock.now())) >= deadline
+    assert len(done) == 1 and deadline - 0.1 <= done[0] < deadline
+
+
+@pytest.mark.parametrize(
+    ("clock", "time_left"),
+    [(WallClock(), 0.01), (WallClock(spin=0.5), 0.1), (WallClock(), -1.0), (SimulatedClock(), 1.0)],
+)
+def test_nothing_is_done_meanwhile_where_there_is_no_time(clock: WallClock | SimulatedClock, time_left: float) -> None:
+    clock.wait_until(clock.now() + time_left, lambda: pytest.fail("it was done"))
+
+
 def test_deadline_that_has_passed_is_not_waited_for() -> None:
     clock = WallClock()
     assert clock.wait_until(clock.now() - 1e6) <= clock.now()

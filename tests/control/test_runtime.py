@@ -7,7 +7,7 @@ import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.testbed import DpsAlone
@@ -62,6 +62,15 @@ def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
     runtime.run(cycles=3000, until=lambda: ticks.append(dps.read(context, "dps.ticks")))
     assert set(np.diff(ticks)) == {1.0}
     assert runtime.time == pytest.approx(start + 3.0, abs=1e-12)
+
+
+def test_what_has_come_by_shortly_before_a_cycle_is_taken_in_before_it():
+    clock, dps = WallClock(spin=0.02), DpsAlone(ServoScenario())
+    runtime = Runtime(dps, ScriptedBridge(dps.interface, clock, still), period=0.05, clock=clock)
+    counts = []
+    runtime.watch(lambda cycle: counts.append(runtime.bridge.sensed["position"].count))
+    runtime.run(cycles=4)
+    assert np.diff(counts).tolist() == [2, 2, 2]
 
 
 @pytest.mark.parametrize("alone", [False, True])

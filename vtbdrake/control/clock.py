@@ -19,8 +19,12 @@ class Clock(ABC):
         """The time; its zero means nothing."""
 
     @abstractmethod
-    def wait_until(self, t: float) -> float:
+    def wait_until(self, t: float, meanwhile: Callable[[], object] | None = None) -> float:
         """Waits until `now` is at least ``t``, not at all if it already is, and returns the time then.
+
+        Args:
+            t: a time of this clock.
+            meanwhile: what is worth doing shortly before, where there is time for it.
 
         Raises:
             ValueError: ``t`` is not finite.
@@ -38,8 +42,8 @@ class WallClock(Clock):
     falling asleep makes nothing late. Other threads run meanwhile, and signal handlers: Ctrl-C ends the wait.
 
     Args:
-        spin: how long before the deadline, in seconds, it wakes up to poll the clock for the rest. It trades a
-            processor (and the GIL) for the time that waking up takes.
+        spin: how long before the deadline, in seconds, it wakes up, to do what there is to do meanwhile, and to poll
+            the clock for the rest. It trades a processor (and the GIL) for the time that waking up takes.
     """
 
     def __init__(self, *, spin: float = 0.0) -> None:
@@ -52,12 +56,15 @@ class WallClock(Clock):
     def now(self) -> float:
         return time.monotonic()
 
-    def wait_until(self, t: float) -> float:
+    def wait_until(self, t: float, meanwhile: Callable[[], object] | None = None) -> float:
         if not isfinite(t):
             raise ValueError(f"one can wait until a finite time, not until {t}")
         if (now := time.monotonic()) >= t:
             return now
-        self._sleep_until(t - self._spin)
+        if now < t - self._spin:
+            self._sleep_until(t - self._spin)
+            if self._spin and meanwhile is not None:
+                meanwhile()
         while (now := time.monotonic()) < t:
             pass
         return now
@@ -76,7 +83,7 @@ _TIMER_ABSTIME = 1  # <time.h>
 
 
 class SimulatedClock(Clock):
-    """A clock that stands still unless it is waited for: the same run gives the same times.
+    """A clock that stands still unless it is waited for: the same run gives the same times. There is no meanwhile.
 
     Args:
         start: the time at first, in seconds.
@@ -92,7 +99,7 @@ class SimulatedClock(Clock):
     def now(self) -> float:
         return self._now
 
-    def wait_until(self, t: float) -> float:
+    def wait_until(self, t: float, meanwhile: Callable[[], object] | None = None) -> float:
         if not isfinite(t):
             raise ValueError(f"one can wait until a finite time, not until {t}")
         late = self._lateness(self._calls)
