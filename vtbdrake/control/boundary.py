@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.testbed import Command, Signal
+from vtbdrake.testbed import Command
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.feed import Feed
 
@@ -24,7 +24,7 @@ class RealPorts:
         diagram, interface = target.diagram, target.interface
         self._context = context
         self.feed = Feed({s.name: (s, diagram.GetInputPort(f"real.sense.{s.name}")) for s in interface.sense}, context)
-        self._outputs = {s.name: (s, diagram.GetOutputPort(f"real.act.{s.name}")) for s in interface.act}
+        self._outputs = {s.name: (s, diagram.GetOutputPort(f"real.act.{s.name}").Eval) for s in interface.act}
         self._active = diagram.GetOutputPort("real.act.active") if interface.act else None
 
     def active(self) -> list[str]:
@@ -36,10 +36,13 @@ class RealPorts:
 
     def commands(self, names: Iterable[str]) -> dict[str, Any]:
         """What the DPS commands to the machine now, by actuator signal."""
-        return {name: self._value(*self._outputs[name]) for name in names}
-
-    def _value(self, signal: Signal, port: Any) -> Any:
-        if signal.is_vector:
-            return np.array(port.Eval(self._context))
-        value = port.Eval(self._context)
-        return value.value if isinstance(value, Command) else value
+        commands: dict[str, Any] = {}
+        for name in names:
+            signal, evaluate = self._outputs[name]
+            value = evaluate(self._context)
+            if signal.is_vector:
+                value = np.array(value)
+            elif isinstance(value, Command):
+                value = value.value
+            commands[name] = value
+        return commands

@@ -116,7 +116,7 @@ class LcmLink:
         return self._connection
 
     def _required(self) -> Connection | None:
-        connection = self._connection or self._current()
+        connection = self._current()
         if connection is None and self._search is None:
             raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
         return connection
@@ -134,7 +134,7 @@ class LcmLink:
 
     def take(self, timeout: float, limit: int) -> int:
         """Hands messages to their handlers, waiting up to ``timeout`` seconds for the first; says how many."""
-        connection = self._required()
+        connection = self._connection or self._required()
         if connection is None:
             if timeout > 0 and self._search is not None:
                 self._search.ended.wait(timeout)
@@ -153,7 +153,7 @@ class LcmLink:
 
     def publish(self, *messages: tuple[str, bytes]) -> bool:
         """Whether the messages (channel and bytes) went to the bus."""
-        connection = self._required()
+        connection = self._connection or self._required()
         if connection is None:
             return False
         try:

@@ -56,14 +56,13 @@ class Range:
             return "type"
         if entries.shape != (self._size,):
             return "size"
-        if self._has(entries):
+        if entries.size > _SMALL:
+            inside = bool(((entries >= self._lower) & (entries <= self._upper)).all())
+        else:
+            inside = within(self.lower, entries.tolist(), self.upper)
+        if inside:
             return ""
         return "limits" if np.isfinite(entries).all() else "not finite"
-
-    def _has(self, entries: np.ndarray) -> bool:
-        if entries.size > _SMALL:
-            return bool(((entries >= self._lower) & (entries <= self._upper)).all())
-        return within(self.lower, entries.tolist(), self.upper)
 
     def _shape(self) -> tuple[Any, ...]:
         return self._size, self._type, self.lower, self.upper

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,18 +21,19 @@ class Feed:
     def __init__(self, ports: Mapping[str, tuple[Signal, InputPort]], context: Context) -> None:
         self._ports = ports
         self._context = context
-        self._fixed: dict[str, tuple[Any, np.ndarray | None]] = {}
+        self._fixed: dict[str, tuple[Callable[[], Any], np.ndarray | None]] = {}
 
     def __call__(self, name: str, value: Any) -> None:
         """Gives the port of a signal a value: for a vector signal an array of its size."""
-        if name not in self._fixed:
+        known = self._fixed.get(name)
+        if known is None:
             signal, port = self._ports[name]
             fixed = port.FixValue(self._context, value if signal.is_vector else _wrapped(signal, value))
             numbers = fixed.GetMutableData().get_mutable_value().get_mutable_value() if signal.is_vector else None
-            self._fixed[name] = (fixed, numbers)
+            self._fixed[name] = (fixed.GetMutableData, numbers)
             return
-        fixed, numbers = self._fixed[name]
-        data = fixed.GetMutableData()
+        changed, numbers = known
+        data = changed()
         if numbers is None:
             data.set_value(value)
         else:
