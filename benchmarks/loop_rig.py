@@ -102,8 +102,8 @@ class Rig:
         return runtime.missed - missed
 
     def drain(self) -> None:
-        """Takes in what came while somebody else had his turn."""
-        while self.bridge.poll():
+        """Takes in what came while somebody else had his turn, until no more comes than the machine tells now."""
+        while self.bridge.poll(PERIOD / 4):
             pass
 
     def granted(self) -> str:
