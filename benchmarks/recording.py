@@ -96,7 +96,7 @@ def _check_complete(recorder: Recorder) -> None:
         raise RuntimeError(f"the recorder lost {recorder.lost} cycles")
 
 
-def replay_rtf(simulated: float = 10.0, repeats: int = 5) -> Benchmark:
+def replay_rtf(simulated: float = 60.0, repeats: int = 3) -> Benchmark:
     """Seconds of the loop per second of replaying its log with the DPS alone; to read the file and to build the DPS is
     part of it. The log is that of the arm on the machine, with the bridge's messages; the replay has to be identical.
 
