@@ -15,6 +15,9 @@ STAMP := $(VENV)/.vtbdrake-installed
 ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
+# What compiled modules are made of.
+COMPILED := setup.py $(shell find vtbdrake -name '*.pyx' -o -name '*.pxd')
+
 .DEFAULT_GOAL := help
 .PHONY: help python setup demo demo-control test check answers bench clean stale
 
@@ -55,12 +58,13 @@ answers: $(STAMP)
 bench: $(STAMP)
 	$(RUN) -m benchmarks $(ONLY)
 
-$(STAMP): pyproject.toml $(wildcard constraints/*.txt) tools/setup.sh $(if $(STALE),stale)
-	@tools/setup.sh "$(VENV)" "$(PYTHON)"
+$(STAMP): pyproject.toml $(wildcard constraints/*.txt) tools/setup.sh $(COMPILED) $(if $(STALE),stale)
+	@tools/setup.sh "$(VENV)" $(if $(STALE),"$(PYTHON)")
 
 stale:
 
 clean:
-	rm -rf .venv .venv-* build dist out answers.json benchmarks/results.json
+	rm -rf .venv .venv-* build dist *.egg-info out answers.json benchmarks/results.json
 	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find vtbdrake -name '*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,6 +2,7 @@
 # The environment that demo, tests and checks run in: system packages, a virtual environment, the package in it.
 #
 #   tools/setup.sh VENV PYTHON          set up VENV with the interpreter PYTHON, or repair it
+#   tools/setup.sh VENV                 bring VENV up to date, with the interpreter that it was set up with
 #   tools/setup.sh --check VENV [ASKED] succeed at once if VENV was set up for this checkout (and by PYTHON=ASKED)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -16,18 +17,32 @@ fail() { say "$@"; exit 1; }
 
 stamp_text() { printf 'checkout %s\npython %s\n' "$PWD" "$1"; }
 
-if [ "${1:-}" = --check ]; then
-    stamp=$2/.vtbdrake-installed
-    [ -x "$2/bin/python" ] && [ -f "$stamp" ] || exit 1
-    asked=${3:-$(sed -n 's/^python //p' "$stamp")}
+is_set_up() {
+    local stamp=$1/.vtbdrake-installed
+    [ -x "$1/bin/python" ] && [ -f "$stamp" ] || return 1
+    local asked=${2:-$(sed -n 's/^python //p' "$stamp")}
     [ "$(cat "$stamp")" = "$(stamp_text "$asked")" ]
+}
+
+if [ "${1:-}" = --check ]; then
+    is_set_up "$2" "${3:-}"
     exit
 fi
 
-[ $# -eq 2 ] || fail "usage: tools/setup.sh VENV PYTHON"
-venv=$1 python=$2
+[ $# -eq 1 ] || [ $# -eq 2 ] || fail "usage: tools/setup.sh VENV [PYTHON]"
+venv=$1
 stamp=$venv/.vtbdrake-installed
 unfinished=$venv/.vtbdrake-unfinished
+[ $# -eq 2 ] || [ -f "$stamp" ] || fail "'$venv' was not set up yet: name the interpreter to do so with"
+python=${2:-$(sed -n 's/^python //p' "$stamp")}
+
+# Where nothing but compiled modules has changed, compiling them is all there is to do, and a slip in them costs no more.
+if is_set_up "$venv" "$python" && [ -z "$(find pyproject.toml constraints tools/setup.sh -newer "$stamp")" ]; then
+    say "compiling modules"
+    "$venv/bin/python" setup.py --quiet build_ext --inplace || fail "vtbdrake does not compile, see above"
+    touch "$stamp"
+    exit
+fi
 
 # Debian packages: as root they are installed, otherwise the user is told the command.
 need_packages() {
@@ -56,9 +71,18 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
     fail "'$python' is Python $version, vtbdrake needs 3.11 or newer: set PYTHON, for example PYTHON=python3.11"
 
 has_venv() { "$python" -c 'import ensurepip, venv' 2>/dev/null; }
+is_of_debian() { [ "$("$python" -c 'import sys; print(sys.base_prefix)')" = /usr ]; }
+has_compiler() {
+    local compiler=${CC:-$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("CC"))')}
+    # shellcheck disable=SC2086
+    echo '#include <stdlib.h>' | $compiler -x c -fsyntax-only - 2>/dev/null
+}
+has_headers() { [ -f "$("$python" -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h" ]; }
 has_library() { "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "$1" 2>/dev/null; }
 missing() {
     has_venv || echo "python$version-venv"
+    has_compiler || echo "gcc libc6-dev"
+    has_headers || echo "python$version-dev"
     local entry
     for entry in "${LIBRARIES[@]}"; do
         has_library "${entry%%:*}" || echo "${entry##*:}"
@@ -66,9 +90,10 @@ missing() {
 }
 packages=$(missing)
 if [ -n "$packages" ]; then
-    # Debian's package of the module cannot help an interpreter that is not Debian's.
-    if ! has_venv && [ "$("$python" -c 'import sys; print(sys.base_prefix)')" != /usr ]; then
-        fail "'$python' lacks the modules venv and ensurepip: set PYTHON to one that has them"
+    # Debian's packages of Python's parts cannot help an interpreter that is not Debian's.
+    if ! is_of_debian; then
+        has_venv || fail "'$python' lacks the modules venv and ensurepip: set PYTHON to one that has them"
+        has_headers || fail "'$python' lacks its headers (Python.h), to compile modules: set PYTHON to one that has them"
     fi
     # shellcheck disable=SC2086
     need_packages $packages
@@ -102,9 +127,10 @@ rm -f "$stamp"
 say "installing into $venv for Python $version with $constraints (a minute or two the first time)"
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
 pip() { "$venv/bin/python" -m pip --quiet --disable-pip-version-check "$@"; }
-# The build tool comes first and in its tested version, so that the build needs no environment of its own.
-pip install --constraint "$constraints" hatchling
-pip install --constraint "$constraints" --no-build-isolation --editable ".[$EXTRAS]"
+# The build tools come first and in their tested versions, so that the build needs no environment of its own.
+pip install --constraint "$constraints" setuptools Cython numpy
+pip install --constraint "$constraints" --no-build-isolation --editable ".[$EXTRAS]" ||
+    fail "vtbdrake does not compile, or what it depends on does not install, see above"
 "$venv/bin/python" -c 'import pydrake.common, vtbdrake' || fail "the installed packages do not import"
 rm "$unfinished"
 stamp_text "$python" >"$stamp"

@@ -1,0 +1,37 @@
+"""What pyproject.toml cannot say: every .pyx in the package becomes a compiled module, which may include numpy's headers."""
+
+from pathlib import Path
+
+import numpy as np
+from setuptools import Extension, setup
+
+_ROOT = Path(__file__).parent
+_SOURCES = sorted(path.relative_to(_ROOT) for path in (_ROOT / "vtbdrake").rglob("*.pyx"))
+
+setup(
+    ext_modules=[
+        Extension(
+            ".".join(source.with_suffix("").parts),
+            [str(source)],
+            include_dirs=[np.get_include()],
+            define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")],
+            # The same rounding on every processor: no product and sum in one.
+            extra_compile_args=["-O2", "-ffp-contract=off"],
+        )
+        for source in _SOURCES
+    ],
+    options={
+        "build_ext": {
+            # Files are compared by age only, which knows nothing of another Cython, numpy or other options.
+            "force": True,
+            # The folder of temporary files belongs to one version of Python: several share a checkout.
+            "cython_c_in_temp": True,
+            "cython_directives": {
+                "language_level": "3",
+                "boundscheck": False,
+                "wraparound": False,
+                "cdivision": True,
+            },
+        }
+    },
+)
