@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: every .pyx in the package becomes a compiled module, which may include numpy's headers."""
+"""What pyproject.toml cannot say: every .pyx of the package becomes a compiled module, with numpy at hand."""
 
 from pathlib import Path
 

@@ -1,41 +1,110 @@
-"""The wheel holds the package vtbdrake, typed and licensed, and nothing else of the repository."""
+"""The sdist holds all that the wheel is built from; the wheel holds the package, typed, compiled and licensed."""
 
+import os
+import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from email.message import Message
 from email.parser import Parser
 from pathlib import Path
+from sysconfig import get_config_var
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+COMPILED = sorted(path.relative_to(ROOT) for path in (ROOT / "vtbdrake").rglob("*.pyx"))
+EXT_SUFFIX = get_config_var("EXT_SUFFIX")
+
+
+def run(*arguments: str, cwd: Path, **environment: str) -> str:
+    result = subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=os.environ | environment, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
-    result = subprocess.run(build, cwd=ROOT, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    (path,) = folder.glob("*.whl")
-    return zipfile.ZipFile(path)
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy, modules compiled in place included: a build leaves its folders where it runs."""
+    folder = tmp_path_factory.mktemp("build") / "checkout"
+    shutil.copytree(ROOT / "vtbdrake", folder / "vtbdrake", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def metadata(wheel: zipfile.ZipFile) -> Message:
-    (name,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
-    return Parser().parsestr(wheel.read(name).decode())
+def files(checkout: Path) -> set[str]:
+    """The package's own files, as they are kept in the repository."""
+    paths = [path for path in (checkout / "vtbdrake").rglob("*") if path.is_file() and path.suffix != ".so"]
+    return {path.relative_to(checkout).as_posix() for path in paths}
 
 
-def test_wheel_holds_only_the_package(wheel: zipfile.ZipFile) -> None:
-    tops = {name.split("/")[0] for name in wheel.namelist()}
-    assert tops == {"vtbdrake", "vtbdrake-0.1.0.dist-info"}
+@pytest.fixture(scope="module")
+def sdist(checkout: Path, files: set[str]) -> Path:
+    run("-c", "import setuptools.build_meta as backend; backend.build_sdist('..')", cwd=checkout)
+    (path,) = checkout.parent.glob("*.tar.gz")
+    return path
 
 
-def test_wheel_is_complete(wheel: zipfile.ZipFile) -> None:
-    modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "vtbdrake").rglob("*.py")}
-    assert modules | {"vtbdrake/py.typed"} <= set(wheel.namelist())
+@pytest.fixture(scope="module")
+def wheel(sdist: Path) -> Path:
+    options = ("--no-index", "--no-build-isolation", "--no-deps", "--disable-pip-version-check")
+    run("-m", "pip", "wheel", *options, str(sdist), cwd=sdist.parent)
+    (path,) = sdist.parent.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def content(wheel: Path) -> dict[str, str]:
+    """Name and text of every file in the wheel; what is not text is left to its name."""
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name).decode(errors="replace") for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def metadata(content: dict[str, str]) -> Message:
+    return Parser().parsestr(content["vtbdrake-0.1.0.dist-info/METADATA"])
+
+
+def test_compiled_modules_are_not_older_than_their_sources() -> None:
+    for source in COMPILED:
+        module = ROOT / source.with_suffix(EXT_SUFFIX)
+        assert module.exists() and module.stat().st_mtime >= (ROOT / source).stat().st_mtime, (
+            f"{module.name} is not what {source} says: compile it, {sys.executable} setup.py build_ext --inplace"
+        )
+
+
+def test_sdist_holds_the_package_and_what_builds_it(sdist: Path, files: set[str]) -> None:
+    with tarfile.open(sdist) as archive:
+        names = {entry.name.partition("/")[2] for entry in archive if entry.isfile()}
+    made = {name for name in names if name.startswith("vtbdrake.egg-info/")} | {"PKG-INFO", "setup.cfg"}
+    assert names - made == files | {"pyproject.toml", "setup.py", "README.md", "LICENSE"}
+
+
+def test_wheel_holds_the_package_compiled_and_nothing_else(content: dict[str, str], files: set[str]) -> None:
+    names = {name for name in content if not name.startswith("vtbdrake-0.1.0.dist-info/")}
+    sources = {source.as_posix() for source in COMPILED}
+    assert names == files - sources | {source.with_suffix(EXT_SUFFIX).as_posix() for source in COMPILED}
+    assert "vtbdrake/py.typed" in names
+
+
+def test_wheel_is_for_this_python_and_platform(wheel: Path, content: dict[str, str]) -> None:
+    python = "cp{}{}".format(*sys.version_info)
+    assert f"-{python}-{python}-linux_" in wheel.name
+    assert "Root-Is-Purelib: false" in content["vtbdrake-0.1.0.dist-info/WHEEL"]
+
+
+def test_compiled_modules_of_the_wheel_import(wheel: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    for source in COMPILED:
+        name = ".".join(source.with_suffix("").parts)
+        found = run("-c", f"import {name} as module; print(module.__file__)", cwd=tmp_path, PYTHONPATH=str(tmp_path))
+        assert Path(found.strip()) == tmp_path / source.with_suffix(EXT_SUFFIX)
 
 
 def test_metadata(metadata: Message) -> None:
@@ -52,6 +121,5 @@ def test_optional_packages_are_extras(metadata: Message) -> None:
     assert not always & {"opencv-python-headless", "embreex", "optuna", "dask", "distributed", "pandas", "ipywidgets"}
 
 
-def test_command_line_entry_point(wheel: zipfile.ZipFile) -> None:
-    (name,) = (name for name in wheel.namelist() if name.endswith(".dist-info/entry_points.txt"))
-    assert "vtbdrake = vtbdrake.cli:main" in wheel.read(name).decode()
+def test_command_line_entry_point(content: dict[str, str]) -> None:
+    assert "vtbdrake = vtbdrake.cli:main" in content["vtbdrake-0.1.0.dist-info/entry_points.txt"]
