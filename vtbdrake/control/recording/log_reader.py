@@ -6,9 +6,7 @@ import logging
 import os
 import struct
 import zlib
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from vtbdrake.control.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
-from vtbdrake.control.recording.log_events import LogEvents, Place
+from vtbdrake.control.recording.log_events import LogEvents
 from vtbdrake.control.recording.log_format import (
     CHANGE,
     COMMANDED,
@@ -38,6 +36,7 @@ from vtbdrake.control.recording.log_format import (
     LogError,
 )
 from vtbdrake.control.recording.log_header import LogHeader
+from vtbdrake.control.recording.scan import whole_cycles
 from vtbdrake.state import Snapshot
 from vtbdrake.state.archive import ArchiveError
 
@@ -124,36 +123,18 @@ def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 
 
-def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> tuple[np.ndarray, list[range]]:
-    """The cycles that are whole, in order, and which bytes of the file belong to each."""
-    content, size = memoryview(events.content), layout.dtype.itemsize
-    whole: list[bytes] = []
-    frames: list[range] = []
-    frame_size, numbers = struct.Struct(">iI"), struct.Struct(">q")
-    newest = -1
-    for _, _, begin, end in events.on(CYCLE):
-        what = "a cycle of another length"
-        if end - begin == size:
-            length, crc = frame_size.unpack_from(content, end - frame_size.size)
-            (number,) = numbers.unpack_from(content, begin + 16)
-            if not size < length <= end or zlib.crc32(content[end - length : end - 4]) != crc:
-                what = f"the checksum of cycle {number} is wrong"
-            elif number <= newest:
-                what = f"cycle {number} follows cycle {newest}"
-            else:
-                newest = number
-                whole.append(bytes(content[begin:end]))
-                frames.append(range(end - length, end))
-                continue
-        damages.append(Damage(begin, what))
-    records = np.frombuffer(b"".join(whole), layout.dtype)
+def _cycles(events: LogEvents, layout: CycleLayout, damages: list[Damage]) -> tuple[np.ndarray, np.ndarray]:
+    """The cycles that are whole, in order, and which bytes of the file belong to each; see `whole_cycles`."""
+    records, frames, wrong = whole_cycles(events.content, events.places(CYCLE), layout.dtype)
+    damages += [Damage(*damage) for damage in wrong]
     if not layout.fits(records).all():
         raise LogError("the log's cycles do not have the signals that its header tells of")
     return records, frames
 
 
 def _columns(entries: np.ndarray, parts: dict[str, slice]) -> dict[str, np.ndarray]:
-    return {name: np.ascontiguousarray(entries[:, part], dtype=float) for name, part in parts.items()}
+    native = entries.astype(float)
+    return {name: np.ascontiguousarray(native[:, part]) for name, part in parts.items()}
 
 
 def _where(entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: np.ndarray) -> dict[str, np.ndarray]:
@@ -166,12 +147,12 @@ def _where(entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: n
 
 
 def _messages(
-    events: LogEvents, channel: str, message_type: Any, damages: list[Damage], frames: list[range] | None = None
+    events: LogEvents, channel: str, message_type: Any, damages: list[Damage], frames: np.ndarray | None = None
 ) -> list[Any]:
     """Those of a channel; with ``frames`` only what belongs to them: of a cycle that does not count, nothing does."""
     found = []
-    places = events.on(channel)
-    for _, _, begin, end in places if frames is None else _within(frames, places):
+    places = events.places(channel)
+    for _, _, begin, end in (places if frames is None else _within(frames, places)).tolist():
         try:
             found.append(decode(message_type, events.data(begin, end)))
         except (MalformedError, struct.error, ValueError) as error:
@@ -188,18 +169,15 @@ def _last(events: LogEvents, damages: list[Damage]) -> list[int]:
     return whole
 
 
-def _within(frames: list[range], places: Sequence[Place]) -> Iterator[Place]:
-    ends = [frame.stop for frame in frames]
-    for place in places:
-        _, _, begin, end = place
-        i = bisect_left(ends, end)
-        if i < len(frames) and begin in frames[i]:
-            yield place
+def _within(frames: np.ndarray, places: np.ndarray) -> np.ndarray:
+    i = np.searchsorted(frames[:, 1], places[:, 3])
+    begins = np.append(frames[:, 0], np.iinfo(np.int64).max)
+    return places[places[:, 2] >= begins[i]]
 
 
 def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
-    known = [header.first_cycle - 1, *numbers.tolist(), *(number + 1 for number in ends)]
-    return [Gap(a + 1, b - 1) for a, b in pairwise(known) if b > a + 1]
+    known = np.concatenate([[header.first_cycle - 1], numbers, np.array(ends, int) + 1])
+    return [Gap(int(known[i]) + 1, int(known[i + 1]) - 1) for i in np.flatnonzero(np.diff(known) > 1)]
 
 
 def _jumps(records: np.ndarray) -> list[int]:

@@ -1,0 +1,124 @@
+"""What there is to be done for every event of a log, compiled: to find the events, and the cycles that are whole."""
+
+import zlib
+
+import numpy as np
+
+from cpython.array cimport array, extend_buffer
+from cpython.buffer cimport PyBUF_READ
+from cpython.bytes cimport PyBytes_FromStringAndSize
+from cpython.memoryview cimport PyMemoryView_FromMemory
+from libc.stdint cimport int32_t, int64_t, uint32_t, uint64_t
+from libc.string cimport memcpy
+
+from vtbdrake.control.lcm_maps import LONGEST_CHANNEL_NAME
+from vtbdrake.control.recording.log_format import EVENT, SYNC
+
+cdef extern from *:
+    """
+    #include <endian.h>
+    """
+    uint32_t be32toh(uint32_t) nogil
+    uint64_t be64toh(uint64_t) nogil
+
+cdef packed struct Header:  # EVENT, in the byte order of the file
+    uint32_t sync
+    uint64_t number
+    uint64_t utime
+    uint32_t name
+    uint32_t length
+
+assert sizeof(Header) == EVENT.size
+
+cdef uint32_t _SYNC = SYNC
+cdef int64_t _LONGEST_NAME = LONGEST_CHANNEL_NAME
+
+
+cdef inline uint32_t _number4(const unsigned char* at) noexcept nogil:
+    cdef uint32_t number
+    memcpy(&number, at, sizeof(number))
+    return be32toh(number)
+
+
+cdef inline uint64_t _number8(const unsigned char* at) noexcept nogil:
+    cdef uint64_t number
+    memcpy(&number, at, sizeof(number))
+    return be64toh(number)
+
+
+def find_events(content not None):
+    cdef const unsigned char[::1] view = content
+    cdef int64_t size = view.shape[0], at = 0, begin, end, following
+    cdef const unsigned char* data = &view[0] if size else NULL
+    cdef const Header* header
+    cdef int64_t[4] place
+    cdef bint whole, good
+    cdef array found
+    cdef dict places = {}
+    damages, sync = [], SYNC.to_bytes(4, "big")
+    while at < size:
+        header = <const Header*>(data + at)
+        whole = size - at >= <int64_t>sizeof(Header)
+        good = whole and be32toh(header.sync) == _SYNC and 0 < be32toh(header.name) <= _LONGEST_NAME
+        if good:
+            begin = at + <int64_t>sizeof(Header) + be32toh(header.name)
+            end = begin + be32toh(header.length)
+            good = end <= size
+        if not good or (end < size and (size - end < 4 or _number4(data + end) != _SYNC)):
+            following = content.find(sync, at + 1)
+            # Where an event lies within another one, the length of that is wrong; else what follows is.
+            if not good or 0 <= following < end:
+                torn = following < 0 and (not whole or be32toh(header.sync) == _SYNC)
+                damages.append((at, "the file ends in the middle of an event" if torn else "no event"))
+                if following < 0:
+                    break
+                at = following
+                continue
+        channel = PyBytes_FromStringAndSize(
+            <const char*>data + at + sizeof(Header), begin - at - <int64_t>sizeof(Header)
+        )
+        entry = places.get(channel)
+        if entry is None:
+            entry = places[channel] = array("q")
+        found = entry
+        place[0], place[1] = <int64_t>be64toh(header.number), <int64_t>be64toh(header.utime)
+        place[2], place[3] = begin, end
+        extend_buffer(found, <char*>place, 4)
+        at = end
+    return {channel: np.frombuffer(entry, np.int64).reshape(-1, 4) for channel, entry in places.items()}, damages
+
+
+def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None):
+    cdef const unsigned char[::1] view = content
+    cdef const unsigned char* data = &view[0] if view.shape[0] else NULL
+    cdef int64_t size = dtype.itemsize, number_at = dtype.fields["number"][1], size_at = dtype.fields["size"][1]
+    cdef int64_t begin, end, length, number, newest = -1
+    cdef Py_ssize_t i, n = 0
+    cdef uint32_t crc
+    records, frames = np.empty((places.shape[0], size), np.uint8), np.empty((places.shape[0], 2), np.int64)
+    cdef unsigned char[:, ::1] record = records
+    cdef int64_t[:, ::1] frame = frames
+    damages, crc32 = [], zlib.crc32
+    for i in range(places.shape[0]):
+        begin, end = places[i, 2], places[i, 3]
+        if not 0 <= begin <= end <= view.shape[0]:
+            raise IndexError(f"bytes {begin} to {end} are not all in the {view.shape[0]} that there are")
+        what = "a cycle of another length"
+        if end - begin == size:
+            length = <int32_t>_number4(data + begin + size_at)
+            number = <int64_t>_number8(data + begin + number_at)
+            crc = _number4(data + end - 4)
+            if not size < length <= end or crc != <uint32_t>crc32(
+                PyMemoryView_FromMemory(<char*>data + end - length, length - 4, PyBUF_READ)
+            ):
+                what = f"the checksum of cycle {number} is wrong"
+            elif number <= newest:
+                what = f"cycle {number} follows cycle {newest}"
+            else:
+                newest = number
+                memcpy(&record[n, 0], data + begin, size)
+                frame[n, 0], frame[n, 1] = end - length, end
+                n += 1
+                continue
+        damages.append((begin, what))
+    return records[:n].reshape(-1).view(dtype), frames[:n], damages
