@@ -10,7 +10,7 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_image, lcmt_robot_state
 
 from tests.control.arm import status
-from vtbdrake.control.lcm_wire import Excerpt, Layout, MalformedError, decode
+from vtbdrake.control.lcm_wire import Layout, MalformedError, decode
 
 
 def reason(message_type: Any, data: bytes) -> str:
@@ -62,17 +62,6 @@ def test_thousands_of_millions_of_empty_rows_are_not_read(user_types: ModuleType
     assert reason(user_types.mixed_t, bytes(data)) == "size"
 
 
-def test_excerpt_reads_the_numbers_that_lcm_gen_wrote() -> None:
-    layout = Layout(status(5, position=0.5, torque=-2.0))
-    excerpt = Excerpt(layout, ["joint_torque_external", "utime", "joint_position_measured"])
-    numbers = excerpt.unpack(status(6, position=0.25, torque=3.0).encode())
-    assert excerpt.fixed(numbers) == excerpt.expected
-    assert numbers[excerpt.at["utime"]] == (6,)
-    assert numbers[excerpt.at["joint_position_measured"]] == (0.25,) * 7
-    assert numbers[excerpt.at["joint_torque_external"]] == (3.0,) * 7
-    assert len(numbers) == 1 + 1 + 1 + 7 + 7  # fingerprint, time and the arrays' length come with the fields
-
-
 def test_layout_tells_where_lcm_gen_writes_a_field() -> None:
     message = status(5, position=0.5, torque=-2.0)
     place = Layout(message).at["joint_torque_measured"]
@@ -80,12 +69,12 @@ def test_layout_tells_where_lcm_gen_writes_a_field() -> None:
     assert data == tuple(message.joint_torque_measured)
 
 
-@pytest.mark.parametrize("at", [0, 7, 19], ids=["fingerprint", "its end", "length of the arrays"])
-def test_excerpt_knows_a_message_that_is_laid_out_in_another_way(at: int) -> None:
-    excerpt = Excerpt(Layout(status(5)), ["joint_position_measured"])
-    data = bytearray(status(5).encode())
-    data[at] ^= 1
-    assert excerpt.fixed(excerpt.unpack(bytes(data))) != excerpt.expected
+def test_layout_tells_by_what_it_is_known() -> None:
+    message = status(5)
+    data, layout = message.encode(), Layout(message)
+    (begin, size), *lengths = layout.fixed
+    assert data[begin : begin + size] == lcmt_iiwa_status._get_packed_fingerprint()
+    assert [struct.unpack(">i", data[at : at + n]) for at, n in lengths] == [(message.num_joints,)]
 
 
 def test_message_that_is_not_numbers_only_has_no_layout(user_types: ModuleType) -> None:

@@ -4,49 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.control.kernels import Reception
+
 if TYPE_CHECKING:
     # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
-    from vtbdrake.control.ranges import Range
     from vtbdrake.testbed import Interface
+
+__all__ = ["Bridge", "BridgeError", "Reception"]
 
 
 class BridgeError(RuntimeError):
     """A bridge that cannot be opened, or is used before it is."""
-
-
-@dataclass
-class Reception:
-    """What is known of one sensor signal; the bridge keeps it up to date in place.
-
-    Attributes:
-        value: the newest accepted one: an array of the signal's size, or an abstract value; None before the first.
-        arrived: when it arrived, on the clock of `time.monotonic`, in seconds; -inf before the first.
-        sent: the sender's own time of it, in seconds, if the message tells; NaN if not.
-        count: how many were accepted.
-        rejected: how many were not, by the reason: ``fingerprint``, ``truncated``, ``trailing``, ``size``, ``not
-            finite``, ``limits``, ``out of order``, ...
-        range: what the bridge checks every value against before it accepts it; None if it leaves that to others.
-    """
-
-    value: Any = None
-    arrived: float = -inf
-    sent: float = float("nan")
-    count: int = 0
-    rejected: dict[str, int] = field(default_factory=dict)
-    range: Range | None = None
-
-    def age(self, now: float) -> float:
-        """Seconds since it arrived; infinite before the first."""
-        return now - self.arrived
-
-    def reject(self, reason: str) -> None:
-        """Counts a message that was not accepted."""
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1
 
 
 class Bridge(ABC):

@@ -47,7 +47,7 @@ class CloudMap(LcmMap):
 
         def read(data: bytes) -> Sample:
             message = decode(self.type, data)
-            return Sample(message.utime * 1e-6, {signal.name: to_cloud(message, signal.model_value)}, None)
+            return Sample(message.utime * 1e-6, {signal.name: to_cloud(message, signal.model_value)})
 
         return read
 

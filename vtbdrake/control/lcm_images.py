@@ -62,7 +62,7 @@ class ImageMap(LcmMap):
             message = decode(self.type, data)
             images = self.select(message)
             values = {name: to_image(images[name], model) for name, model in models.items() if name in images}
-            return Sample(message.header.utime * 1e-6, values, None)
+            return Sample(message.header.utime * 1e-6, values)
 
         return read
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import nan
 from typing import Any, NamedTuple
 
+from vtbdrake.control.kernels import Intake, Reception
 from vtbdrake.control.lcm_wire import decode
 from vtbdrake.testbed import Signal
 
@@ -20,12 +21,10 @@ class Sample(NamedTuple):
     Attributes:
         sent: the sender's time, in seconds; NaN if the message does not tell.
         values: the value of each signal in it, by name.
-        numbers: the entries of all signals, in the map's order, if they are known to have the right sizes; else None.
     """
 
     sent: float
     values: Mapping[str, Any]
-    numbers: Sequence[float] | None
 
 
 Reader = Callable[[bytes], Sample]
@@ -87,9 +86,19 @@ class LcmMap:
 
         def read(data: bytes) -> Sample:
             message = decode(self.type, data)
-            return Sample(self.sent(message), to_values(message), None)
+            return Sample(self.sent(message), to_values(message))
 
         return read
+
+    def intake(self, signals: Sequence[Signal], receptions: Sequence[Reception], example: bytes) -> Intake | None:
+        """What takes in messages that are laid out like an accepted one, quickly; None if there is no such way.
+
+        Args:
+            signals: those of this map, in its order.
+            receptions: theirs.
+            example: a message that `reader` could read.
+        """
+        return None
 
     def writer(self, signals: Sequence[Signal]) -> Writer:
         """What makes a message's bytes of values, by name, and the time in microseconds.

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from math import nan
-from operator import attrgetter, itemgetter
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
+from vtbdrake.control.kernels import Form, Intake, Reception
 from vtbdrake.control.lcm_fields import Field, compose, find_field
-from vtbdrake.control.lcm_maps import LcmMap, Reader, Sample, Writer, never_sent
-from vtbdrake.control.lcm_wire import Excerpt, Layout, Place
+from vtbdrake.control.lcm_maps import LcmMap, Reader, Writer, never_sent
+from vtbdrake.control.lcm_wire import Layout, Place
+from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
 MICROSECOND = 1e-6
@@ -31,11 +30,6 @@ class VectorMap(LcmMap):
 
     fields: Mapping[str, Sequence[Field]]
     stamp: str = ""
-
-    @cached_property
-    def paths(self) -> tuple[str, ...]:
-        """The mapped fields, in the order of the signals."""
-        return tuple(field.path for name in self.signals for field in self.fields[name])
 
     def check(self, signals: Sequence[Signal]) -> None:
         """
@@ -65,11 +59,62 @@ class VectorMap(LcmMap):
 
     def reader(self, signals: Sequence[Signal]) -> Reader:
         self.check(signals)
-        return _VectorReader(self, signals)
+        return super().reader(signals)
+
+    def intake(self, signals: Sequence[Signal], receptions: Sequence[Reception], example: bytes) -> Intake | None:
+        layout = self._layout(self.type.decode(example))
+        if layout is None:
+            return None
+        ranges = [Range(signal) for signal in signals]
+        return Intake(
+            example,
+            fixed=layout.fixed,
+            places=self._places(layout, signals),
+            stamp=self._stamp(layout),
+            receptions=receptions,
+            sizes=[signal.size for signal in signals],
+            lower=[entry for limits in ranges for entry in limits.lower],
+            upper=[entry for limits in ranges for entry in limits.upper],
+        )
 
     def writer(self, signals: Sequence[Signal]) -> Writer:
         self.check(signals)
         return _VectorWriter(self, signals)
+
+    def form(self, signals: Sequence[Signal]) -> Form | None:
+        """What writes the messages of some of the map's signals, quickly; None if there is no such way."""
+        assert self.encode is not None
+        message = self.encode({signal.name: np.zeros(signal.size or 0) for signal in signals}, 0)
+        layout = self._layout(message)
+        if layout is None:
+            return None
+        return Form(
+            layout.example,
+            places=self._places(layout, signals),
+            stamp=self._stamp(layout),
+            names=[signal.name for signal in signals],
+            sizes=[signal.size for signal in signals],
+        )
+
+    def _layout(self, message: Any) -> Layout | None:
+        try:
+            return Layout(message)
+        except TypeError:  # It holds more than numbers.
+            return None
+
+    def _places(self, layout: Layout, signals: Sequence[Signal]) -> list[tuple[int, int, int, int, str]]:
+        """Of the signals' entries: which signal, from which entry on, at which byte, how many, their type."""
+        places = []
+        for i, signal in enumerate(signals):
+            begin = 0
+            for field in self.fields[signal.name]:
+                place = layout.at[field.path]
+                places.append((i, begin, place.offset, place.size, place.code))
+                begin += place.size
+        return places
+
+    def _stamp(self, layout: Layout) -> Place | None:
+        return layout.at[self.stamp] if self.stamp else None
 
 
 def vector_map(
@@ -121,125 +166,23 @@ def vector_map(
     )
 
 
-class _VectorReader:
-    """Reads messages that are laid out like an earlier one by one call of `struct`, and the others field by field."""
-
-    _LAYOUTS = 4  # how many to remember: messages of a channel are laid out alike, or change between a few ways
-
-    def __init__(self, map: VectorMap, signals: Sequence[Signal]) -> None:
-        self._read = LcmMap.reader(map, signals)
-        self._map = map
-        self._sizes = {signal.name: signal.size for signal in signals}
-        ends = np.cumsum([signal.size for signal in signals]).tolist()
-        self._parts = [(s.name, slice(end - (s.size or 0), end)) for s, end in zip(signals, ends, strict=True)]
-        self._known: dict[int, tuple[Excerpt, itemgetter[Any], int]] = {}  # by the messages' size
-        self._flat = True  # until a message turns out to hold more than numbers
-
-    def __call__(self, data: bytes) -> Sample:
-        known = self._known.get(len(data))
-        if known is not None:
-            excerpt, pick, stamp = known
-            numbers = excerpt.unpack(data)
-            if excerpt.fixed(numbers) == excerpt.expected:
-                picked = pick(numbers)
-                entries = np.array(picked, dtype=float)
-                sent = numbers[stamp] * MICROSECOND if stamp else nan
-                return Sample(sent, {name: entries[part] for name, part in self._parts}, picked)
-        sample = self._read(data)
-        if self._flat and known is None and len(self._known) < self._LAYOUTS:
-            self._learn(data, sample)
-        return sample
-
-    def _learn(self, data: bytes, sample: Sample) -> None:
-        if any(len(sample.values[name]) != size for name, size in self._sizes.items()):
-            return
-        try:
-            layout = Layout(self._map.type.decode(data))
-        except TypeError:
-            self._flat = False
-            return
-        excerpt = Excerpt(layout, {self._map.stamp, *self._map.paths})
-        places = [place for path in self._map.paths for place in range(excerpt.at[path].start, excerpt.at[path].stop)]
-        together = places == list(range(places[0], places[-1] + 1))
-        pick = itemgetter(slice(places[0], places[-1] + 1)) if together else itemgetter(*places)
-        stamp = excerpt.at[self._map.stamp].start if self._map.stamp else 0
-        self._known[len(data)] = (excerpt, pick, stamp)
-
-
-class _Blank(NamedTuple):
-    """A stretch of a message where numbers go.
-
-    Attributes:
-        write: writes them, into a message, at an offset.
-        offset: in bytes.
-        part: which entries of the signal they are.
-        integer: whether they are rounded.
-    """
-
-    write: Callable[..., None]
-    offset: int
-    part: slice
-    integer: bool
-
-
-class _Form:
-    """A message of numbers only, in which the time and the signals are left to be filled in."""
-
-    def __init__(self, layout: Layout, map: VectorMap, names: Iterable[str]) -> None:
-        self._message = bytearray(layout.example)
-        self._stamp = _blank(layout.at[map.stamp], 0, integer=True) if map.stamp else None
-        self._blanks: list[tuple[str, list[_Blank]]] = []
-        for name in names:
-            begin, blanks = 0, []
-            for field in map.fields[name]:
-                place = layout.at[field.path]
-                blanks.append(_blank(place, begin, integer=field.integer))
-                begin += place.size
-            self._blanks.append((name, blanks))
-
-    def fill(self, values: Mapping[str, Any], utime: int) -> bytes:
-        """
-        Raises:
-            struct.error, OverflowError: a number does not fit its field.
-        """
-        message = self._message
-        if self._stamp is not None:
-            self._stamp.write(message, self._stamp.offset, utime)
-        for name, blanks in self._blanks:
-            entries = np.asarray(values[name], dtype=float).tolist()
-            for write, offset, part, integer in blanks:
-                numbers = entries[part]
-                write(message, offset, *(map(round, numbers) if integer else numbers))
-        return bytes(message)
-
-
-def _blank(place: Place, begin: int, *, integer: bool) -> _Blank:
-    write = struct.Struct(f">{place.size}{place.code}").pack_into
-    return _Blank(write, place.offset, slice(begin, begin + place.size), integer)
-
-
 class _VectorWriter:
     """Writes the messages of a map; those that are numbers only by filling in a form."""
 
     def __init__(self, map: VectorMap, signals: Sequence[Signal]) -> None:
         self._map = map
+        self._signals = signals
         self._write = LcmMap.writer(map, signals)
-        self._forms: dict[tuple[str, ...], _Form | None] = {}
-        self._learn({signal.name: np.zeros(signal.size or 0) for signal in signals})
+        self._forms: dict[tuple[str, ...], Form | None] = {}
+        self._learn(tuple(signal.name for signal in signals))
 
-    def _learn(self, values: Mapping[str, Any]) -> _Form | None:
-        encode = self._map.encode
-        assert encode is not None
-        message = encode(values, 0)
-        message.encode()
-        try:
-            form: _Form | None = _Form(Layout(message), self._map, values)
-        except TypeError:
-            form = None
-        self._forms[tuple(values)] = form
+    def _learn(self, names: tuple[str, ...]) -> Form | None:
+        form = self._map.form([signal for signal in self._signals if signal.name in names])
+        self._forms[names] = form
         return form
 
     def __call__(self, values: Mapping[str, Any], utime: int) -> bytes:
         names = tuple(values)
-        form = self._forms[names] if names in self._forms else self._learn(values)
-        return self._write(values, utime) if form is None else form.fill(values, utime)
+        form = self._forms[names] if names in self._forms else self._learn(names)
+        message = form.fill(values, utime) if form is not None else None
+        return self._write(values, utime) if message is None else message

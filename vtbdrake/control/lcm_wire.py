@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Container
 from io import BytesIO
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 FORMATS = {
@@ -94,12 +92,13 @@ class Place(NamedTuple):
 class Layout:
     """Where each number lies in messages of a type whose arrays are as long as an example's.
 
-    Such messages are read and written by calls of `struct`, many times as fast as field by field.
+    Such messages are read and written many times as fast as field by field.
 
     Attributes:
         example: the example's bytes.
         at: by field, where its numbers are.
-        lengths: the fields that tell the lengths of arrays.
+        fixed: offsets and sizes of the bytes by which one tells that a message of the example's length is laid out so:
+            its fingerprint, and the lengths of its arrays.
     """
 
     def __init__(self, message: Any) -> None:
@@ -118,30 +117,6 @@ class Layout:
             lengths.update(dimension for dimension in dimensions or () if isinstance(dimension, str))
             self.at[name] = Place(end, count, FORMATS[typename])
             end = self.at[name].end
-        self.lengths = tuple(name for name in kind.__slots__ if name in lengths)
+        places = [self.at[name] for name in kind.__slots__ if name in lengths]
+        self.fixed = [(0, _FINGERPRINT), *((place.offset, place.end - place.offset) for place in places)]
         self.example: bytes = message.encode()
-
-
-class Excerpt:
-    """Reads the numbers of some fields, from all messages of a layout, by one call of `struct`.
-
-    Attributes:
-        size: bytes of such a message.
-        unpack: takes a message of this size; entry 0 of what it returns is the fingerprint.
-        at: by field, which of these entries are its numbers.
-        fixed: picks those entries by which one tells that a message is laid out so.
-        expected: what they are then.
-    """
-
-    def __init__(self, layout: Layout, fields: Container[str]) -> None:
-        code, end, count = f">{_FINGERPRINT}s", _FINGERPRINT, 1
-        self.at: dict[str, slice] = {}
-        for name, place in layout.at.items():
-            if name in layout.lengths or name in fields:
-                code += f"{place.offset - end}x{place.size}{place.code}"
-                self.at[name] = slice(count, count + place.size)
-                end, count = place.end, count + place.size
-        self.size = len(layout.example)
-        self.unpack = struct.Struct(f"{code}{self.size - end}x").unpack
-        self.fixed = itemgetter(0, *(self.at[name].start for name in layout.lengths))
-        self.expected = self.fixed(self.unpack(layout.example))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from math import isfinite, sqrt
 from typing import Any
 
-import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.control.kernels import Passage, finite
 from vtbdrake.testbed import Signal
 
 # What stands for "no limit" of a range. Its square is still finite, so that no arithmetic of limits overflows.
@@ -102,15 +100,9 @@ class CommandGuard:
         )
         self.needs_start = bool(np.isfinite(steps).any() or np.isfinite(changes).any())
         self.has_start = False
-        # c, s, x and w of above, which the compiled check of all entries at once reads and writes in place.
-        self._wanted, self._sent, self._step_before, self._step = (np.zeros(self._size) for _ in range(4))
-        self._passes = np.zeros(1)
-        self._buffer: Any
-        self._buffer, self._look = _passing(self._limits).buffer()
-        for index, array in enumerate((self._wanted, self._sent, self._step_before)):
-            self._buffer.set_arg(index, array.data)
-        for index, array in enumerate((self._passes, self._step)):
-            self._buffer.set_res(index, array.data)
+        # s and x of above.
+        self._sent, self._step_before = np.zeros(self._size), np.zeros(self._size)
+        self._passage = Passage(self._limits)
 
     @property
     def last_sent(self) -> NDArray[np.float64] | None:
@@ -148,14 +140,15 @@ class CommandGuard:
         Raises:
             CommandFault: as `limit`.
         """
+        if finite(command, self._size):
+            return command  # type: ignore[return-value]
         try:
             array = np.asarray(command, dtype=float)
         except (TypeError, ValueError) as error:
             raise CommandFault("size", f"is not a vector of {self._size} numbers: {error}") from error
         if array.shape != (self._size,):
             raise CommandFault("size", f"has the shape {array.shape} instead of ({self._size},)")
-        # The sum is quick, but large entries overflow it.
-        if not isfinite(sum(array.tolist())) and not np.isfinite(array).all():
+        if not np.isfinite(array).all():
             raise CommandFault("not finite", f"is not finite: {array.tolist()}")
         return array
 
@@ -165,12 +158,7 @@ class CommandGuard:
             if self.needs_start:
                 raise CommandFault("not started", NOT_STARTED)
             self.start_from(values)
-        self._wanted[:] = values
-        self._look()
-        if self._passes[0]:
-            self._sent[:] = values
-            self._step_before[:] = self._step
-        else:
+        if not self._passage.advance(values, self._sent, self._step_before):
             before = self._sent.copy()
             entries = zip(values.tolist(), before.tolist(), self._step_before.tolist(), self._limits, strict=True)
             self._sent[:] = [self._limited(c, s, x, *limits) for c, s, x, limits in entries]
@@ -197,23 +185,6 @@ class CommandGuard:
             count.count += 1
             count.largest = max(count.largest, amount)
         return sent
-
-
-def _passing(limits: Sequence[tuple[float, float, float, float]]) -> casadi.Function:
-    """Of c, s and x: whether every entry of c passes as it is, and the steps w = c - s. See `CommandGuard`."""
-    c, s, x = (casadi.SX.sym(name, len(limits)) for name in "csx")
-    w = c - s
-    rules = []
-    for i, (step, change, lower, upper) in enumerate(limits):
-        rules += [lower <= c[i], c[i] <= upper]
-        if isfinite(step):
-            rules += [casadi.fabs(w[i]) <= step]
-        if isfinite(change):
-            # A parabola half a change ahead lies above f: what it lets pass may pass, and most does.
-            reach = casadi.fabs(w[i]) + 0.5 * change
-            way = casadi.if_else(w[i] > 0.0, upper - s[i], s[i] - lower)
-            rules += [casadi.fabs(w[i] - x[i]) <= change, reach * reach <= 2.0 * change * way]
-    return casadi.Function("passing", [c, s, x], [reduce(casadi.logic_and, rules), w])
 
 
 def _longest_step(d: float, a: float) -> float:

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from operator import le
 from typing import Any
 
 import numpy as np
 
+from vtbdrake.control.kernels import Box
 from vtbdrake.testbed import Signal
 
 _LARGEST = float(np.finfo(float).max)
-
-# Up to this size Python's floats are quicker than numpy's calls.
-_SMALL = 32
-
-
-def within(lower: Sequence[float], entries: Sequence[float], upper: Sequence[float]) -> bool:
-    """Whether all entries are within their limits; for few of them, quicker than numpy. A NaN never is."""
-    return all(map(le, lower, entries)) and all(map(le, entries, upper))
 
 
 class Range:
@@ -38,7 +29,7 @@ class Range:
         else:
             self.lower = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
             self.upper = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
-            self._lower, self._upper = np.array(self.lower), np.array(self.upper)
+            self._box = Box(self.lower, self.upper)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Range) and self._shape() == other._shape()
@@ -50,17 +41,15 @@ class Range:
         """Why ``value`` is not one of this signal (``type``, ``size``, ``limits``, ``not finite``); empty if it is."""
         if self._type is not None:
             return "" if isinstance(value, self._type) else "type"
+        if self._box.contains(value):
+            return ""
         try:
-            entries = np.asarray(value, dtype=float)
+            entries = np.array(value, dtype=float)
         except (TypeError, ValueError):
             return "type"
         if entries.shape != (self._size,):
             return "size"
-        if entries.size > _SMALL:
-            inside = bool(((entries >= self._lower) & (entries <= self._upper)).all())
-        else:
-            inside = within(self.lower, entries.tolist(), self.upper)
-        if inside:
+        if self._box.contains(entries):
             return ""
         return "limits" if np.isfinite(entries).all() else "not finite"
 

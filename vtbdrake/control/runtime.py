@@ -165,8 +165,8 @@ class Runtime(Stepped):
     def _await(self, deadline: float) -> tuple[float, float]:
         """Waits for the next cycle; gives when it was due, and how late it is."""
         if self.pace is None:
-            # What has come by shortly before need not be taken in when the cycle is due.
-            return deadline, self.clock.wait_until(deadline, self.bridge.poll) - deadline
+            # What has come by shortly before need not be taken in, and fed, when the cycle is due.
+            return deadline, self.clock.wait_until(deadline, self._take_in) - deadline
         reception = self.bridge.sensed[self.pace]
         count, limit = reception.count, self.clock.now() + self._patience
         while reception.count == count:
@@ -176,6 +176,10 @@ class Runtime(Stepped):
             self.bridge.poll(left)
         woke = self.clock.now()
         return woke, max(woke - limit, 0.0)
+
+    def _take_in(self) -> None:
+        self.bridge.poll()
+        self.feed()
 
     def _next(self, due: float) -> float:
         """The next deadline; those that have passed already are left out and counted."""

@@ -9,8 +9,10 @@ from itertools import accumulate
 from math import ceil, exp, inf, log, nan
 from typing import Any
 
+from vtbdrake.control.kernels import Bins
 
-class Histogram:
+
+class Histogram(Bins):
     """Durations in bins of equal ratio, in constant memory.
 
     A percentile is the upper end of the bin in which it lies: never below the true one (of the kind "inverted_cdf"),
@@ -29,48 +31,13 @@ class Histogram:
         if not 0.0 < lowest < highest < inf:
             raise ValueError(f"a histogram needs 0 < lowest < highest, not {lowest} and {highest}")
         self.resolution, self.lowest, self.highest = resolution, lowest, highest
-        self.count = 0
-        self.total = 0.0
-        self._least, self._largest = inf, -inf
         self._scale = 1.0 / log(1.0 + resolution)
-        # Bin 0 ends at `lowest`; bin k > 0 ends at lowest (1 + resolution)^k; the last one ends nowhere.
-        self._shift = 1.0 - self._scale * log(lowest)
-        self._bins = [0] * (ceil(self._scale * log(highest / lowest)) + 2)
-
-    def record(self, seconds: float) -> None:
-        """Adds one duration.
-
-        Raises:
-            ValueError: it is NaN.
-        """
-        if seconds <= self.lowest:
-            index = 0
-        elif seconds >= self.highest:
-            index = -1
-        else:
-            index = int(log(seconds) * self._scale + self._shift)
-        self._bins[index] += 1
-        self.count += 1
-        self.total += seconds
-        if seconds > self._largest:
-            self._largest = seconds
-        if seconds < self._least:
-            self._least = seconds
+        super().__init__(lowest, highest, self._scale, ceil(self._scale * log(highest / lowest)) + 2)
 
     @property
     def mean(self) -> float:
         """In seconds; NaN if there is none."""
         return self.total / self.count if self.count else nan
-
-    @property
-    def least(self) -> float:
-        """In seconds; NaN if there is none."""
-        return self._least if self.count else nan
-
-    @property
-    def largest(self) -> float:
-        """In seconds; NaN if there is none."""
-        return self._largest if self.count else nan
 
     def percentile(self, percent: float) -> float:
         """In seconds; NaN if there is none. The duration that ``percent`` of all do not exceed."""
@@ -79,12 +46,13 @@ class Histogram:
         if self.count == 0:
             return nan
         if percent == 100.0:
-            return self._largest
+            return self.largest
         # The rounding guards 99.9 % of 1000, which is 999.0000000000001.
         rank = max(1, ceil(round(percent / 100.0 * self.count, 6)))
-        index = next(index for index, passed in enumerate(accumulate(self._bins)) if passed >= rank)
-        end = inf if index == len(self._bins) - 1 else self.lowest * exp(index / self._scale)
-        return min(end, self._largest)
+        bins = self.counts()
+        index = next(index for index, passed in enumerate(accumulate(bins)) if passed >= rank)
+        end = inf if index == len(bins) - 1 else self.lowest * exp(index / self._scale)
+        return min(end, self.largest)
 
     def merge(self, other: Histogram) -> None:
         """Adds all durations of ``other``.
@@ -97,11 +65,7 @@ class Histogram:
                 "histograms merge if their resolution, lowest and highest agree, but these are "
                 f"{self._shape()} and {other._shape()}"
             )
-        self._bins = [mine + its for mine, its in zip(self._bins, other._bins, strict=True)]
-        self.count += other.count
-        self.total += other.total
-        self._least = min(self._least, other._least)
-        self._largest = max(self._largest, other._largest)
+        self.add(other.counts(), other.total, other.least, other.largest)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, fit for JSON."""
@@ -110,9 +74,9 @@ class Histogram:
             "lowest": self.lowest,
             "highest": self.highest,
             "total": self.total,
-            "least": self._least if self.count else None,
-            "largest": self._largest if self.count else None,
-            "bins": {str(index): number for index, number in enumerate(self._bins) if number},
+            "least": self.least if self.count else None,
+            "largest": self.largest if self.count else None,
+            "bins": {str(index): number for index, number in enumerate(self.counts()) if number},
         }
 
     @classmethod
@@ -123,14 +87,13 @@ class Histogram:
             ValueError: it has a bin that such a histogram has not.
         """
         histogram = cls(resolution=data["resolution"], lowest=data["lowest"], highest=data["highest"])
+        bins = histogram.counts()
         for index, number in data["bins"].items():
-            if not (0 <= int(index) < len(histogram._bins) and number > 0):
-                raise ValueError(f"a histogram of {len(histogram._bins)} bins has no bin {index} with {number} entries")
-            histogram._bins[int(index)] = number
-        histogram.count = sum(data["bins"].values())
-        histogram.total = data["total"]
-        if histogram.count:
-            histogram._least, histogram._largest = data["least"], data["largest"]
+            if not (0 <= int(index) < len(bins) and number > 0):
+                raise ValueError(f"a histogram of {len(bins)} bins has no bin {index} with {number} entries")
+            bins[int(index)] = number
+        if any(bins):
+            histogram.add(bins, data["total"], data["least"], data["largest"])
         return histogram
 
     def _shape(self) -> tuple[float, float, float]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import Reception
+from vtbdrake.control.kernels import Freshness
 from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
@@ -62,7 +63,7 @@ class Delay:
         return took - self._least
 
 
-class Watchdog:
+class Watchdog(Freshness):
     """Watches one sensor signal: it has to be fresh, and what it says plausible.
 
     A signal that never arrived is stale, whatever its maximum age. A vector is plausible if it has the right size and
@@ -85,9 +86,7 @@ class Watchdog:
         if max_delay is not None and not max_delay > 0.0:
             raise ValueError(f"the sensor signal {signal.name} has a positive max_delay, not {max_delay} s")
         self.signal = signal
-        self._max_age = signal.max_age
-        self._count = 0
-        self._fault: Fault | None = None
+        super().__init__(signal.max_age)
         self._arrived = -inf
         self._value: np.ndarray | None = None
         self._delay = None if max_delay is None else Delay(max_delay)
@@ -102,25 +101,16 @@ class Watchdog:
                 raise ValueError(f"the sensor signal {signal.name} may jump: to tell a jump, it needs a finite rate")
             self._tolerance = signal.vector(jump_tolerance)
 
-    def check(self, now: float, reception: Reception) -> Fault | None:
-        """What is wrong with the signal now."""
-        if now - reception.arrived > self._max_age or not reception.count:
-            return self._stale(now, reception)
-        if reception.count != self._count:
-            self._count = reception.count
-            # Mostly there is nothing to do: the bridge has checked the sample by the same limits.
-            checked = self._range is reception.range and not self._compares
-            self._fault = None if checked else self._examine(now, reception)
-        return self._fault
-
-    def _stale(self, now: float, reception: Reception) -> Fault:
+    def stale(self, now: float, reception: Reception) -> Fault:
         name = self.signal.name
         if not reception.count:
             return Fault(now, name, "stale", f"sensor signal {name} has never arrived")
-        age = f"{1e3 * reception.age(now):.1f} ms old, {1e3 * self._max_age:g} allowed"
+        age = f"{1e3 * reception.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
         return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
 
-    def _examine(self, now: float, reception: Reception) -> Fault | None:
+    def examine(self, now: float, reception: Reception) -> Fault | None:
+        if self._range is reception.range and not self._compares:
+            return None  # Mostly so: the bridge has checked the sample by the same limits.
         fault = None
         # Mostly they are not only equal but the same, from the second time on.
         if self._range is not reception.range:

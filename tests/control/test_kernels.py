@@ -1,0 +1,239 @@
+"""The compiled parts of a cycle do what `struct`, numpy and the rules say, and nothing where Python has to look."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from vtbdrake.control.kernels import Bins, Box, Form, Freshness, Intake, Passage, Reception, finite
+
+EVERY = "dqfihb?"
+HEAD = b"\xf1\xf2\xf3\xf4\xf5\xf6\xf7\xf8"
+UTIME, NUMBERS = 8, 16  # offsets: of the time, and of what follows it
+
+NOT_VECTORS: list[Any] = [
+    None,
+    [1.0, 2.0],
+    (1.0, 2.0),
+    np.ones(3),
+    np.ones(1),
+    np.ones((2, 1)),
+    np.array(1.0),
+    np.ones(2, dtype=np.float32),
+    np.ones(2, dtype=int),
+    np.ones(2, dtype=">f8"),
+    np.ones(4)[::2],
+    np.ma.masked_array([1.0, 2.0], [True, False]),
+]
+
+
+def message(code: str, numbers: list[float], utime: int = 5) -> bytes:
+    return HEAD + struct.pack(f">q{len(numbers)}{code}", utime, *numbers)
+
+
+def intake(code: str, count: int, *, limit: float = math.inf, stamp: bool = True) -> tuple[Intake, list[Reception]]:
+    """Of two signals: the first has one entry, the second the others."""
+    receptions, example = [Reception(), Reception()], message(code, [0] * count)
+    sizes = [1, count - 1]
+    width = struct.calcsize(f">{code}")
+    return (
+        Intake(
+            example,
+            fixed=[(0, 8)],
+            places=[(0, 0, NUMBERS, 1, code), (1, 0, NUMBERS + width, count - 1, code)],
+            stamp=(UTIME, 1, "q") if stamp else None,
+            receptions=receptions,
+            sizes=sizes,
+            lower=[-limit] * count,
+            upper=[limit] * count,
+        ),
+        receptions,
+    )
+
+
+# -- what is a vector
+
+
+@pytest.mark.parametrize("value", NOT_VECTORS)
+def test_only_plain_arrays_of_doubles_are_looked_at(value: Any) -> None:
+    assert not finite(value, 2)
+    assert not Box([-9.0, -9.0], [9.0, 9.0]).contains(value)
+    assert not Passage([(9.0, 9.0, -9.0, 9.0)] * 2).advance(value, np.zeros(2), np.zeros(2))
+    form = Form(message("d", [0.0, 0.0]), places=[(0, 0, NUMBERS, 2, "d")], stamp=None, names=["a"], sizes=[2])
+    assert form.fill({"a": value}, 0) is None
+
+
+def test_arrays_that_cannot_be_written_can_be_looked_at() -> None:
+    value = np.ones(2)
+    value.flags.writeable = False
+    assert finite(value, 2) and Box([0.0, 0.0], [1.0, 1.0]).contains(value)
+
+
+@given(st.lists(st.floats(), min_size=3, max_size=3))
+def test_a_vector_is_finite_as_numpy_says(entries: list[float]) -> None:
+    assert finite(np.array(entries), 3) == np.isfinite(entries).all()
+
+
+@given(*[st.lists(st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf]), min_size=3, max_size=3)] * 3)
+def test_a_box_contains_what_numpy_says(lower: list[float], entries: list[float], upper: list[float]) -> None:
+    inside = np.all((np.array(lower) <= entries) & (np.array(entries) <= upper))
+    assert Box(lower, upper).contains(np.array(entries)) == inside
+
+
+def test_what_passes_leaves_its_step_and_what_does_not_leaves_nothing() -> None:
+    passage = Passage([(0.5, 0.3, -1.0, 1.0)] * 2)
+    sent, step = np.array([0.1, 0.2]), np.array([0.05, 0.0])
+    assert passage.advance(np.array([0.3, 0.1]), sent, step)
+    np.testing.assert_array_equal(sent, [0.3, 0.1])
+    np.testing.assert_allclose(step, [0.2, -0.1], atol=1e-15)
+    assert not passage.advance(np.array([0.4, 0.9]), sent, step)
+    np.testing.assert_array_equal(sent, [0.3, 0.1])
+
+
+# -- messages
+
+
+@pytest.mark.parametrize("code", EVERY)
+@settings(max_examples=50)
+@given(data=st.data())
+def test_numbers_are_taken_in_as_struct_reads_them(code: str, data: st.DataObject) -> None:
+    raw = data.draw(st.binary(min_size=3 * struct.calcsize(f">{code}"), max_size=3 * struct.calcsize(f">{code}")))
+    expected = np.array(struct.unpack(f">3{code}", raw), dtype=float)
+    take, (first, others) = intake(code, 3)
+    sent = take.take(HEAD + struct.pack(">q", 1_500_000) + raw, 1.0, 7.0)
+    if not (np.abs(expected) <= np.inf).all():  # a NaN
+        assert sent is None and first.count == 0
+        return
+    assert sent == first.sent == others.sent == 1_500_000 * 1e-6
+    assert first.arrived == 7.0 and (first.count, others.count) == (1, 1)
+    np.testing.assert_array_equal(np.concatenate([first.value, others.value]), expected)
+
+
+@pytest.mark.parametrize(
+    ("data", "last"),
+    [
+        (message("d", [1.0, 2.0, 3.0])[:-1], 0.0),
+        (message("d", [1.0, 2.0, 3.0, 4.0]), 0.0),
+        (b"\0" + message("d", [1.0, 2.0, 3.0])[1:], 0.0),
+        (message("d", [1.0, 2.0, 9.0]), 0.0),
+        (message("d", [1.0, math.nan, 3.0]), 0.0),
+        (message("d", [1.0, 2.0, 3.0]), 5e-6),
+        (b"", 0.0),
+    ],
+    ids=["short", "long", "fingerprint", "limits", "NaN", "not newer", "empty"],
+)
+def test_of_other_messages_nothing_is_taken_in(data: bytes, last: float) -> None:
+    take, receptions = intake("d", 3, limit=8.0)
+    assert take.take(data, last, 1.0) is None
+    assert [(reception.count, reception.value) for reception in receptions] == [(0, None)] * 2
+
+
+def test_values_of_earlier_messages_stay_as_they_are() -> None:
+    take, (_, others) = intake("d", 3)
+    take.take(message("d", [1.0, 2.0, 3.0], 1), 0.0, 1.0)
+    before = others.value
+    take.take(message("d", [4.0, 5.0, 6.0], 2), 0.0, 1.0)
+    np.testing.assert_array_equal(before, [2.0, 3.0])
+    np.testing.assert_array_equal(others.value, [5.0, 6.0])
+
+
+def test_without_a_time_all_messages_are_new() -> None:
+    take, (first, _) = intake("d", 3, stamp=False)
+    assert math.isnan(take.take(message("d", [1.0, 2.0, 3.0]), math.inf, 1.0) or 0.0)
+    assert math.isnan(first.sent) and first.count == 1
+
+
+def test_places_outside_of_the_message_are_refused() -> None:
+    with pytest.raises(ValueError, match="not in a message of 24 bytes"):
+        Form(message("d", [0.0]), places=[(0, 0, NUMBERS + 1, 1, "d")], stamp=None, names=["a"], sizes=[1])
+    with pytest.raises(ValueError, match="a has no entries 0 to 1"):
+        Form(message("d", [0.0, 0.0]), places=[(0, 0, NUMBERS, 2, "d")], stamp=None, names=["a"], sizes=[1])
+    with pytest.raises(ValueError, match="other numbers than the signals"):
+        Intake(
+            message("d", [0.0]),
+            fixed=[],
+            places=[(0, 0, NUMBERS, 1, "d")],
+            stamp=None,
+            receptions=[Reception()],
+            sizes=[2],
+            lower=[0.0, 0.0],
+            upper=[0.0, 0.0],
+        )
+
+
+@pytest.mark.parametrize("code", EVERY)
+@settings(max_examples=100)
+@given(entries=st.lists(st.floats(-1e40, 1e40) | st.floats(-200.0, 200.0) | st.floats(), min_size=2, max_size=2))
+def test_a_form_is_filled_in_as_struct_writes(code: str, entries: list[float]) -> None:
+    form = Form(
+        message(code, [0, 0]),
+        places=[(0, 1, NUMBERS, 1, code), (0, 0, NUMBERS + struct.calcsize(f">{code}"), 1, code)],
+        stamp=(UTIME, 1, "q"),
+        names=["a"],
+        sizes=[2],
+    )
+    utime = 2**60 + 1
+    written = form.fill({"a": np.array(entries)}, utime)
+    try:
+        numbers = entries[::-1] if code in "df" else [round(entry) for entry in entries[::-1]]
+        expected = message(code, numbers, utime)
+    except (struct.error, OverflowError, ValueError):
+        assert written is None
+        return
+    if written is None:  # what is not finite, or close to the ends of an integer, is left to the slow way
+        assert not all(abs(entry) < 9.1e18 for entry in entries)
+    else:
+        assert written == expected
+
+
+@pytest.mark.parametrize("values", [{}, {"b": np.ones(1)}, {"a": np.ones(1), "b": np.ones(1)}])
+def test_a_form_is_for_its_own_vectors(values: dict[str, np.ndarray]) -> None:
+    form = Form(message("d", [0.0]), places=[(0, 0, NUMBERS, 1, "d")], stamp=None, names=["a"], sizes=[1])
+    assert form.fill(values, 0) is None
+
+
+# -- ages and histograms
+
+
+class Examined(Freshness):
+    """Finds fault with values below 0."""
+
+    def __init__(self) -> None:
+        super().__init__(0.5)
+        self.times: list[float] = []
+
+    def stale(self, now: float, reception: Reception) -> Any:
+        return "stale"
+
+    def examine(self, now: float, reception: Reception) -> Any:
+        self.times.append(now)
+        return "negative" if reception.value < 0.0 else None
+
+
+def test_a_value_is_examined_once_and_its_age_in_every_cycle() -> None:
+    watch, reception = Examined(), Reception()
+    assert watch.check(0.0, reception) == "stale"
+    reception.accept(-1.0, 1.0, math.nan)
+    assert [watch.check(now, reception) for now in (1.0, 1.25, 1.5, 1.75)] == ["negative"] * 3 + ["stale"]
+    reception.accept(1.0, 2.0, math.nan)
+    assert [watch.check(now, reception) for now in (2.0, 2.25)] == [None, None]
+    assert watch.times == [1.0, 2.0]
+
+
+@given(st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=30))
+def test_durations_fall_into_their_bins(durations: list[float]) -> None:
+    scale, number = 5.0, 20
+    ends = [1e-3 * math.exp(k / scale) for k in range(number - 1)]
+    assume(not np.isclose(np.divide.outer(durations, ends), 1.0, rtol=1e-12).any())  # There, rounding decides.
+    bins = Bins(ends[0], ends[-1], scale, number)
+    for duration in durations:
+        bins.record(duration)
+    expected = np.bincount(np.searchsorted(ends, durations), minlength=number)
+    assert bins.counts() == expected.tolist()
+    assert (bins.count, bins.least, bins.largest) == (len(durations), min(durations), max(durations))
