@@ -7,24 +7,20 @@ import socket
 import struct
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from urllib.parse import urlsplit
 
 import lcm
 
+from vtbdrake.control.hub.reader import Reader, publication
 from vtbdrake.control.hub.shortcut import take_shortcut
 from vtbdrake.control.hub.tcpq import (
     MAGIC_CLIENT,
     MAGIC_SERVER,
-    PUBLISH,
     SUBSCRIBE,
     VERSION,
     ProtocolError,
-    Reader,
-    Record,
     address_name,
-    publication,
 )
 
 Handler = Callable[[str, bytes], None]
@@ -34,7 +30,6 @@ _DEFAULT_PORT = 7700
 _LONGEST_MESSAGE = 1 << 28  # LCM_MAX_MESSAGE_SIZE
 _RECEIVE = 1 << 16
 _WORDS = struct.Struct(">II")
-_HEAD = 12  # bytes of a publication beside its channel and its data
 _SO_TIMESTAMPNS = 35  # <asm-generic/socket.h>; the type of the control message, too
 _TIMESPEC = struct.Struct("@ll")
 
@@ -131,9 +126,8 @@ class TcpqConnection(Connection):
 
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
         self._handlers = {channel.encode(): (channel, handler) for channel, handler in handlers.items()}
-        self._reader = Reader(max_message=_LONGEST_MESSAGE)
-        self._reader.greeted = True  # the hub's greeting is read below; what follows has the form of a client's records
-        self._records: deque[Record] = deque()
+        # The hub's greeting is read below; what follows has the form of a client's records.
+        self._reader = Reader(max_message=_LONGEST_MESSAGE, greeted=True)
         self._unsent = b""
         self._socket = _open(tcpq_address(url), timeout, stamped=stamped)
         try:
@@ -148,7 +142,7 @@ class TcpqConnection(Connection):
         except OSError:
             self._socket.close()
             raise
-        self._receive = self._receive_stamped if stamped else self._socket.recv
+        self._stamped = stamped
 
     def _greet(self) -> None:
         self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
@@ -168,41 +162,41 @@ class TcpqConnection(Connection):
         if self.pending:
             with contextlib.suppress(BlockingIOError):
                 self._send(self._unsent)
-        count = self._dispatch(limit) if self._records else 0
-        chunk_size = _RECEIVE
-        while count < limit and chunk_size == _RECEIVE:  # a smaller chunk was all that there was
-            try:
-                chunk = self._receive(_RECEIVE)
-            except BlockingIOError:
-                break
-            chunk_size = len(chunk)
-            if not chunk:
+        count = self._dispatch(limit) if self._reader.partial else 0
+        size = _RECEIVE
+        while count < limit and size == _RECEIVE:  # a smaller piece was all that there was
+            size = self._receive_stamped() if self._stamped else self._reader.receive(self._socket.fileno(), _RECEIVE)
+            if size <= 0:
+                if size < 0:
+                    break
                 raise ConnectionResetError("the hub closed the connection")
-            try:
-                self._records.extend(self._reader.feed(chunk))
-            except ProtocolError as error:
-                raise ConnectionError(f"the hub {error}") from None
             count += self._dispatch(limit - count)
         return count
 
-    def _receive_stamped(self, size: int) -> bytes:
-        """Bytes that have arrived; `arrived` is then the time of the last of them."""
-        chunk, ancillary, _, _ = self._socket.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size))
+    def _receive_stamped(self) -> int:
+        """As `Reader.receive`; `arrived` is then the time of the last byte that came."""
+        try:
+            chunk, ancillary, _, _ = self._socket.recvmsg(_RECEIVE, socket.CMSG_SPACE(_TIMESPEC.size))
+        except BlockingIOError:
+            return -1
         stamps = [data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS)]
         if stamps:
             seconds, nanoseconds = _TIMESPEC.unpack(stamps[0])
             age = time.time() - (seconds + 1e-9 * nanoseconds)
             self.arrived = time.monotonic() - age
-        return chunk
+        self._reader.append(chunk)
+        return len(chunk)
 
     def _dispatch(self, limit: int) -> int:
-        records, handlers = self._records, self._handlers
-        count = min(limit, len(records))
-        for _ in range(count):
-            kind, name, record = records.popleft()
-            if kind == PUBLISH and name in handlers:
-                channel, handler = handlers[name]
-                handler(channel, bytes(record[_HEAD + len(name) :]))
+        publication, handlers, count = self._reader.publication, self._handlers, 0
+        try:
+            while count < limit and (come := publication()) is not None:
+                count += 1
+                if come[0] in handlers:
+                    channel, handler = handlers[come[0]]
+                    handler(channel, come[1])
+        except ProtocolError as error:
+            raise ConnectionError(f"the hub {error}") from None
         return count
 
     def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
@@ -210,7 +204,8 @@ class TcpqConnection(Connection):
             self._send(self._unsent)
             if self.pending:
                 raise BlockingIOError("an earlier message is still on its way")
-        self._send(b"".join([publication(channel.encode(), data) for channel, data in messages]))
+        records = [publication(channel.encode(), data) for channel, data in messages]
+        self._send(records[0] if len(records) == 1 else b"".join(records))
 
     def _send(self, records: bytes) -> None:
         self._unsent = records[self._socket.send(records) :]

@@ -7,7 +7,8 @@ from collections import deque
 from collections.abc import Callable
 
 from vtbdrake.control.hub.patterns import matcher
-from vtbdrake.control.hub.tcpq import ProtocolError, Reader, address_name
+from vtbdrake.control.hub.reader import Reader
+from vtbdrake.control.hub.tcpq import ProtocolError, address_name
 
 # A slice of a large message: while it is copied to the kernel, or from there, all others wait (some 50 us).
 SLICE = 256 * 1024

@@ -9,6 +9,7 @@ from vtbdrake.control.hub import tcpq
 from vtbdrake.control.hub.config import HubConfig
 from vtbdrake.control.hub.connection import Connection, text
 from vtbdrake.control.hub.protection import ProtectedChannel
+from vtbdrake.control.hub.reader import publication
 from vtbdrake.control.hub.statistics import Statistics
 
 _log = logging.getLogger(__name__)
@@ -166,7 +167,7 @@ class Relay:
         channel = tcpq.STATUS_CHANNEL.encode()
         route = self._routes.get(channel) or self._find_route(channel)
         if route.subscribers:
-            self._distribute(route, tcpq.publication(channel, self.statistics(now).to_json()))
+            self._distribute(route, publication(channel, self.statistics(now).to_json()))
             self.deliver(now)
 
     def statistics(self, now: float) -> Statistics:

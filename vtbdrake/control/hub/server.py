@@ -103,7 +103,6 @@ class HubServer:
 
         self._clients: dict[int, Connection] = {}
         self._relay = Relay(config)
-        self._scratch = memoryview(bytearray(SLICE))
         self._running = True
         self._now = time.monotonic()
         # A quarter: how much of a time may pass unnoticed.
@@ -227,11 +226,13 @@ class HubServer:
 
     def _read(self, client: Connection) -> None:
         for _ in range(_READS):
-            size = client.socket.recv_into(self._scratch)
+            size = client.reader.receive(client.fileno, SLICE)
+            if size < 0:
+                return
             if size == 0:
                 self._disconnect(client, "closed", "closed its connection")
                 return
-            for record in client.reader.feed(self._scratch[:size]):
+            while (record := client.reader.record()) is not None:
                 self._relay.handle(client, record, self._now)
             client.acknowledge()
             # The rest of a message is there as soon as its beginning is acknowledged; but large messages come in turns.

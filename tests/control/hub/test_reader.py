@@ -1,0 +1,131 @@
+"""The stream of a client is cut into records, in whatever pieces it comes."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import tracemalloc
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vtbdrake.control.hub.reader import Reader, publication
+from vtbdrake.control.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
+
+GREETING = struct.pack(">II", 0x287617FB, 0x0100)
+LARGEST = 1000
+
+CHANNELS = st.binary(min_size=1, max_size=255)
+PUBLICATIONS = st.builds(
+    lambda channel, data: (PUBLISH, channel, published(channel, data)), CHANNELS, st.binary(max_size=LARGEST)
+)
+SUBSCRIPTIONS = st.builds(
+    lambda kind, pattern: (kind, pattern, struct.pack(">II", kind, len(pattern)) + pattern),
+    st.sampled_from([SUBSCRIBE, UNSUBSCRIBE]),
+    CHANNELS,
+)
+RECORDS = st.lists(PUBLICATIONS | SUBSCRIPTIONS, max_size=8)
+
+
+def published(channel: bytes, data: bytes) -> bytes:
+    return struct.pack(">II", PUBLISH, len(channel)) + channel + struct.pack(">I", len(data)) + data
+
+
+def cut(reader: Reader) -> Iterator[Record]:
+    while (record := reader.record()) is not None:
+        yield record
+
+
+def in_pieces(stream: bytes, ends: list[int]) -> Iterator[bytes]:
+    begin = 0
+    for end in [*sorted(end % (len(stream) + 1) for end in ends), len(stream)]:
+        yield stream[begin:end]
+        begin = end
+
+
+@given(RECORDS, st.lists(st.integers(0, 10_000), max_size=20))
+def test_records_are_the_same_in_whatever_pieces_they_come(records: list[Record], ends: list[int]) -> None:
+    reader, found = Reader(max_message=LARGEST), []
+    for piece in in_pieces(GREETING + b"".join(record for *_, record in records), ends):
+        reader.append(piece)
+        found += cut(reader)
+    assert found == [(GREET, b"", GREETING), *records]
+    assert reader.greeted and not reader.partial
+
+
+@given(RECORDS, st.lists(st.integers(0, 10_000), max_size=20))
+def test_publications_are_channel_and_data_of_those_records(records: list[Record], ends: list[int]) -> None:
+    reader, found = Reader(max_message=LARGEST, greeted=True), []
+    for piece in in_pieces(b"".join(record for *_, record in records), ends):
+        reader.append(piece)
+        while (come := reader.publication()) is not None:
+            found.append(come)
+    assert [published(*come) for come in found] == [record for kind, _, record in records if kind == PUBLISH]
+
+
+@given(CHANNELS, st.binary())
+def test_a_publication_is_written_as_liblcm_does(channel: bytes, data: bytes) -> None:
+    assert publication(channel, data) == published(channel, data)
+
+
+@pytest.mark.parametrize(
+    ("bytes_", "reason"),
+    [
+        (struct.pack(">II", 4, 1), "malformed"),
+        (struct.pack(">II", 0, 1), "malformed"),
+        (struct.pack(">II", PUBLISH, 0), "malformed"),
+        (struct.pack(">II", SUBSCRIBE, 256), "malformed"),
+        (struct.pack(">II", SUBSCRIBE, 2**32 - 1), "malformed"),
+        (struct.pack(">II", PUBLISH, 1) + b"A" + struct.pack(">I", LARGEST + 1), "too large"),
+        (struct.pack(">II", PUBLISH, 1) + b"A" + struct.pack(">I", 2**32 - 1), "too large"),
+    ],
+)
+def test_what_is_no_record_is_told_after_the_records_before_it(bytes_: bytes, reason: str) -> None:
+    reader = Reader(max_message=LARGEST, greeted=True)
+    reader.append(published(b"A", b"1") + bytes_)
+    assert reader.record() == (PUBLISH, b"A", published(b"A", b"1"))
+    for _ in range(2):
+        with pytest.raises(ProtocolError) as caught:
+            reader.record()
+        assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("greeting", [struct.pack(">II", 0x287617FA, 0x0100), struct.pack(">II", 0x287617FB, 0x0200)])
+def test_who_greets_in_another_way_is_no_client(greeting: bytes) -> None:
+    reader = Reader(max_message=LARGEST)
+    reader.append(greeting)
+    with pytest.raises(ProtocolError, match="greeting|begins with|speaks version"):
+        reader.record()
+
+
+def test_memory_is_that_of_what_has_come_and_given_back() -> None:
+    announced, come = 1 << 30, 1 << 20
+    tracemalloc.start()
+    reader = Reader(max_message=1 << 31, greeted=True)
+    reader.append(published(b"A", b"")[:-4] + struct.pack(">I", announced))
+    for _ in range(16):
+        reader.append(bytes(come // 16))
+        assert reader.record() is None
+    assert tracemalloc.get_traced_memory()[0] < 4 * come
+    reader = Reader(max_message=1 << 31, greeted=True)
+    reader.append(published(b"A", bytes(come)))
+    assert reader.record() is not None
+    reader.append(published(b"A", b"1"))
+    assert tracemalloc.get_traced_memory()[0] < come // 4
+    tracemalloc.stop()
+
+
+def test_a_socket_is_read_without_waiting_until_it_is_closed() -> None:
+    near, far = socket.socketpair()
+    reader = Reader(max_message=LARGEST, greeted=True)
+    with near, far:
+        assert reader.receive(near.fileno(), 100) == -1
+        far.sendall(published(b"A", bytes(200)))
+        assert [reader.receive(near.fileno(), 100) for _ in range(4)] == [100, 100, 13, -1]
+        assert reader.publication() == (b"A", bytes(200))
+        far.close()
+        assert reader.receive(near.fileno(), 100) == 0
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        reader.receive(near.fileno(), 100)
