@@ -64,7 +64,7 @@ def intake(code: str, count: int, *, limit: float = math.inf, stamp: bool = True
 def test_only_plain_arrays_of_doubles_are_looked_at(value: Any) -> None:
     assert not finite(value, 2)
     assert not Box([-9.0, -9.0], [9.0, 9.0]).contains(value)
-    assert not Passage([(9.0, 9.0, -9.0, 9.0)] * 2).advance(value, np.zeros(2), np.zeros(2))
+    assert Passage([(9.0, 9.0, -9.0, 9.0)] * 2).advance(value, np.zeros(2), np.zeros(2)) is None
     form = Form(message("d", [0.0, 0.0]), places=[(0, 0, NUMBERS, 2, "d")], stamp=None, names=["a"], sizes=[2])
     assert form.fill({"a": value}, 0) is None
 
@@ -89,10 +89,12 @@ def test_a_box_contains_what_numpy_says(lower: list[float], entries: list[float]
 def test_what_passes_leaves_its_step_and_what_does_not_leaves_nothing() -> None:
     passage = Passage([(0.5, 0.3, -1.0, 1.0)] * 2)
     sent, step = np.array([0.1, 0.2]), np.array([0.05, 0.0])
-    assert passage.advance(np.array([0.3, 0.1]), sent, step)
-    np.testing.assert_array_equal(sent, [0.3, 0.1])
+    command = np.array([0.3, 0.1])
+    passed = passage.advance(command, sent, step)
+    assert passed is not command
+    np.testing.assert_array_equal([passed, sent], [command, command])
     np.testing.assert_allclose(step, [0.2, -0.1], atol=1e-15)
-    assert not passage.advance(np.array([0.4, 0.9]), sent, step)
+    assert passage.advance(np.array([0.4, 0.9]), sent, step) is None
     np.testing.assert_array_equal(sent, [0.3, 0.1])
 
 
@@ -192,10 +194,12 @@ def test_a_form_is_filled_in_as_struct_writes(code: str, entries: list[float]) -
         assert written == expected
 
 
-@pytest.mark.parametrize("values", [{}, {"b": np.ones(1)}, {"a": np.ones(1), "b": np.ones(1)}])
-def test_a_form_is_for_its_own_vectors(values: dict[str, np.ndarray]) -> None:
-    form = Form(message("d", [0.0]), places=[(0, 0, NUMBERS, 1, "d")], stamp=None, names=["a"], sizes=[1])
+@pytest.mark.parametrize("values", [{}, {"b": np.ones(1)}, {"a": np.full(1, 1.5)}, {"a": np.full(1, math.nan)}])
+def test_a_form_takes_all_its_vectors_within_their_limits(values: dict[str, np.ndarray]) -> None:
+    example, places, box = message("d", [0.0]), [(0, 0, NUMBERS, 1, "d")], Box([-1.0], [1.0])
+    form = Form(example, places=places, stamp=None, names=["a"], sizes=[1], boxes=[box])
     assert form.fill(values, 0) is None
+    assert form.fill({**values, "a": np.ones(1)}, 0) == message("d", [1.0])
 
 
 # -- ages and histograms

@@ -141,7 +141,7 @@ def test_command_that_must_not_leave_is_withheld_with_its_whole_message(hub: Hub
 def test_signal_that_is_not_there_cannot_be_published() -> None:
     with closing(bridge("memq://")) as arm:
         arm.open()
-        with pytest.raises(ValueError, match="no actuator signals: jaw; there are position, torque"):
+        with pytest.raises(ValueError, match="there is no actuator signal jaw; there are position, torque"):
             arm.publish({"jaw": [0.0]})
 
 

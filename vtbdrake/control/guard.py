@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.fallback import Fallback, chain, default_fallback
+from vtbdrake.control.kernels import found
 from vtbdrake.control.limits import NOT_STARTED, AbstractGuard, CommandFault, CommandGuard
 from vtbdrake.control.watchdog import Fault, Watchdog
 from vtbdrake.testbed import Interface, Signal
@@ -100,7 +101,7 @@ class Guards:
         self._causes: tuple[Fault, ...] = ()  # Those of them that are not about sensor signals.
         self._begun: set[Fallback] = set()
         self._failed: set[Fallback] = set()
-        self._active: frozenset[str] = frozenset()
+        self._active: tuple[str, ...] = ()
         self._last: float | None = None
 
     @property
@@ -111,7 +112,7 @@ class Guards:
     @property
     def driven(self) -> frozenset[str]:
         """The actuator signals that were on real in the last cycle."""
-        return self._active
+        return frozenset(self._active)
 
     def needs_start(self, name: str) -> bool:
         """Whether an actuator signal has a limit of its rate or acceleration, which counts from somewhere."""
@@ -156,27 +157,28 @@ class Guards:
             not_ready: why the machine is not ready, if it is not.
         """
         driven = self._activate(active if active is not None else self._active if error else commands)
-        faults = self._whole(now, error, missed, not_ready)
-        wanted = {}
+        causes = self._whole(now, error, missed, not_ready)
+        wanted = []
         if error is None:
             for name in driven:
+                guard: Any = self.commands[name]
                 try:
-                    wanted[name] = self._checked(name, commands)
+                    if name not in commands:
+                        raise CommandFault("missing", "is missing")
+                    if guard.needs_start and not guard.has_start:
+                        raise CommandFault("not started", NOT_STARTED)
+                    wanted.append((name, guard, guard.checked(commands[name])))
                 except CommandFault as problem:
-                    faults.append(Fault(now, name, problem.kind, f"the command {name} {problem}"))
-        causes = len(faults)
-        watchdogs = self.watchdogs
-        for name, reception in receptions.items():
-            if fault := watchdogs[name].check(now, reception):
-                faults.append(fault)
-        if faults or self._faults:
-            self._note(faults, causes)
-            if faults and driven and not self._latched:
+                    causes.append(Fault(now, name, problem.kind, f"the command {name} {problem}"))
+        doubts = found(now, self.watchdogs, receptions)
+        if causes or doubts or self._faults:
+            self._note(causes, doubts)
+            if self._faults and driven and not self._latched:
                 self._latch(self._faults)
         if self._latched:
             return Verdict(self._fall_back(now, receptions), False, self._faults)
         self._last = now
-        return Verdict({name: self.commands[name].send(values) for name, values in wanted.items()}, True, self._faults)
+        return Verdict({name: guard.send(values) for name, guard, values in wanted}, True, self._faults)
 
     def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
@@ -193,20 +195,19 @@ class Guards:
         Returns:
             Why it stays; empty if it was released.
         """
-        doubts = (self.watchdogs[name].check(now, reception) for name, reception in receptions.items())
-        reasons = tuple(fault.reason for fault in (*self._causes, *doubts) if fault)
+        reasons = tuple(fault.reason for fault in (*self._causes, *found(now, self.watchdogs, receptions)))
         if not reasons:
             self._latched = ()
         return reasons
 
-    def _activate(self, names: Iterable[str]) -> frozenset[str]:
+    def _activate(self, names: Iterable[str]) -> tuple[str, ...]:
         """Takes note of what is on real; a signal that no longer is has to start anew."""
-        active = frozenset(names)
-        if active != self._active:
-            for name in self._active - active:
+        names = tuple(dict.fromkeys(names))
+        if names != self._active:
+            for name in set(self._active) - set(names):
                 self.commands[name].release()
-            self._active = active
-        return active
+            self._active = names
+        return names
 
     def _whole(self, now: float, error: BaseException | None, missed: int, not_ready: str | None) -> list[Fault]:
         """The faults that are not about one signal."""
@@ -220,19 +221,11 @@ class Guards:
             faults.append(Fault(now, None, "not ready", f"the machine is not ready: {not_ready}"))
         return faults
 
-    def _checked(self, name: str, commands: Mapping[str, Any]) -> Any:
-        guard = self.commands[name]
-        if name not in commands:
-            raise CommandFault("missing", "is missing")
-        if guard.needs_start and not guard.has_start:
-            raise CommandFault("not started", NOT_STARTED)
-        return guard.checked(commands[name])
-
-    def _note(self, faults: list[Fault], causes: int) -> None:
+    def _note(self, causes: list[Fault], doubts: list[Fault]) -> None:
         """Logs the faults that the cycle before did not have."""
         known = {(fault.signal, fault.kind) for fault in self._faults}
-        self.log.extend(fault for fault in faults if (fault.signal, fault.kind) not in known)
-        self._faults, self._causes = tuple(faults), tuple(faults[:causes])
+        self._faults, self._causes = (*causes, *doubts), tuple(causes)
+        self.log.extend(fault for fault in self._faults if (fault.signal, fault.kind) not in known)
 
     def _latch(self, faults: tuple[Fault, ...]) -> None:
         self._latched = faults

@@ -113,8 +113,11 @@ cdef class Passage:
         PyMem_Free(self.limits)
 
     def advance(self, command, sent, step):
-        """Whether ``command`` passes as it is. If so, it is in ``sent`` afterwards, and the step that led there in
-        ``step``; before, they are those of the cycle before. All are arrays of doubles of this size."""
+        """A copy of ``command`` if it passes as it is, else None.
+
+        If so, it is in ``sent`` afterwards, and the step that led there in ``step``; before, they are those of the cycle
+        before. All are arrays of doubles of this size.
+        """
         cdef double* c = _entries(command, self.size)
         cdef double* s = _entries(sent, self.size)
         cdef double* x = _entries(step, self.size)
@@ -122,22 +125,22 @@ cdef class Passage:
         cdef double w, reach, way
         cdef Py_ssize_t i
         if c is NULL or s is NULL or x is NULL:
-            return False
+            return None
         for i in range(self.size):
             w = c[i] - s[i]
             if not (fabs(w) <= limit[0] and limit[2] <= c[i] <= limit[3]):
-                return False
+                return None
             if limit[1] < INFINITY:
                 # A parabola half a change ahead lies above f: what it lets pass may pass, and most does.
                 reach = fabs(w) + 0.5 * limit[1]
                 way = limit[3] - s[i] if w > 0.0 else s[i] - limit[2]
                 if not (fabs(w - x[i]) <= limit[1] and reach * reach <= 2.0 * limit[1] * way):
-                    return False
+                    return None
             limit += 4
         for i in range(self.size):
             x[i] = c[i] - s[i]
             s[i] = c[i]
-        return True
+        return cnp.PyArray_NewCopy(<cnp.ndarray>command, cnp.NPY_CORDER)
 
 
 # -- sensor signals
@@ -207,7 +210,7 @@ cdef class Freshness:
     def __init__(self, double max_age):
         self.max_age = max_age
 
-    def check(self, double now, Reception reception):
+    cpdef check(self, double now, Reception reception):
         """What is wrong with the signal at the time ``now``, in seconds; None if nothing is."""
         if now - reception.arrived > self.max_age or not reception.count:
             return self.stale(now, reception)
@@ -215,6 +218,16 @@ cdef class Freshness:
             self.count = reception.count
             self.fault = self.examine(now, reception)
         return self.fault
+
+
+def found(double now, dict watches, receptions):
+    """What `Freshness.check` finds at the time ``now``, with those of ``watches`` whose receptions are given, by name."""
+    faults = []
+    for name, reception in receptions.items():
+        fault = (<Freshness?>watches[name]).check(now, reception)
+        if fault is not None:
+            faults.append(fault)
+    return faults
 
 
 # -- messages of numbers
@@ -432,6 +445,7 @@ cdef class Form:
         places, stamp: as of `Intake`.
         names: of the vectors.
         sizes: theirs.
+        boxes: of those that have limits; by default of none.
     """
 
     cdef bytes example
@@ -439,13 +453,15 @@ cdef class Form:
     cdef Py_ssize_t run_count
     cdef Run* stamp
     cdef list names
+    cdef list boxes
     cdef Py_ssize_t* sizes
     cdef double** vectors
 
-    def __cinit__(self, bytes example, *, places, stamp, names, sizes):
+    def __cinit__(self, bytes example, *, places, stamp, names, sizes, boxes=None):
         cdef Py_ssize_t i
         self.example = example
         self.names = list(names)
+        self.boxes = [None] * len(self.names) if boxes is None else list(boxes)
         self.runs = _runs(places, len(example))
         self.run_count = len(places)
         self.stamp = _runs([(0, 0, *stamp)], len(example)) if stamp is not None else NULL
@@ -466,19 +482,21 @@ cdef class Form:
     def fill(self, values, int64_t utime):
         """The message with these vectors, by name, and this time in microseconds.
 
-        Integers are rounded, half to even. None if ``values`` has other names, something else than arrays of doubles of
-        the right sizes, or a number that does not fit its field.
+        Integers are rounded, half to even. None if one of ``values`` is missing, something else than an array of doubles
+        of the right size, or not within its limits, or if a number does not fit its field.
         """
+        cdef Box box
         cdef double* entries
         cdef char* message
         cdef char* at
         cdef Run* run
         cdef Py_ssize_t i, k
-        if len(values) != len(self.names):
-            return None
         for i in range(len(self.names)):
             entries = _entries(values.get(self.names[i]), self.sizes[i])
             if entries is NULL:
+                return None
+            box = self.boxes[i]
+            if box is not None and not (box.size == self.sizes[i] and box.holds(entries)):
                 return None
             self.vectors[i] = entries
         data = PyBytes_FromStringAndSize(PyBytes_AS_STRING(self.example), PyBytes_GET_SIZE(self.example))

@@ -155,20 +155,16 @@ class LcmBridge(Bridge):
         Raises:
             ValueError: there is no such actuator signal.
         """
-        if not commands.keys() <= self.sent.keys():
-            raise ValueError(
-                f"no actuator signals: {', '.join(sorted(commands.keys() - self.sent.keys()))}; there are "
-                f"{', '.join(self.sent)}"
-            )
-        self._utime = max(self._utime + 1, round((self._time_of_day + time.monotonic()) * 1e6))
-        leaving = [
-            (outlet, data) for outlet in self._outlets if (data := outlet.message(commands, self._utime)) is not None
-        ]
+        for name in commands:
+            if name not in self.sent:
+                raise ValueError(f"there is no actuator signal {name}; there are {', '.join(self.sent)}")
+        self._utime = utime = max(self._utime + 1, int((self._time_of_day + time.monotonic()) * 1e6))
+        leaving = [(outlet, data) for outlet in self._outlets if (data := outlet.message(commands, utime)) is not None]
         if not leaving:
             return
-        for outlet, data in leaving:
-            if (watch := self._watches.get(outlet.channel)) is not None:
-                watch.expect(data)
+        if self._watches:
+            for outlet, data in leaving:
+                self._watches[outlet.channel].expect(data)
         left = self._link.publish(*[(outlet.channel, data) for outlet, data in leaving])
         for outlet, data in leaving:
             # What is refused has left all the same: the hub lets it pass as soon as the channel is free.

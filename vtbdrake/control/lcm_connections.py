@@ -208,8 +208,9 @@ class TcpqConnection(Connection):
         self._send(records[0] if len(records) == 1 else b"".join(records))
 
     def _send(self, records: bytes) -> None:
-        self._unsent = records[self._socket.send(records) :]
-        self.pending = bool(self._unsent)
+        sent = self._socket.send(records)
+        self.pending = sent < len(records)
+        self._unsent = records[sent:] if self.pending else b""
 
     def close(self) -> None:
         self._socket.close()

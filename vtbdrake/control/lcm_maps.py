@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from math import nan
 from typing import Any, NamedTuple
 
-from vtbdrake.control.kernels import Intake, Reception
+from vtbdrake.control.kernels import Form, Intake, Reception
 from vtbdrake.control.lcm_wire import decode
+from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
 LONGEST_CHANNEL_NAME = 63
@@ -97,6 +98,15 @@ class LcmMap:
             signals: those of this map, in its order.
             receptions: theirs.
             example: a message that `reader` could read.
+        """
+        return None
+
+    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> Form | None:
+        """What writes messages with all of ``signals``, quickly; None if there is no such way.
+
+        Args:
+            signals: some of this map, in its order.
+            ranges: theirs, if what is not within them is not to be written.
         """
         return None
 

@@ -143,11 +143,17 @@ class Outlet:
         self.channel = map.channel
         self._write = map.writer(signals)
         self._ranges = {signal.name: Range(signal) for signal in signals}
+        # The quick way, if all signals are commanded.
+        self._form = map.form(signals, self._ranges)
         self._transmissions = transmissions
+        self._all = list(self._ranges)
         self._named: list[str] = []
 
     def message(self, commands: Mapping[str, Any], utime: int) -> bytes | None:
         """The message of those commands that are this channel's; None if there are none, or none may leave."""
+        if self._form is not None and (message := self._form.fill(commands, utime)) is not None:
+            self._named = self._all
+            return message
         values = {name: commands[name] for name in self._ranges if name in commands}
         self._named = list(values)
         if not values:

@@ -81,11 +81,9 @@ class VectorMap(LcmMap):
         self.check(signals)
         return _VectorWriter(self, signals)
 
-    def form(self, signals: Sequence[Signal]) -> Form | None:
-        """What writes the messages of some of the map's signals, quickly; None if there is no such way."""
+    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> Form | None:
         assert self.encode is not None
-        message = self.encode({signal.name: np.zeros(signal.size or 0) for signal in signals}, 0)
-        layout = self._layout(message)
+        layout = self._layout(self.encode({signal.name: np.zeros(signal.size or 0) for signal in signals}, 0))
         if layout is None:
             return None
         return Form(
@@ -94,6 +92,7 @@ class VectorMap(LcmMap):
             stamp=self._stamp(layout),
             names=[signal.name for signal in signals],
             sizes=[signal.size for signal in signals],
+            boxes=[ranges[signal.name].box for signal in signals] if ranges else None,
         )
 
     def _layout(self, message: Any) -> Layout | None:

@@ -158,11 +158,13 @@ class CommandGuard:
             if self.needs_start:
                 raise CommandFault("not started", NOT_STARTED)
             self.start_from(values)
-        if not self._passage.advance(values, self._sent, self._step_before):
-            before = self._sent.copy()
-            entries = zip(values.tolist(), before.tolist(), self._step_before.tolist(), self._limits, strict=True)
-            self._sent[:] = [self._limited(c, s, x, *limits) for c, s, x, limits in entries]
-            self._step_before[:] = self._sent - before
+        passed = self._passage.advance(values, self._sent, self._step_before)
+        if passed is not None:
+            return passed
+        before = self._sent.copy()
+        entries = zip(values.tolist(), before.tolist(), self._step_before.tolist(), self._limits, strict=True)
+        self._sent[:] = [self._limited(c, s, x, *limits) for c, s, x, limits in entries]
+        self._step_before[:] = self._sent - before
         return self._sent.copy()
 
     def _limited(self, c: float, s: float, x: float, step: float, change: float, lower: float, upper: float) -> float:

@@ -17,6 +17,7 @@ class Range:
 
     Attributes:
         lower, upper: of a vector signal, by entry, finite: so what is infinite is not within them.
+        box: of both.
     """
 
     def __init__(self, signal: Signal) -> None:
@@ -29,7 +30,7 @@ class Range:
         else:
             self.lower = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
             self.upper = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
-            self._box = Box(self.lower, self.upper)
+            self.box = Box(self.lower, self.upper)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Range) and self._shape() == other._shape()
@@ -41,7 +42,7 @@ class Range:
         """Why ``value`` is not one of this signal (``type``, ``size``, ``limits``, ``not finite``); empty if it is."""
         if self._type is not None:
             return "" if isinstance(value, self._type) else "type"
-        if self._box.contains(value):
+        if self.box.contains(value):
             return ""
         try:
             entries = np.array(value, dtype=float)
@@ -49,7 +50,7 @@ class Range:
             return "type"
         if entries.shape != (self._size,):
             return "size"
-        if self._box.contains(entries):
+        if self.box.contains(entries):
             return ""
         return "limits" if np.isfinite(entries).all() else "not finite"
 

@@ -26,7 +26,8 @@ class Stepped:
 
     Attributes:
         steps: how many the DPS has done.
-        start_time: of the DPS, in seconds, before its first step.
+        time: of the DPS, in seconds.
+        start_time: the same, before its first step.
         idle: whether the DPS alone has not begun yet.
         initialized: whether the events of initialization have happened; they do in the first step, unless ``context``
             was given.
@@ -50,7 +51,7 @@ class Stepped:
         self.initialized = context is not None
         self._simulator = target.simulator(context, restored=context is not None)
         self._context = self._simulator.get_mutable_context()
-        self.start_time = self._context.get_time()
+        self.time = self.start_time = float(self._context.get_time())
         self._ports = RealPorts(target, self._context)
         self.idle = isinstance(target, DpsAlone)
         self.active: list[str] = []
@@ -67,18 +68,15 @@ class Stepped:
         """The target's context; only the thread that runs the cycles may touch it while they run."""
         return self._context
 
-    @property
-    def time(self) -> float:
-        """The DPS's time in seconds."""
-        return float(self._context.get_time())
-
     def step(self) -> tuple[BaseException | None, dict[str, Any]]:
         """Steps by one period; gives what was raised inside, if anything, and the commands of the signals on real."""
         if self.idle:
             return None, {}
         self.initialized = True
         try:
-            self._simulator.AdvanceTo(time_after(self.steps + 1, start=self.start_time, period=self.period))
+            end = time_after(self.steps + 1, start=self.start_time, period=self.period)
+            self._simulator.AdvanceTo(end)
+            self.time = end
             self.steps += 1
             return None, self._ports.commands(self.active)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
