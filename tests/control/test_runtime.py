@@ -233,7 +233,7 @@ def test_a_switch_that_was_prepared_in_an_earlier_cycle_is_refused():
     runtime.run(cycles=2)
     with pytest.raises(SwitchRefusedError, match="2 cycles ago: prepare it anew"):
         runtime.perform(preparation)
-    assert runtime.active == []
+    assert runtime.active == ()
 
 
 def test_a_command_that_would_jump_is_refused():

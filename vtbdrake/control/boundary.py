@@ -27,12 +27,12 @@ class RealPorts:
         self._outputs = {s.name: (s, diagram.GetOutputPort(f"real.act.{s.name}").Eval) for s in interface.act}
         self._active = diagram.GetOutputPort("real.act.active") if interface.act else None
 
-    def active(self) -> list[str]:
+    def active(self) -> tuple[str, ...]:
         """The actuator signals that are on real; it asks the switches and not the DPS."""
         if self._active is None:
-            return []
+            return ()
         flags = self._active.Eval(self._context)
-        return [name for name, flag in zip(self._outputs, flags, strict=True) if flag]
+        return tuple(name for name, flag in zip(self._outputs, flags, strict=True) if flag)
 
     def commands(self, names: Iterable[str]) -> dict[str, Any]:
         """What the DPS commands to the machine now, by actuator signal."""

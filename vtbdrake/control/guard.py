@@ -150,8 +150,8 @@ class Guards:
             now: the time on the clock of `Reception.arrived`, in seconds.
             receptions: of the sensor signals that are on real; no others are watched.
             commands: of the DPS, by actuator signal.
-            active: the actuator signals that are on real; by default those of ``commands``, and those of the cycle
-                before if the DPS raised.
+            active: the actuator signals that are on real, each once; by default those of ``commands``, and those of the
+                cycle before if the DPS raised.
             error: what the DPS raised, if it did.
             missed: how many deadlines were missed in a row, up to now.
             not_ready: why the machine is not ready, if it is not.
@@ -202,7 +202,7 @@ class Guards:
 
     def _activate(self, names: Iterable[str]) -> tuple[str, ...]:
         """Takes note of what is on real; a signal that no longer is has to start anew."""
-        names = tuple(dict.fromkeys(names))
+        names = tuple(names)
         if names != self._active:
             for name in set(self._active) - set(names):
                 self.commands[name].release()

@@ -54,7 +54,7 @@ class Stepped:
         self.time = self.start_time = float(self._context.get_time())
         self._ports = RealPorts(target, self._context)
         self.idle = isinstance(target, DpsAlone)
-        self.active: list[str] = []
+        self.active: tuple[str, ...] = ()
         self.watched: Mapping[str, Reception] = {}
         self._changes: list[Change] = []
         self._fed: dict[str, Any] = {}
@@ -94,7 +94,7 @@ class Stepped:
         To be called after a switch was thrown by other means than `perform`, unless `run` or a `request` did.
         """
         sensed = self.bridge.sensed
-        self.active = [] if self.idle else self._ports.active()
+        self.active = () if self.idle else self._ports.active()
         if isinstance(self.target, DpsAlone):
             self.watched = {} if self.idle else sensed
         else:

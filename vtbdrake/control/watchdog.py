@@ -109,15 +109,11 @@ class Watchdog(Freshness):
         return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
 
     def examine(self, now: float, reception: Reception) -> Fault | None:
-        if self._range is reception.range and not self._compares:
-            return None  # Mostly so: the bridge has checked the sample by the same limits.
         fault = None
-        # Mostly they are not only equal but the same, from the second time on.
-        if self._range is not reception.range:
-            if self._range == reception.range:
-                self._range = reception.range
-            else:
-                fault = self._implausible(now, reception)
+        if self._range is None or self._range != reception.range:
+            fault = self._implausible(now, reception)
+        elif not self._compares:
+            self.trusted = reception.range
         if fault is None and self._tolerates:
             fault = self._jump(now, reception)
         if fault is None and self._delay is not None:

@@ -119,7 +119,7 @@ class ReplayRun:
         """Looks which signals the DPS commands."""
         self._outputs = [
             (self._target.diagram.GetOutputPort(f"real.act.{name}").Eval, self.commands.get(name), self.commanded[name])
-            for name in ([] if self._idle else self._ports.active())
+            for name in (() if self._idle else self._ports.active())
         ]
 
     # -- changes
