@@ -15,8 +15,8 @@ STAMP := $(VENV)/.vtbdrake-installed
 ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
-# What compiled modules are made of.
-COMPILED := setup.py $(shell find vtbdrake -name '*.pyx' -o -name '*.pxd')
+# What is compiled.
+SOURCES := $(shell find vtbdrake -name '*.pyx' -o -name '*.pxd')
 
 .DEFAULT_GOAL := help
 .PHONY: help python setup demo demo-control test check answers bench clean stale
@@ -58,7 +58,7 @@ answers: $(STAMP)
 bench: $(STAMP)
 	$(RUN) -m benchmarks $(ONLY)
 
-$(STAMP): pyproject.toml $(wildcard constraints/*.txt) tools/setup.sh $(COMPILED) $(if $(STALE),stale)
+$(STAMP): pyproject.toml setup.py $(wildcard constraints/*.txt) tools/setup.sh $(SOURCES) $(if $(STALE),stale)
 	@tools/setup.sh "$(VENV)" $(if $(STALE),"$(PYTHON)")
 
 stale:

@@ -22,8 +22,6 @@ setup(
     ],
     options={
         "build_ext": {
-            # Files are compared by age only, which knows nothing of another Cython, numpy or other options.
-            "force": True,
             # The folder of temporary files belongs to one version of Python: several share a checkout.
             "cython_c_in_temp": True,
             "cython_directives": {

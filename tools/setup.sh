@@ -36,8 +36,9 @@ unfinished=$venv/.vtbdrake-unfinished
 [ $# -eq 2 ] || [ -f "$stamp" ] || fail "'$venv' was not set up yet: name the interpreter to do so with"
 python=${2:-$(sed -n 's/^python //p' "$stamp")}
 
-# Where nothing but compiled modules has changed, compiling them is all there is to do, and a slip in them costs no more.
-if is_set_up "$venv" "$python" && [ -z "$(find pyproject.toml constraints tools/setup.sh -newer "$stamp")" ]; then
+# Where nothing but sources to compile has changed, compiling those is all there is to do.
+# The installation below compiles from nothing: of another Cython, or other options, the ages of files say nothing.
+if is_set_up "$venv" "$python" && [ -z "$(find pyproject.toml setup.py constraints tools/setup.sh -newer "$stamp")" ]; then
     say "compiling modules"
     "$venv/bin/python" setup.py --quiet build_ext --inplace || fail "vtbdrake does not compile, see above"
     touch "$stamp"
@@ -129,6 +130,7 @@ say "installing into $venv for Python $version with $constraints (a minute or tw
 pip() { "$venv/bin/python" -m pip --quiet --disable-pip-version-check "$@"; }
 # The build tools come first and in their tested versions, so that the build needs no environment of its own.
 pip install --constraint "$constraints" setuptools Cython numpy
+rm -rf build/*"-$("$venv/bin/python" -c 'import sys; print(sys.implementation.cache_tag)')"
 pip install --constraint "$constraints" --no-build-isolation --editable ".[$EXTRAS]" ||
     fail "vtbdrake does not compile, or what it depends on does not install, see above"
 "$venv/bin/python" -c 'import pydrake.common, vtbdrake' || fail "the installed packages do not import"
