@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 
 from vtbdrake.components.casadi_system.compiler import compiled, compiled_if_possible
+from vtbdrake.components.casadi_system.handler import gather
 
 # casadi.SX or casadi.MX, for which CasADi's functions are overloaded one by one.
 Expression = Any
@@ -47,7 +48,7 @@ class Kernel:
     def value(self, blocks: Sequence[ArrayLike]) -> NDArray[np.float64]:
         """y where z is the blocks one after the other. The thread's next call overwrites it."""
         z, evaluate, y = self._value.parts
-        np.concatenate(blocks, out=z)
+        gather(blocks, z)
         evaluate()
         return y
 

@@ -13,6 +13,7 @@ from pydrake.autodiffutils import AutoDiffXd
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
+    Context_,
     DependencyTicket,
     DiscreteStateIndex,
     DiscreteValues_,
@@ -22,6 +23,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from vtbdrake.components.casadi_system.handler import handler
 from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
 
 
@@ -145,36 +147,22 @@ def CasadiSystem_(T: type) -> type:
         def _handler(
             self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None], updates: bool
         ) -> Callable[[Context, Any], None]:
-            """What Drake calls with a context and a vector, or the discrete state if it ``updates`` that.
-
-            To ``deliver`` is to write there. It runs in every step of a simulation, where each call of a function in
-            Python counts: so there are as few as possible.
+            """See `handler`. It runs in every step of a simulation, where each call of a function in Python counts: so
+            there are as few as possible.
             """
-            compute = result.kernel.value if T is float else result.kernel.autodiff
-            states = [self._model.state_index(block.names[0]) for block in result.blocks if block.source == STATE]
-            inputs = [self._ports[block.names[0]].Eval for block in result.blocks if block.source == INPUT]
             sources = {block.source for block in result.blocks}
-            clock, parameters = TIME in sources, PARAMETER in sources
-            # A view is cheaper, but there is none of AutoDiffXd.
-            values = BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector
-
-            def handle(context: Context, target: Any) -> None:
-                blocks: list[ArrayLike] = []
-                if states:
-                    # What is to be updated comes with the values that it has in the context, and is at hand.
-                    state = target if updates else context.get_discrete_state()
-                    for i in states:
-                        blocks.append(state.value(i))
-                if clock:
-                    blocks.append((context.get_time(),))
-                if parameters:
-                    blocks.append(values(context.get_numeric_parameter(0)))
-                for read in inputs:
-                    blocks.append(read(context))
-                # All has been read before the kernel's arrays are touched: an input may evaluate this system too.
-                deliver(target, compute(blocks or [()]))
-
-            return handle
+            return handler(
+                states=tuple(self._model.state_index(b.names[0]) for b in result.blocks if b.source == STATE),
+                updates=updates,
+                clock=TIME in sources,
+                parameters=Context_[T].get_numeric_parameter if PARAMETER in sources else None,
+                inputs=tuple(self._ports[b.names[0]].Eval for b in result.blocks if b.source == INPUT),
+                state_value=DiscreteValues_[T].value,
+                # A view is cheaper, but there is none of AutoDiffXd.
+                vector_value=BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector,
+                compute=result.kernel.value if T is float else result.kernel.autodiff,
+                deliver=deliver,
+            )
 
         def _ticket(self, block: Block) -> DependencyTicket:
             name = block.names[0]
