@@ -6,13 +6,16 @@ import numpy as np
 from setuptools import Extension, setup
 
 _ROOT = Path(__file__).parent
-_SOURCES = sorted(path.relative_to(_ROOT) for path in (_ROOT / "vtbdrake").rglob("*.pyx"))
+_SOURCES, _DECLARATIONS = (
+    sorted(path.relative_to(_ROOT) for path in (_ROOT / "vtbdrake").rglob(name)) for name in ("*.pyx", "*.pxd")
+)
 
 setup(
     ext_modules=[
         Extension(
             ".".join(source.with_suffix("").parts),
             [str(source)],
+            depends=[str(path) for path in _DECLARATIONS],
             include_dirs=[np.get_include()],
             define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")],
             # The same rounding on every processor: no product and sum in one.

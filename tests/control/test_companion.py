@@ -6,9 +6,8 @@ import signal
 import time
 
 import numpy as np
-import pytest
 
-from vtbdrake.control.companion import Companion, Frames
+from vtbdrake.control.companion import Companion
 
 TIMEOUT = 30.0
 
@@ -65,14 +64,6 @@ def test_frames_come_back_whole_and_in_order():
         assert back == sent and companion.dropped == 0
     finally:
         assert companion.close() == 0
-
-
-@pytest.mark.parametrize("cut", [1, 7, 8, 9, 1000])
-def test_a_stream_that_is_cut_anywhere_gives_the_same_frames(cut):
-    frames = [b"", b"a", b"b" * 100, bytes(range(256))]
-    stream = b"".join(len(f).to_bytes(8, "little") + f for f in frames)
-    reader = Frames()
-    assert [f for i in range(0, len(stream), cut) for f in reader.feed(stream[i : i + cut])] == frames
 
 
 def test_what_waits_is_sent_before_it_ends():

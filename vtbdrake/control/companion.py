@@ -15,31 +15,13 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from vtbdrake.control.streams import Frames
+
 _log = logging.getLogger(__name__)
 
 _LENGTH = struct.Struct("<Q")
 _CHUNK = 1 << 18
 _BUFFER = 1 << 20  # of the socket, in bytes; the system may grant less
-
-
-class Frames:
-    """Puts frames together again, each its length and its bytes, from a stream that is cut anywhere."""
-
-    def __init__(self) -> None:
-        self._pending = bytearray()
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """The frames that ``data`` completes."""
-        pending, frames, start = self._pending, [], 0
-        pending += data
-        while len(pending) - start >= _LENGTH.size:
-            end = start + _LENGTH.size + _LENGTH.unpack_from(pending, start)[0]
-            if len(pending) < end:
-                break
-            frames.append(bytes(pending[start + _LENGTH.size : end]))
-            start = end
-        del pending[:start]
-        return frames
 
 
 class Channel:
@@ -48,7 +30,6 @@ class Channel:
     def __init__(self, line: socket.socket) -> None:
         self._line = line
         self._frames = Frames()
-        self._received: deque[bytes] = deque()
 
     def fileno(self) -> int:
         """What becomes readable when frames arrive."""
@@ -62,15 +43,13 @@ class Channel:
             TimeoutError: none came within ``timeout`` seconds.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        while not self._received:
+        while (frame := self._frames.frame()) is None:
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
             if not select.select((self._line,), (), (), left)[0]:
                 raise TimeoutError(f"no frame came within {timeout} s")
-            data = self._line.recv(_CHUNK)
-            if not data:
+            if not self._frames.receive(self._line.fileno(), _CHUNK):
                 raise EOFError("the loop's end of the line is closed")
-            self._received += self._frames.feed(data)
-        return self._received.popleft()
+        return frame
 
     def send(self, *parts: bytes) -> None:
         """Sends one frame, of the parts' bytes one after another.
@@ -205,16 +184,14 @@ class Companion:
         size = _CHUNK
         while size == _CHUNK:  # a smaller one was all that there was
             try:
-                data = self._line.recv(_CHUNK)
-            except BlockingIOError:
-                return
+                size = self._frames.receive(self._line.fileno(), _CHUNK)
             except OSError as error:
                 self._lose(error)
                 return
-            size = len(data)
-            if not data:
+            if not size:
                 self._lose("it has closed the line")
-            self._back += self._frames.feed(data)
+            while (frame := self._frames.frame()) is not None:
+                self._back.append(frame)
 
     def fileno(self) -> int:
         """What becomes readable when frames come back."""

@@ -1,21 +1,15 @@
-"""Cuts what comes by a socket into tcpq's records; see `tcpq`, of which this is the compiled part."""
+"""What comes from a client of tcpq (see `tcpq`), cut into its records; compiled."""
 
 from cpython.bytes cimport PyBytes_FromStringAndSize
-from cpython.exc cimport PyErr_CheckSignals, PyErr_SetFromErrno
-from cpython.mem cimport PyMem_Free, PyMem_Realloc
-from libc.errno cimport EAGAIN, EINTR, errno
 from libc.stdint cimport uint32_t
 from libc.string cimport memcpy
 
 from vtbdrake.control.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, ProtocolError
+from vtbdrake.control.streams cimport Stream
 
 cdef extern from "<arpa/inet.h>" nogil:
     uint32_t ntohl(uint32_t)
     uint32_t htonl(uint32_t)
-
-cdef extern from "<sys/socket.h>" nogil:
-    const int MSG_DONTWAIT
-    ssize_t recv(int, void*, size_t, int)
 
 cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
 cdef uint32_t _PUBLISH = PUBLISH
@@ -43,10 +37,8 @@ def publication(bytes channel, bytes data):
     return record
 
 
-cdef class Reader:
-    """Makes records of the bytes that come from one client, in whatever pieces they come.
-
-    Its memory grows with what has arrived, not with what was announced.
+cdef class Reader(Stream):
+    """Cuts what comes from one client into tcpq's records.
 
     Args:
         max_message: the largest data of a publication, in bytes.
@@ -58,72 +50,13 @@ cdef class Reader:
 
     cdef readonly bint greeted
     cdef Py_ssize_t max_message
-    # What has come and is not cut yet lies from `begin` to `end`.
-    cdef char* buffer
-    cdef Py_ssize_t room, begin, end
-    # Of the record that begins there, as far as it is known.
+    # Of the record that begins, as far as it is known.
     cdef uint32_t kind
     cdef Py_ssize_t length, size
 
     def __init__(self, *, max_message, greeted=False):
         self.max_message = max_message
         self.greeted = greeted
-
-    def __dealloc__(self):
-        PyMem_Free(self.buffer)
-
-    @property
-    def partial(self):
-        """Whether a record has begun and not ended."""
-        return self.end > self.begin
-
-    cdef int _make_room(self, Py_ssize_t size) except -1:
-        """For so many bytes more."""
-        cdef Py_ssize_t have = self.end - self.begin
-        cdef Py_ssize_t room = self.room
-        if self.begin and have <= self.begin:
-            memcpy(self.buffer, self.buffer + self.begin, have)
-            self.begin, self.end = 0, have
-        if not have and room > 4 * size:
-            room = 0  # A large message has gone by.
-        if self.end + size > room:
-            room = 2 * (self.end + size)
-        if room != self.room:
-            buffer = <char*>PyMem_Realloc(self.buffer, room)
-            if buffer is NULL:
-                raise MemoryError
-            self.buffer, self.room = buffer, room
-        return 0
-
-    def append(self, const unsigned char[::1] data):
-        """Adds what has come."""
-        cdef Py_ssize_t size = data.shape[0]
-        if size:
-            self._make_room(size)
-            memcpy(self.buffer + self.end, &data[0], size)
-            self.end += size
-
-    def receive(self, int fileno, Py_ssize_t limit):
-        """Adds what has come by a socket, without waiting, ``limit`` bytes at most; says how many.
-
-        Returns:
-            0 if the other side has closed the connection, -1 if nothing has come.
-
-        Raises:
-            OSError: the connection is lost.
-        """
-        cdef ssize_t size
-        self._make_room(limit)
-        while True:
-            size = recv(fileno, self.buffer + self.end, limit, MSG_DONTWAIT)
-            if size >= 0:
-                self.end += size
-                return size
-            if errno == EAGAIN:
-                return -1
-            if errno != EINTR:
-                PyErr_SetFromErrno(OSError)
-            PyErr_CheckSignals()
 
     def record(self):
         """The next record: its type, its channel or pattern, and the record as it came; None if it is not there yet.

@@ -85,9 +85,9 @@ class LiveService:
         self._orders += self._companion.take()
         if self._orders:
             self._begin(*pickle.loads(self._orders.popleft()))
-        if self._readings:
-            self._read(cycle)
-        if self._records and cycle.now >= self._flush_at:
+        busy = bool(self._readings) and self._read(cycle)
+        # Rather in a cycle in which nothing is read.
+        if self._records and cycle.now >= self._flush_at + busy * self._pause:
             self._flush(cycle.now)
 
     def _begin(self, number: int, order: tuple[Any, ...] | None) -> None:
@@ -133,13 +133,14 @@ class LiveService:
             return {"error": str(error)}
         return {"ok": True, "released": released}
 
-    def _read(self, cycle: Cycle) -> None:
-        """One after another, from where it ended in the cycle before."""
+    def _read(self, cycle: Cycle) -> bool:
+        """One after another, from where it ended in the cycle before; whether anything was due."""
         begin = before = time.thread_time()
+        busy = False
         for _ in range(len(self._readings)):
             reading = self._readings[0]
             if reading.due(cycle):
-                done = False
+                busy, done = True, False
                 while not done:
                     done = reading.read_one(self._runtime.context)
                     now = time.thread_time()
@@ -147,7 +148,7 @@ class LiveService:
                         reading.error = f"{reading.latest} takes {1e3 * (now - before):.1f} ms to be read"
                         done = True
                     elif not done and now - begin > self.budget:
-                        return
+                        return True
                     before = now
                 if not self._conclude(reading, cycle):
                     self._readings.popleft()
@@ -155,6 +156,7 @@ class LiveService:
             self._readings.rotate(-1)
             if before - begin > self.budget:
                 break
+        return busy
 
     def _conclude(self, reading: _Reading, cycle: Cycle) -> bool:
         """Sends what was read; whether it is to be read again."""

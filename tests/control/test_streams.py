@@ -1,4 +1,4 @@
-"""The stream of a client is cut into records, in whatever pieces it comes."""
+"""A stream is cut into records, or frames, in whatever pieces it comes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from vtbdrake.control.hub.reader import Reader, publication
 from vtbdrake.control.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
+from vtbdrake.control.streams import Frames
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)
 LARGEST = 1000
@@ -65,6 +66,16 @@ def test_publications_are_channel_and_data_of_those_records(records: list[Record
     assert [published(*come) for come in found] == [record for kind, _, record in records if kind == PUBLISH]
 
 
+@given(st.lists(st.binary(max_size=300), max_size=8), st.lists(st.integers(0, 10_000), max_size=20))
+def test_frames_are_the_same_in_whatever_pieces_they_come(frames: list[bytes], ends: list[int]) -> None:
+    stream, found = Frames(), []
+    for piece in in_pieces(b"".join(struct.pack("<Q", len(frame)) + frame for frame in frames), ends):
+        stream.append(piece)
+        while (frame := stream.frame()) is not None:
+            found.append(frame)
+    assert found == frames and not stream.partial
+
+
 @given(CHANNELS, st.binary())
 def test_a_publication_is_written_as_liblcm_does(channel: bytes, data: bytes) -> None:
     assert publication(channel, data) == published(channel, data)
@@ -103,12 +114,15 @@ def test_who_greets_in_another_way_is_no_client(greeting: bytes) -> None:
 def test_memory_is_that_of_what_has_come_and_given_back() -> None:
     announced, come = 1 << 30, 1 << 20
     tracemalloc.start()
-    reader = Reader(max_message=1 << 31, greeted=True)
+    reader, frames = Reader(max_message=1 << 31, greeted=True), Frames()
     reader.append(published(b"A", b"")[:-4] + struct.pack(">I", announced))
+    frames.append(struct.pack("<Q", 2**64 - 1))
     for _ in range(16):
         reader.append(bytes(come // 16))
-        assert reader.record() is None
-    assert tracemalloc.get_traced_memory()[0] < 4 * come
+        frames.append(bytes(come // 16))
+        assert reader.record() is frames.frame() is None
+    assert tracemalloc.get_traced_memory()[0] < 8 * come
+    del frames
     reader = Reader(max_message=1 << 31, greeted=True)
     reader.append(published(b"A", bytes(come)))
     assert reader.record() is not None

@@ -1,0 +1,93 @@
+"""What comes by sockets, put together again; compiled."""
+
+from cpython.bytes cimport PyBytes_FromStringAndSize
+from cpython.exc cimport PyErr_CheckSignals, PyErr_SetFromErrno
+from cpython.mem cimport PyMem_Free, PyMem_Realloc
+from libc.errno cimport EAGAIN, EINTR, errno
+from libc.stdint cimport uint64_t
+from libc.string cimport memcpy
+
+cdef extern from "<endian.h>" nogil:
+    uint64_t le64toh(uint64_t)
+
+cdef extern from "<sys/socket.h>" nogil:
+    const int MSG_DONTWAIT
+    ssize_t recv(int, void*, size_t, int)
+
+cdef class Stream:
+    """What has come by a stream and is not cut yet. Its memory grows with what has arrived, not with what was announced.
+    """
+
+    def __dealloc__(self):
+        PyMem_Free(self.buffer)
+
+    @property
+    def partial(self):
+        """Whether something has begun and not ended."""
+        return self.end > self.begin
+
+    cdef int _make_room(self, Py_ssize_t size) except -1:
+        """For so many bytes more."""
+        cdef Py_ssize_t have = self.end - self.begin
+        cdef Py_ssize_t room = self.room
+        if self.begin and have <= self.begin:
+            memcpy(self.buffer, self.buffer + self.begin, have)
+            self.begin, self.end = 0, have
+        if not have and room > 4 * size:
+            room = 0  # A large message has gone by.
+        if self.end + size > room:
+            room = 2 * (self.end + size)
+        if room != self.room:
+            buffer = <char*>PyMem_Realloc(self.buffer, room)
+            if buffer is NULL:
+                raise MemoryError
+            self.buffer, self.room = buffer, room
+        return 0
+
+    def append(self, const unsigned char[::1] data):
+        """Adds what has come."""
+        cdef Py_ssize_t size = data.shape[0]
+        if size:
+            self._make_room(size)
+            memcpy(self.buffer + self.end, &data[0], size)
+            self.end += size
+
+    def receive(self, int fileno, Py_ssize_t limit):
+        """Adds what has come by a socket, without waiting, ``limit`` bytes at most; says how many.
+
+        Returns:
+            0 if the other side has closed the connection, -1 if nothing has come.
+
+        Raises:
+            OSError: the connection is lost.
+        """
+        cdef ssize_t size
+        self._make_room(limit)
+        while True:
+            size = recv(fileno, self.buffer + self.end, limit, MSG_DONTWAIT)
+            if size >= 0:
+                self.end += size
+                return size
+            if errno == EAGAIN:
+                return -1
+            if errno != EINTR:
+                PyErr_SetFromErrno(OSError)
+            PyErr_CheckSignals()
+
+
+cdef class Frames(Stream):
+    """Puts frames together again, each its length (64 bits, little-endian) and its bytes, from pieces cut anywhere."""
+
+    def frame(self):
+        """The next frame; None if it is not there yet."""
+        cdef Py_ssize_t have = self.end - self.begin
+        cdef uint64_t size
+        if have < 8:
+            return None
+        memcpy(&size, self.buffer + self.begin, 8)
+        size = le64toh(size)
+        if <uint64_t>(have - 8) < size:
+            return None
+        frame = PyBytes_FromStringAndSize(self.buffer + self.begin + 8, <Py_ssize_t>size)
+        self.begin += 8 + <Py_ssize_t>size
+        return frame
