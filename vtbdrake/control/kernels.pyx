@@ -28,21 +28,6 @@ cdef extern from *:
 
 # -- vectors
 
-cdef inline double* _entries(object value, Py_ssize_t size) noexcept:
-    """Of an array of ``size`` doubles, one after the other; NULL if ``value`` is anything else."""
-    if not cnp.PyArray_CheckExact(value):
-        return NULL
-    cdef cnp.ndarray array = <cnp.ndarray>value
-    if (
-        cnp.PyArray_NDIM(array) != 1
-        or cnp.PyArray_DIM(array, 0) != size
-        or cnp.PyArray_TYPE(array) != cnp.NPY_DOUBLE
-        or not cnp.PyArray_ISCARRAY_RO(array)
-    ):
-        return NULL
-    return <double*>cnp.PyArray_DATA(array)
-
-
 cdef void* _zeros(Py_ssize_t count, size_t size) except NULL:
     cdef void* memory = PyMem_Calloc(max(count, 1), size)
     if memory is NULL:
@@ -60,7 +45,7 @@ cdef double* _doubles(object numbers) except NULL:
 
 def finite(value, Py_ssize_t size):
     """Whether ``value`` is an array of doubles of shape (size,), all finite."""
-    cdef double* entries = _entries(value, size)
+    cdef double* entries = entries_of(value, size)
     cdef Py_ssize_t i
     if entries is NULL:
         return False
@@ -95,7 +80,7 @@ cdef class Box:
 
     def contains(self, value):
         """Whether ``value`` is an array of doubles of this size, within the limits."""
-        cdef double* entries = _entries(value, self.size)
+        cdef double* entries = entries_of(value, self.size)
         return entries is not NULL and self.holds(entries)
 
 
@@ -118,9 +103,9 @@ cdef class Passage:
         If so, it is in ``sent`` afterwards, and the step that led there in ``step``; before, they are those of the cycle
         before. All are arrays of doubles of this size.
         """
-        cdef double* c = _entries(command, self.size)
-        cdef double* s = _entries(sent, self.size)
-        cdef double* x = _entries(step, self.size)
+        cdef double* c = entries_of(command, self.size)
+        cdef double* s = entries_of(sent, self.size)
+        cdef double* x = entries_of(step, self.size)
         cdef double* limit = self.limits
         cdef double w, reach, way
         cdef Py_ssize_t i
@@ -499,7 +484,7 @@ cdef class Form:
         cdef Run* run
         cdef Py_ssize_t i, k
         for i in range(len(self.names)):
-            entries = _entries(values.get(self.names[i]), self.sizes[i])
+            entries = entries_of(values.get(self.names[i]), self.sizes[i])
             if entries is NULL:
                 return None
             box = self.boxes[i]
