@@ -41,22 +41,25 @@ class TimedRuntime(Runtime):
 
     Attributes:
         overheads: of each cycle, from its call to its return, less the DPS's step, in seconds.
-        lateness: from each cycle's deadline to its end, in seconds.
+        commanded: from each cycle's deadline until its commands had left, in seconds.
+        lateness: from each cycle's deadline to its end, when all who watch had their turn, in seconds.
         worked: processor time of the loop's thread in all those cycles, and while it waited for them, in seconds.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.overheads: list[float] = []
+        self.commanded: list[float] = []
         self.lateness: list[float] = []
         self.worked = 0.0
 
     def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
-        steps = self.statistics.histograms["step"]
-        before, begin = steps.total, self.clock.now()
+        steps, cycles = self.statistics.histograms["step"], self.statistics.histograms["cycle"]
+        stepped, cycled, begin = steps.total, cycles.total, self.clock.now()
         done = super().cycle(lateness=lateness, poll=poll)
         took = self.clock.now() - begin
-        self.overheads.append(took - (steps.total - before))
+        self.overheads.append(took - (steps.total - stepped))
+        self.commanded.append(lateness + cycles.total - cycled)
         self.lateness.append(lateness + took)
         return done
 
@@ -93,6 +96,7 @@ class Rig:
         runtime.run(cycles=WARM_UP)
         self.machine.reset_statistics()
         runtime.overheads.clear()
+        runtime.commanded.clear()
         runtime.lateness.clear()
         missed, worked = runtime.missed, time.thread_time()
         runtime.run(cycles=cycles)

@@ -135,11 +135,13 @@ class LiveService:
 
     def _read(self, cycle: Cycle) -> bool:
         """One after another, from where it ended in the cycle before; whether anything was due."""
-        begin = before = time.thread_time()
+        begin = before = 0.0
         busy = False
         for _ in range(len(self._readings)):
             reading = self._readings[0]
             if reading.due(cycle):
+                if not busy:
+                    begin = before = time.thread_time()
                 busy, done = True, False
                 while not done:
                     done = reading.read_one(self._runtime.context)
