@@ -1,6 +1,7 @@
 """Imports inside vtbdrake point one way, and importing it stays light."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -92,6 +93,15 @@ def test_imports_point_one_way() -> None:
         is_package = parts[-1] == "__init__"
         module = ".".join(parts[:-1] if is_package else parts)
         found += violations(path.read_text(encoding="utf-8"), module, is_package)
+    assert not found, "\n".join(found)
+
+
+def test_imports_of_compiled_modules_point_one_way() -> None:
+    found = []
+    for path in sorted(PACKAGE.rglob("*.pyx")):
+        imports = re.findall(r"^(?:from +\S+ +)?c?import +[^#\n]+", path.read_text(encoding="utf-8"), re.MULTILINE)
+        source = "\n".join(line.replace("cimport", "import") for line in imports)
+        found += violations(source, ".".join(path.relative_to(ROOT).with_suffix("").parts))
     assert not found, "\n".join(found)
 
 
