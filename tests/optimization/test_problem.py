@@ -177,6 +177,8 @@ def test_a_problem_that_makes_no_sense_is_refused(changes, message):
         (lambda p: p.rollout({THETA: 1.0}), "wrong about"),
         (lambda p: p.sweep(), "either the number of points"),
         (lambda p: p.sweep(points=1), "at least two points"),
+        (lambda p: p.sweep(points=10**13), r"1e\+13 points does not fit into memory"),
+        (lambda p: p.state([5.0], t="late"), "the time t is a number, not 'late'"),
         (lambda p: p.sweep(points=3, executor="gpu"), "not 'gpu'"),
         (lambda p: p.sweep(values=np.zeros((3, 4))), r"have shape \(n, 1\), not \(3, 4\)"),
         (lambda p: _two().sweep(values=np.zeros((3, 4))), r"have shape \(n, 2\), not \(3, 4\)"),

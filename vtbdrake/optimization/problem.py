@@ -176,10 +176,9 @@ class Problem:
         return ProblemRollout(**vars(result), problem=self, condition=self.conditions[condition])
 
     def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
-        """s(t) = Gamma'(s^0, t), equation (10), at a sample time."""
+        """s(t) = Gamma'(s^0, t), equation (10), at a sample time, in seconds."""
         parameters = self.values(point, condition=condition)
-        snapshot: Snapshot = self._runner(self.task, parameters).state(split(parameters)[1], t)
-        return snapshot
+        return self._runner(self.task, parameters).state(split(parameters)[1], as_number("the time t", t))
 
     def motion(self, parameters: Mapping[str, Any]) -> Motion:
         """The motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from math import inf
+from math import inf, prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -213,7 +213,8 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     """Every combination of equally spaced values of one or two parameters, ends included; shape (n, p).
 
     Raises:
-        ValueError: there are more than two parameters, or too few points for one of them.
+        ValueError: there are more than two parameters, too few points for one of them, or more in all than there is
+            memory for.
     """
     if not 1 <= len(parameters) <= 2:
         raise ValueError(f"a sweep goes over one or two parameters, not {len(parameters)}")
@@ -222,8 +223,11 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     counts = [as_whole("a number of points", count) for count in all_of(object, each, name="points", form=form)]
     if len(counts) != len(parameters) or min(counts) < 2:
         raise ValueError(f"a sweep has at least two points for each of its {len(parameters)} parameters, not {points}")
-    axes = [np.linspace(p.lower, p.upper, count) for p, count in zip(parameters, counts, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
+    try:
+        axes = [np.linspace(p.lower, p.upper, count) for p, count in zip(parameters, counts, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
+    except (MemoryError, ValueError, OverflowError):
+        raise ValueError(f"a sweep of {prod(counts):.3g} points does not fit into memory: take fewer") from None
 
 
 def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
