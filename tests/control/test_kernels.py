@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from vtbdrake.control.kernels import Bins, Box, Form, Freshness, Intake, Passage, Reception, finite
+from vtbdrake.control.kernels import Bins, Box, Form, Freshness, Intake, Passage, Reception, finite, found
 
 EVERY = "dqfihb?"
 HEAD = b"\xf1\xf2\xf3\xf4\xf5\xf6\xf7\xf8"
@@ -98,6 +98,13 @@ def test_what_passes_leaves_its_step_and_what_does_not_leaves_nothing() -> None:
     np.testing.assert_array_equal(sent, [0.3, 0.1])
 
 
+def test_limits_that_do_not_belong_together_are_refused() -> None:
+    with pytest.raises(ValueError, match="as many lower limits as upper ones, not 3 and 1"):
+        Box([0.0] * 3, [1.0])
+    with pytest.raises(ValueError, match="values to unpack"):
+        Passage([(1.0, 1.0, 0.0)])
+
+
 # -- messages
 
 
@@ -169,6 +176,79 @@ def test_places_outside_of_the_message_are_refused() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    "place", [(0, -1, "d"), (8, 1, "d"), (-1, 1, "b"), (0, 2**61, "d"), (2**63, 1, "b"), (0, 2**64, "b"), (9, 0, "d")]
+)
+def test_no_place_reaches_out_of_the_message(place: tuple[int, int, str]) -> None:
+    offset, count, code = place
+    signals: dict[str, Any] = {"receptions": [Reception()], "sizes": [count], "lower": [], "upper": []}
+    with pytest.raises(ValueError, match=r"other numbers than|not in a message of 8 bytes"):
+        Intake(bytes(8), fixed=[], places=[(0, 0, *place)], stamp=None, **signals)
+    with pytest.raises(ValueError, match="not in a message of 8 bytes"):
+        Form(bytes(8), places=[(0, 0, *place)], stamp=None, names=["a"], sizes=[1])
+    with pytest.raises(ValueError, match="not in a message of 8 bytes"):
+        Intake(
+            bytes(8), fixed=[(offset, count * 8)], places=[], stamp=None, receptions=[], sizes=[], lower=[], upper=[]
+        )
+
+
+def test_a_time_is_one_number_of_the_message() -> None:
+    with pytest.raises(ValueError, match="1 numbers from byte 8 on are not in a message of 8 bytes"):
+        Form(bytes(8), places=[], stamp=(8, 0, "q"), names=[], sizes=[])
+
+
+def test_an_intake_has_a_reception_and_a_size_for_every_signal() -> None:
+    example, places = message("d", [0.0]), [(0, 0, NUMBERS, 1, "d")]
+    for receptions, sizes in (([Reception()] * 2, [1]), ([Reception()] * 2, [3, -2])):
+        with pytest.raises(ValueError, match="other numbers than the signals"):
+            Intake(
+                example,
+                fixed=[],
+                places=places,
+                stamp=None,
+                receptions=receptions,
+                sizes=sizes,
+                lower=[0.0],
+                upper=[0.0],
+            )
+    with pytest.raises(TypeError, match="Reception"):
+        other: Any = [object()]
+        Intake(example, fixed=[], places=places, stamp=None, receptions=other, sizes=[1], lower=[0.0], upper=[0.0])
+
+
+@pytest.mark.parametrize(
+    ("places", "sizes", "boxes"),
+    [
+        ([(-1, 0, NUMBERS, 1, "d")], [1], None),
+        ([(1, 0, NUMBERS, 1, "d")], [1], None),
+        ([], [], None),
+        ([], [1], []),
+    ],
+)
+def test_a_form_knows_the_vectors_of_all_its_places(places: Any, sizes: list[int], boxes: Any) -> None:
+    with pytest.raises(ValueError, match="vector"):
+        Form(message("d", [0.0]), places=places, stamp=None, names=["a"], sizes=sizes, boxes=boxes)
+
+
+def test_what_is_no_message_is_refused() -> None:
+    nothing: Any = None
+    with pytest.raises(TypeError, match="expected bytes"):
+        intake("d", 3)[0].take(nothing, 0.0, 1.0)
+
+
+class Made(dict[str, np.ndarray]):
+    """Makes every vector when it is asked for."""
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return np.full(2, float(name))
+
+
+def test_a_form_takes_vectors_that_nobody_else_keeps() -> None:
+    places = [(0, 0, NUMBERS, 2, "d"), (1, 0, NUMBERS + 16, 2, "d")]
+    form = Form(message("d", [0.0] * 4), places=places, stamp=None, names=["1", "2"], sizes=[2, 2])
+    assert form.fill(Made(), 0) == message("d", [1.0, 1.0, 2.0, 2.0])
+
+
 @pytest.mark.parametrize("code", EVERY)
 @settings(max_examples=100)
 @given(entries=st.lists(st.floats(-1e40, 1e40) | st.floats(-200.0, 200.0) | st.floats(), min_size=2, max_size=2))
@@ -230,6 +310,14 @@ def test_a_value_is_examined_once_and_its_age_in_every_cycle() -> None:
     assert watch.times == [1.0, 2.0]
 
 
+def test_only_a_reception_has_an_age() -> None:
+    nothing: Any = None
+    with pytest.raises(TypeError, match="of its Reception, not of None"):
+        Examined().check(0.0, nothing)
+    with pytest.raises(TypeError, match="Freshness"):
+        found(0.0, {"a": nothing}, {"a": Reception()})
+
+
 @given(st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=30))
 def test_durations_fall_into_their_bins(durations: list[float]) -> None:
     scale, number = 5.0, 20
@@ -241,3 +329,22 @@ def test_durations_fall_into_their_bins(durations: list[float]) -> None:
     expected = np.bincount(np.searchsorted(ends, durations), minlength=number)
     assert bins.counts() == expected.tolist()
     assert (bins.count, bins.least, bins.largest) == (len(durations), min(durations), max(durations))
+
+
+def test_bins_that_are_not_divided_take_no_duration() -> None:
+    with pytest.raises(RuntimeError, match="have to be divided first"):
+        Bins.__new__(Bins).record(1.0)
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, math.inf, math.nan])
+def test_bins_of_no_scale_are_refused(scale: float) -> None:
+    with pytest.raises(ValueError, match=f"of the scale {scale}"):
+        Bins(1.0, 2.0, scale, 5)
+
+
+def test_counts_are_added_all_or_none() -> None:
+    bins = Bins(1.0, 2.0, 5.0, 3)
+    wrong: Any = [1, 2, "three"]
+    with pytest.raises(TypeError):
+        bins.add(wrong, 3.0, 1.0, 2.0)
+    assert (bins.counts(), bins.count, bins.total) == ([0, 0, 0], 0, 0.0)

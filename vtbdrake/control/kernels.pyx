@@ -36,10 +36,11 @@ cdef void* _zeros(Py_ssize_t count, size_t size) except NULL:
 
 
 cdef double* _doubles(object numbers) except NULL:
-    cdef double* copy = <double*>_zeros(len(numbers), sizeof(double))
+    cdef list given = [float(number) for number in numbers]
+    cdef double* copy = <double*>_zeros(len(given), sizeof(double))
     cdef Py_ssize_t i
-    for i in range(len(numbers)):
-        copy[i] = numbers[i]
+    for i in range(len(given)):
+        copy[i] = given[i]
     return copy
 
 
@@ -63,6 +64,8 @@ cdef class Box:
     cdef double* upper
 
     def __cinit__(self, lower, upper):
+        if len(lower) != len(upper):
+            raise ValueError(f"a box has as many lower limits as upper ones, not {len(lower)} and {len(upper)}")
         self.size = len(lower)
         self.lower = _doubles(lower)
         self.upper = _doubles(upper)
@@ -92,7 +95,7 @@ cdef class Passage:
 
     def __cinit__(self, limits):
         self.size = len(limits)
-        self.limits = _doubles([number for entry in limits for number in entry])
+        self.limits = _doubles([number for w, f, lower, upper in limits for number in (w, f, lower, upper)])
 
     def __dealloc__(self):
         PyMem_Free(self.limits)
@@ -201,6 +204,8 @@ cdef class Freshness:
 
     cpdef check(self, double now, Reception reception):
         """What is wrong with the signal at the time ``now``, in seconds; None if nothing is."""
+        if reception is None:
+            raise TypeError("the age of a signal is that of its Reception, not of None")
         if now - reception.arrived > self.max_age or not reception.count:
             return self.stale(now, reception)
         if reception.count != self.count:
@@ -248,16 +253,26 @@ cdef Py_ssize_t _width(char code) except -1:
 
 cdef Run* _runs(object places, Py_ssize_t size) except NULL:
     """Of (vector, begin, offset, count, code), in a message of ``size`` bytes."""
-    cdef Run* runs = <Run*>_zeros(len(places), sizeof(Run))
-    cdef Run* run
-    for i, (vector, begin, offset, count, code) in enumerate(places):
-        run = &runs[i]
-        run.code = ord(code)
-        run.width = _width(run.code)
-        run.offset, run.count, run.vector, run.begin = offset, count, vector, begin
-        if run.offset < 0 or run.offset + run.count * run.width > size:
+    cdef list checked = []
+    cdef Run run
+    cdef Run* runs
+    cdef Py_ssize_t i
+    for vector, begin, offset, count, code in places:
+        run.width = _width(ord(code))
+        if not (offset >= 0 and count >= 0 and offset + count * run.width <= size):
             raise ValueError(f"{count} numbers from byte {offset} on are not in a message of {size} bytes")
+        checked.append((ord(code), run.width, offset, count, vector, begin))
+    runs = <Run*>_zeros(len(checked), sizeof(Run))
+    for i in range(len(checked)):
+        run.code, run.width, run.offset, run.count, run.vector, run.begin = checked[i]
+        runs[i] = run
     return runs
+
+
+cdef Run* _run(object place, Py_ssize_t size) except NULL:
+    """Of a single number, as of (offset, 1, code)."""
+    offset, _, code = place
+    return _runs([(0, 0, offset, 1, code)], size)
 
 
 cdef inline double _read(const char* at, char code) noexcept:
@@ -361,15 +376,19 @@ cdef class Intake:
 
     def __cinit__(self, bytes example, *, fixed, places, stamp, receptions, sizes, lower, upper):
         cdef Py_ssize_t i, size = len(example)
-        if not sum(place[3] for place in places) == sum(sizes) == len(lower) == len(upper):
+        if not (
+            sum(place[3] for place in places) == sum(sizes) == len(lower) == len(upper)
+            and len(sizes) == len(receptions)
+            and min(sizes, default=0) >= 0
+        ):
             raise ValueError("the message has other numbers than the signals")
         self.example = example
         self.fixed = _runs([(0, 0, offset, count, "b") for offset, count in fixed], size)
         self.fixed_count = len(fixed)
         self.runs = _runs(places, size)
         self.run_count = len(places)
-        self.stamp = _runs([(0, 0, *stamp)], size) if stamp is not None else NULL
-        self.receptions = list(receptions)
+        self.stamp = _run(stamp, size) if stamp is not None else NULL
+        self.receptions = [<Reception?>reception for reception in receptions]
         self.sizes = <Py_ssize_t*>_zeros(len(sizes), sizeof(Py_ssize_t))
         for i in range(len(sizes)):
             self.sizes[i] = sizes[i]
@@ -383,7 +402,7 @@ cdef class Intake:
         PyMem_Free(self.sizes)
         PyMem_Free(self.numbers)
 
-    def take(self, bytes data, double last, double now):
+    def take(self, bytes data not None, double last, double now):
         """Tells the receptions of a message that came at the time ``now``.
 
         Returns:
@@ -451,17 +470,21 @@ cdef class Form:
 
     def __cinit__(self, bytes example, *, places, stamp, names, sizes, boxes=None):
         cdef Py_ssize_t i
+        if not len(names) == len(sizes) == (len(names) if boxes is None else len(boxes)):
+            raise ValueError(f"{len(names)} vectors have a size each, and a box each if any has one")
         self.example = example
         self.names = list(names)
         self.boxes = [None] * len(self.names) if boxes is None else list(boxes)
         self.runs = _runs(places, len(example))
         self.run_count = len(places)
-        self.stamp = _runs([(0, 0, *stamp)], len(example)) if stamp is not None else NULL
+        self.stamp = _run(stamp, len(example)) if stamp is not None else NULL
         self.vectors = <double**>_zeros(len(self.names), sizeof(double*))
         self.sizes = <Py_ssize_t*>_zeros(len(self.names), sizeof(Py_ssize_t))
         for i in range(len(self.names)):
             self.sizes[i] = sizes[i]
         for vector, begin, _, count, _ in places:
+            if not 0 <= vector < len(names):
+                raise ValueError(f"there is no vector {vector} among {', '.join(names)}")
             if not 0 <= begin <= begin + count <= sizes[vector]:
                 raise ValueError(f"{names[vector]} has no entries {begin} to {begin + count - 1}")
 
@@ -483,8 +506,10 @@ cdef class Form:
         cdef char* at
         cdef Run* run
         cdef Py_ssize_t i, k
-        for i in range(len(self.names)):
-            entries = entries_of(values.get(self.names[i]), self.sizes[i])
+        # They live as long as this list, even if a mapping makes them when they are asked for.
+        cdef list vectors = [values.get(name) for name in self.names]
+        for i in range(len(vectors)):
+            entries = entries_of(vectors[i], self.sizes[i])
             if entries is NULL:
                 return None
             box = self.boxes[i]
@@ -547,8 +572,8 @@ cdef class Bins:
     def __init__(self, double lowest, double highest, double scale, Py_ssize_t number):
         if self.bins is not NULL:
             raise RuntimeError("bins are divided once")
-        if number < 2 or not 0.0 < lowest < highest:
-            raise ValueError(f"{number} bins from {lowest} to {highest} are none")
+        if number < 2 or not 0.0 < lowest < highest or not 0.0 < scale < INFINITY:
+            raise ValueError(f"{number} bins of the scale {scale} from {lowest} to {highest} are none")
         self.bins = <int64_t*>_zeros(number, sizeof(int64_t))
         self.number = number
         self.lowest, self.highest, self.scale = lowest, highest, scale
@@ -561,6 +586,8 @@ cdef class Bins:
             ValueError: it is NaN.
         """
         cdef Py_ssize_t index
+        if self.bins is NULL:
+            raise RuntimeError("bins have to be divided first")
         if isnan(seconds):
             raise ValueError("NaN is no duration")
         if seconds <= self.lowest:
@@ -568,7 +595,8 @@ cdef class Bins:
         elif seconds >= self.highest:
             index = self.number - 1
         else:
-            index = min(<Py_ssize_t>(log(seconds) * self.scale + self.shift), self.number - 1)
+            # Limited before it becomes an integer: it need not be one.
+            index = <Py_ssize_t>min(max(log(seconds) * self.scale + self.shift, 0.0), <double>(self.number - 1))
         self.bins[index] += 1
         self.count += 1
         self.total += seconds
@@ -588,11 +616,14 @@ cdef class Bins:
             ValueError: there is another number of bins.
         """
         cdef Py_ssize_t i
+        cdef int64_t number
         if len(counts) != self.number:
             raise ValueError(f"this histogram has {self.number} bins, not {len(counts)}")
+        cdef list given = [<int64_t>count for count in counts]  # So all of them are added, or none.
         for i in range(self.number):
-            self.bins[i] += counts[i]
-            self.count += counts[i]
+            number = given[i]
+            self.bins[i] += number
+            self.count += number
         self.total += total
         self._least = min(self._least, least)
         self._largest = max(self._largest, largest)
