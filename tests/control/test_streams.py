@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import socket
 import struct
 import tracemalloc
@@ -76,6 +77,52 @@ def test_frames_are_the_same_in_whatever_pieces_they_come(frames: list[bytes], e
     assert found == frames and not stream.partial
 
 
+@pytest.mark.parametrize("greeted", [True, False])
+def test_large_records_are_the_same_in_whatever_pieces_they_come(greeted: bool) -> None:
+    chosen = random.Random(0)
+    for _ in range(20):
+        sizes = [chosen.choice([0, 5, 2**18 - 12, 2**18 - 13, 2**18, 300_000, 2**20]) for _ in range(4)]
+        sent = [(b"CHANNEL", chosen.randbytes(size)) for size in sizes]
+        stream = GREETING * (not greeted) + b"".join(published(*message) for message in sent)
+        ends = [chosen.randrange(len(stream)) for _ in range(chosen.randrange(40))]
+        records, publications = (Reader(max_message=2**20, greeted=greeted) for _ in range(2))
+        found, taken = [], []
+        for piece in in_pieces(stream, ends):
+            records.append(piece)
+            publications.append(piece)
+            found += cut(records)
+            # Sometimes several pieces come before anything is taken off.
+            while chosen.random() < 0.9 and (come := publications.publication()) is not None:
+                taken.append(come)
+        while (come := publications.publication()) is not None:
+            taken.append(come)
+        expected = [(PUBLISH, message[0], published(*message)) for message in sent]
+        assert found == [(GREET, b"", GREETING)] * (not greeted) + expected
+        assert taken == sent and not records.partial and not publications.partial
+
+
+def test_a_large_record_is_not_copied_and_its_memory_is_not_kept() -> None:
+    size, piece = 1 << 24, bytes(1 << 18)
+    reader = Reader(max_message=size, greeted=True)
+    tracemalloc.start()
+    reader.append(published(b"A", b"")[:-4] + struct.pack(">I", size))
+    for _ in range(size // len(piece)):
+        assert reader.record() is None and reader.partial
+        reader.append(piece)
+    record = reader.record()
+    now, most = tracemalloc.get_traced_memory()
+    assert most < 1.2 * size
+    del record
+    assert tracemalloc.get_traced_memory()[0] < now - size
+    assert tracemalloc.get_traced_memory()[0] < 5 * len(piece)
+    tracemalloc.stop()
+
+
+def test_a_publication_whose_length_cannot_be_told_is_refused() -> None:
+    with pytest.raises(ValueError, match="less than 4 GiB, not 1 and 4294967296 bytes"):
+        publication(b"A", bytes(2**32))
+
+
 @given(CHANNELS, st.binary())
 def test_a_publication_is_written_as_liblcm_does(channel: bytes, data: bytes) -> None:
     assert publication(channel, data) == published(channel, data)
@@ -136,6 +183,9 @@ def test_a_socket_is_read_without_waiting_until_it_is_closed() -> None:
     reader = Reader(max_message=LARGEST, greeted=True)
     with near, far:
         assert reader.receive(near.fileno(), 100) == -1
+        for limit in (0, -1, -(2**31)):
+            with pytest.raises(ValueError, match=f"a positive number of bytes, not {limit}"):
+                reader.receive(near.fileno(), limit)
         far.sendall(published(b"A", bytes(200)))
         assert [reader.receive(near.fileno(), 100) for _ in range(4)] == [100, 100, 13, -1]
         assert reader.publication() == (b"A", bytes(200))

@@ -3,4 +3,5 @@ cdef class Stream:
     cdef char* buffer
     cdef Py_ssize_t room, begin, end
 
-    cdef int _make_room(self, Py_ssize_t size) except -1
+    cdef char* _space(self, Py_ssize_t size) except NULL
+    cdef int _came(self, Py_ssize_t size) except -1

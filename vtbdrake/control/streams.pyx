@@ -26,8 +26,8 @@ cdef class Stream:
         """Whether something has begun and not ended."""
         return self.end > self.begin
 
-    cdef int _make_room(self, Py_ssize_t size) except -1:
-        """For so many bytes more."""
+    cdef char* _space(self, Py_ssize_t size) except NULL:
+        """Where so many bytes more, at least one, may be written."""
         cdef Py_ssize_t have = self.end - self.begin
         cdef Py_ssize_t room = self.room
         if self.begin and have <= self.begin:
@@ -42,17 +42,21 @@ cdef class Stream:
             if buffer is NULL:
                 raise MemoryError
             self.buffer, self.room = buffer, room
+        return self.buffer + self.end
+
+    cdef int _came(self, Py_ssize_t size) except -1:
+        """So many have been written there."""
+        self.end += size
         return 0
 
     def append(self, const unsigned char[::1] data):
         """Adds what has come."""
         cdef Py_ssize_t size = data.shape[0]
         if size:
-            self._make_room(size)
-            memcpy(self.buffer + self.end, &data[0], size)
-            self.end += size
+            memcpy(self._space(size), &data[0], size)
+            self._came(size)
 
-    def receive(self, int fileno, Py_ssize_t limit):
+    def receive(self, int fileno, int limit):
         """Adds what has come by a socket, without waiting, ``limit`` bytes at most; says how many.
 
         Returns:
@@ -60,13 +64,16 @@ cdef class Stream:
 
         Raises:
             OSError: the connection is lost.
+            ValueError: ``limit`` is not positive.
         """
         cdef ssize_t size
-        self._make_room(limit)
+        if limit < 1:
+            raise ValueError(f"the most that is received is a positive number of bytes, not {limit}")
         while True:
-            size = recv(fileno, self.buffer + self.end, limit, MSG_DONTWAIT)
+            # Every time anew: a signal's handler may have read from here, too.
+            size = recv(fileno, self._space(limit), limit, MSG_DONTWAIT)
             if size >= 0:
-                self.end += size
+                self._came(size)
                 return size
             if errno == EAGAIN:
                 return -1

@@ -1,7 +1,8 @@
 """What comes from a client of tcpq (see `tcpq`), cut into its records; compiled."""
 
+from cpython.bytearray cimport PyByteArray_AS_STRING, PyByteArray_FromStringAndSize, PyByteArray_Resize
 from cpython.bytes cimport PyBytes_FromStringAndSize
-from libc.stdint cimport uint32_t
+from libc.stdint cimport UINT32_MAX, uint32_t
 from libc.string cimport memcpy
 
 from vtbdrake.control.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, ProtocolError
@@ -15,6 +16,9 @@ cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
 cdef uint32_t _PUBLISH = PUBLISH
 cdef uint32_t _UNSUBSCRIBE = UNSUBSCRIBE
 
+# What is larger is not copied once more when it is complete: that would take long.
+cdef Py_ssize_t _LARGE = 1 << 18
+
 
 cdef inline uint32_t _word(const char* at) noexcept:
     cdef uint32_t word
@@ -23,10 +27,16 @@ cdef inline uint32_t _word(const char* at) noexcept:
 
 
 def publication(bytes channel, bytes data):
-    """The record that publishes ``data``."""
+    """The record that publishes ``data``.
+
+    Raises:
+        ValueError: it is too long for its length to be told.
+    """
     cdef Py_ssize_t length = len(channel), size = len(data)
     cdef uint32_t head[2]
     cdef uint32_t count = htonl(<uint32_t>size)
+    if length > UINT32_MAX or size > UINT32_MAX:
+        raise ValueError(f"tcpq carries channels and data of less than 4 GiB, not {length} and {size} bytes")
     record = PyBytes_FromStringAndSize(NULL, 12 + length + size)
     cdef char* at = record
     head[0], head[1] = htonl(_PUBLISH), htonl(<uint32_t>length)
@@ -53,22 +63,37 @@ cdef class Reader(Stream):
     # Of the record that begins, as far as it is known.
     cdef uint32_t kind
     cdef Py_ssize_t length, size
+    # That record, if it is a large one: it grows where it stays; and how much of it has come.
+    cdef bytearray large
+    cdef Py_ssize_t filled
 
     def __init__(self, *, max_message, greeted=False):
         self.max_message = max_message
         self.greeted = greeted
 
+    @property
+    def partial(self):
+        """Whether a record has begun, and is not taken off."""
+        return self.large is not None or self.end > self.begin
+
     def record(self):
         """The next record: its type, its channel or pattern, and the record as it came; None if it is not there yet.
+
+        A large one is a bytearray, which is nobody else's.
 
         Raises:
             ProtocolError: the client is of no use any more.
         """
         if not self._whole():
             return None
-        cdef const char* at = self.buffer + self.begin
-        self.begin += self.size
-        whole = PyBytes_FromStringAndSize(at, self.size)
+        cdef const char* at
+        if self.large is not None:
+            at = PyByteArray_AS_STRING(self.large)
+            whole, self.large = self.large, None
+        else:
+            at = self.buffer + self.begin
+            self.begin += self.size
+            whole = PyBytes_FromStringAndSize(at, self.size)
         if self.kind == 0:
             return GREET, b"", whole
         return self.kind, PyBytes_FromStringAndSize(at + 8, self.length), whole
@@ -81,8 +106,13 @@ cdef class Reader(Stream):
         """
         cdef const char* at
         while self._whole():
-            at = self.buffer + self.begin
-            self.begin += self.size
+            large = self.large
+            if large is not None:
+                at = PyByteArray_AS_STRING(large)
+                self.large = None
+            else:
+                at = self.buffer + self.begin
+                self.begin += self.size
             if self.kind == _PUBLISH:
                 return (
                     PyBytes_FromStringAndSize(at + 8, self.length),
@@ -94,6 +124,8 @@ cdef class Reader(Stream):
         """Whether the next record is there; then its type (0 for a greeting), length and size are known."""
         cdef const char* at = self.buffer + self.begin
         cdef Py_ssize_t have = self.end - self.begin
+        if self.large is not None:
+            return self.filled == self.size
         if have < 8:
             return False
         self.kind, self.length = _word(at), _word(at + 4)
@@ -121,4 +153,25 @@ cdef class Reader(Stream):
                     "too large", f"sends a message of {size} bytes, the largest allowed has {self.max_message}"
                 )
             self.size = 12 + self.length + <Py_ssize_t>size
+        if have < self.size and self.size > _LARGE:
+            self.large, self.filled = PyByteArray_FromStringAndSize(at, have), have
+            self.begin = self.end = 0
         return have >= self.size
+
+    cdef char* _space(self, Py_ssize_t size) except NULL:
+        if self.large is None or self.filled == self.size:
+            return Stream._space(self, size)
+        PyByteArray_Resize(self.large, self.filled + size)
+        return PyByteArray_AS_STRING(self.large) + self.filled
+
+    cdef int _came(self, Py_ssize_t size) except -1:
+        if self.large is None or self.filled == self.size:
+            return Stream._came(self, size)
+        cdef Py_ssize_t beyond = self.filled + size - self.size
+        if beyond > 0:  # It belongs to the next one.
+            memcpy(Stream._space(self, beyond), PyByteArray_AS_STRING(self.large) + self.size, beyond)
+            Stream._came(self, beyond)
+        self.filled += size - max(beyond, 0)
+        if self.filled == self.size:
+            PyByteArray_Resize(self.large, self.size)
+        return 0

@@ -33,7 +33,7 @@ _PAIR = struct.Struct(">II")
 GREETING = _PAIR.pack(MAGIC_SERVER, VERSION)
 
 # (type, channel or pattern, the record as it came)
-Record = tuple[int, bytes, bytes]
+Record = tuple[int, bytes, bytes | bytearray]
 
 
 class ProtocolError(Exception):
