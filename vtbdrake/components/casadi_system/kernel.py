@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 
 from vtbdrake.components.casadi_system.compiler import compiled, compiled_if_possible
-from vtbdrake.components.casadi_system.handler import gather
+from vtbdrake.components.casadi_system.handler import evaluator
 
 # casadi.SX or casadi.MX, for which CasADi's functions are overloaded one by one.
 Expression = Any
@@ -31,6 +31,9 @@ class Kernel:
 
     CasADi gives up the interpreter lock while it evaluates, and a system is evaluated in several threads at once: so
     every thread has arrays of its own.
+
+    Attributes:
+        value: y where z is the blocks one after the other. The thread's next call overwrites it.
     """
 
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):
@@ -43,14 +46,7 @@ class Kernel:
         self._y = y
         self._translate = _TRANSLATIONS[compile]
         self._jacobian: _Buffers | None = None
-        self._value = self._buffers(self._name, y)
-
-    def value(self, blocks: Sequence[ArrayLike]) -> NDArray[np.float64]:
-        """y where z is the blocks one after the other. The thread's next call overwrites it."""
-        z, evaluate, y = self._value.parts
-        gather(blocks, z)
-        evaluate()
-        return y
+        self.value = evaluator(self._buffers(self._name, y))
 
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
         """y of AutoDiffXd, by the chain rule dy = (dy/dz) dz, where dy/dz is CasADi's."""

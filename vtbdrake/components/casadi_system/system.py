@@ -132,6 +132,8 @@ def CasadiSystem_(T: type) -> type:
             return Impl._handler(self, result, deliver=BasicVector_[T].set_value, updates=False)
 
         def _update(self, result: Result) -> Callable[[Context, Any], None]:
+            if T is float:
+                return Impl._handler(self, result, deliver=None, updates=True)
             ends = np.cumsum([value.size for value in self._model.state.values()]).tolist()
             groups = [(i, slice(start, end)) for i, (start, end) in enumerate(pairwise([0, *ends]))]
 
@@ -139,13 +141,10 @@ def CasadiSystem_(T: type) -> type:
                 for i, entries in groups:
                     state.set_value(i, following[entries])
 
-            only_one = len(groups) == 1
-            return Impl._handler(
-                self, result, deliver=DiscreteValues_[T].set_value if only_one else deliver, updates=True
-            )
+            return Impl._handler(self, result, deliver=deliver, updates=True)
 
         def _handler(
-            self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None], updates: bool
+            self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None] | None, updates: bool
         ) -> Callable[[Context, Any], None]:
             """See `handler`. It runs in every step of a simulation, where each call of a function in Python counts: so
             there are as few as possible.
@@ -157,8 +156,8 @@ def CasadiSystem_(T: type) -> type:
                 clock=TIME in sources,
                 parameters=Context_[T].get_numeric_parameter if PARAMETER in sources else None,
                 inputs=tuple(self._ports[b.names[0]].Eval for b in result.blocks if b.source == INPUT),
-                state_value=DiscreteValues_[T].value,
-                # A view is cheaper, but there is none of AutoDiffXd.
+                # Views are cheaper, but there are none of AutoDiffXd.
+                state_value=DiscreteValues_[T].value if deliver else DiscreteValues_[T].get_mutable_value,
                 vector_value=BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector,
                 compute=result.kernel.value if T is float else result.kernel.autodiff,
                 deliver=deliver,
