@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vtbdrake.control.guard import Verdict
 
 WRITE, SWITCH, RESET, RESULT = "write", "switch", "reset", "result"
@@ -59,6 +62,13 @@ def time_after(steps: int, *, start: float, period: float) -> float:
     if steps and abs(first * period - start) <= _ON_GRID * period:
         return (first + steps) * period
     return start + steps * period
+
+
+def times_after(steps: NDArray[np.int64], *, start: float, period: float) -> NDArray[np.float64]:
+    """`time_after` of every entry, to the last bit."""
+    first = round(start / period)
+    on_grid = abs(first * period - start) <= _ON_GRID * period
+    return np.where(steps, (first + steps) * period if on_grid else start + steps * period, start)
 
 
 _ON_GRID = 1e-6

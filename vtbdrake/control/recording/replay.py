@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.cycle import SWITCH
+from vtbdrake.control.cycle import SWITCH, times_after
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.log_format import LogError
 from vtbdrake.control.recording.log_header import DPS, versions
@@ -106,7 +106,8 @@ class _AtOnce(ReplayRun):
         changes, digests = self._changes(), {i for i, _ in self._log.digests}
         switched = [i for i, change in self._log.changes if change.kind == SWITCH]
         first = min([*switched, self.count] if self._idle else [0])
-        times = np.array([self._time(self._steps + k) for k in range(self.count - first + 1)])
+        header, steps = self._log.header, self._steps + np.arange(self.count - first + 1)
+        times = times_after(steps, start=header.start_time, period=header.period)
         self.times[:first], self.times[first:] = self._now, times[1:]
         if first < self.count and not self._sources.complete_from(first):
             raise SourcesError("the DPS begins without a value of every sensor signal")
