@@ -162,3 +162,9 @@ def test_a_frame_that_reaches_beyond_the_file_is_a_wrong_checksum(size: int) -> 
 def test_a_place_that_is_not_in_the_file_is_refused(begin: int, end: int) -> None:
     with pytest.raises(IndexError, match=f"bytes {begin} to {end} are not all in the 10 that there are"):
         whole_cycles(bytes(10), np.array([[0, 0, begin, end]]), LAYOUT.dtype)
+
+
+@pytest.mark.parametrize("columns", [0, 1, 3, 5])
+def test_a_place_is_four_numbers(columns: int) -> None:
+    with pytest.raises(ValueError, match=f"not {columns} numbers"):
+        whole_cycles(bytes(10), np.zeros((1, columns), np.int64), LAYOUT.dtype)

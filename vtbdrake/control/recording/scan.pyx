@@ -89,6 +89,8 @@ def find_events(content not None):
 
 
 def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None):
+    if places.shape[1] != 4:
+        raise ValueError(f"a place is number, time, begin and end of an event, not {places.shape[1]} numbers")
     cdef const unsigned char[::1] view = content
     cdef const unsigned char* data = &view[0] if view.shape[0] else NULL
     cdef int64_t size = dtype.itemsize, number_at = dtype.fields["number"][1], size_at = dtype.fields["size"][1]
