@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.bridge import Bridge, Reception
 from vtbdrake.control.cycle import WRITE, Change, time_after
+from vtbdrake.control.parameters import parameters_at_hand
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
 
@@ -52,6 +53,8 @@ class Stepped:
         self._simulator = target.simulator(context, restored=context is not None)
         self._context = self._simulator.get_mutable_context()
         self.time = self.start_time = float(self._context.get_time())
+        # Nobody reads it: to be held is what it is for.
+        self._at_hand = parameters_at_hand(target.diagram, self._context)
         self._ports = RealPorts(target, self._context)
         self.idle = isinstance(target, DpsAlone)
         self.active: tuple[str, ...] = ()

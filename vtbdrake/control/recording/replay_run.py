@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after
+from vtbdrake.control.parameters import parameters_at_hand
 from vtbdrake.control.recording.abstract_values import abstract_values
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.digest import StateDigest
@@ -41,6 +42,8 @@ class ReplayRun:
         begin(log, target, context)
         target.write(context, values)
         self._simulator = self._new_simulator()
+        # Nobody reads it: to be held is what it is for.
+        self._at_hand = parameters_at_hand(target.diagram, context)
         self._ports = RealPorts(target, context)
         self._slow_parts = slow_parts(target.diagram)
         self._idle, self._steps = header.idle, header.steps
