@@ -15,7 +15,7 @@ from pydrake.trajectories import DiscreteTimeTrajectory
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.testbed import DpsAlone
 
-_LONGEST = 1000  # cycles of a stretch: a source looks through all its samples
+_LONGEST = 250  # cycles of a stretch: a source looks through all its samples
 _TOLERANCE = 1e-9  # s, of the time of a sample
 
 
