@@ -119,4 +119,4 @@ class LcmMap:
         to_message = self.encode
         if to_message is None:
             raise ValueError(f"the map of channel {self.channel} has no encode=: it cannot send")
-        return lambda values, utime: to_message(values, utime).encode()
+        return lambda values, utime: bytes(to_message(values, utime).encode())
