@@ -81,7 +81,8 @@ def raw_shortcut(url: str, greeting: bytes = GREETING) -> Iterator[socket.socket
     assert sock is not None
     with sock:
         sock.settimeout(TIMEOUT)
-        sock.sendall(greeting)
+        if greeting:  # To send nothing, too, fails once the hub has hung up.
+            sock.sendall(greeting)
         yield sock
 
 
