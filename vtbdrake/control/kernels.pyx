@@ -12,18 +12,20 @@ from libc.string cimport memcmp, memcpy
 
 cimport numpy as cnp
 
-cnp.import_array()
+from vtbdrake.control.byte_order cimport (
+    get_double,
+    get_float,
+    get_uint16,
+    get_uint32,
+    get_uint64,
+    put_double,
+    put_float,
+    put_uint16,
+    put_uint32,
+    put_uint64,
+)
 
-cdef extern from *:
-    """
-    #include <endian.h>
-    """
-    uint16_t be16toh(uint16_t) nogil
-    uint32_t be32toh(uint32_t) nogil
-    uint64_t be64toh(uint64_t) nogil
-    uint16_t htobe16(uint16_t) nogil
-    uint32_t htobe32(uint32_t) nogil
-    uint64_t htobe64(uint64_t) nogil
+cnp.import_array()
 
 
 # -- vectors
@@ -95,7 +97,7 @@ cdef class Passage:
 
     def __cinit__(self, limits):
         self.size = len(limits)
-        self.limits = _doubles([number for w, f, lower, upper in limits for number in (w, f, lower, upper)])
+        self.limits = _doubles([number for step, change, lower, upper in limits for number in (step, change, lower, upper)])
 
     def __dealloc__(self):
         PyMem_Free(self.limits)
@@ -276,28 +278,16 @@ cdef Run* _run(object place, Py_ssize_t size) except NULL:
 
 
 cdef inline double _read(const char* at, char code) noexcept:
-    cdef uint64_t eight
-    cdef uint32_t four
-    cdef uint16_t two
-    cdef double number
-    cdef float single
-    if code == b"d" or code == b"q":
-        memcpy(&eight, at, 8)
-        eight = be64toh(eight)
-        if code == b"q":
-            return <double><int64_t>eight
-        memcpy(&number, &eight, 8)
-        return number
-    if code == b"f" or code == b"i":
-        memcpy(&four, at, 4)
-        four = be32toh(four)
-        if code == b"i":
-            return <double><int32_t>four
-        memcpy(&single, &four, 4)
-        return <double>single
+    if code == b"d":
+        return get_double(at)
+    if code == b"q":
+        return <double><int64_t>get_uint64(at)
+    if code == b"f":
+        return <double>get_float(at)
+    if code == b"i":
+        return <double><int32_t>get_uint32(at)
     if code == b"h":
-        memcpy(&two, at, 2)
-        return <double><int16_t>be16toh(two)
+        return <double><int16_t>get_uint16(at)
     if code == b"?":
         return <double>(at[0] != 0)
     return <double>(<const int8_t*>at)[0]
@@ -305,39 +295,27 @@ cdef inline double _read(const char* at, char code) noexcept:
 
 cdef inline bint _write(char* at, char code, double number) noexcept:
     """Whether it could be written: integers are rounded (half to even), and must fit."""
-    cdef uint64_t eight
-    cdef uint32_t four
-    cdef uint16_t two
-    cdef float single
     if code == b"d":
-        memcpy(&eight, &number, 8)
-        eight = htobe64(eight)
-        memcpy(at, &eight, 8)
+        put_double(at, number)
         return True
     if code == b"f":
-        single = <float>number
-        if not isfinite(single):
+        if not isfinite(<float>number):
             return False
-        memcpy(&four, &single, 4)
-        four = htobe32(four)
-        memcpy(at, &four, 4)
+        put_float(at, <float>number)
         return True
     number = rint(number)
     if code == b"q":
         if not -9.2e18 < number < 9.2e18:
             return False
-        eight = htobe64(<uint64_t><int64_t>number)
-        memcpy(at, &eight, 8)
+        put_uint64(at, <uint64_t><int64_t>number)
     elif code == b"i":
         if not -2147483648.0 <= number <= 2147483647.0:
             return False
-        four = htobe32(<uint32_t><int32_t>number)
-        memcpy(at, &four, 4)
+        put_uint32(at, <uint32_t><int32_t>number)
     elif code == b"h":
         if not -32768.0 <= number <= 32767.0:
             return False
-        two = htobe16(<uint16_t><int16_t>number)
-        memcpy(at, &two, 2)
+        put_uint16(at, <uint16_t><int16_t>number)
     elif code == b"b":
         if not -128.0 <= number <= 127.0:
             return False
@@ -532,11 +510,9 @@ cdef class Form:
 
 
 cdef inline bint _write_stamp(char* at, char code, int64_t utime) noexcept:
-    cdef uint64_t eight
     if code != b"q":
         return _write(at, code, <double>utime)
-    eight = htobe64(<uint64_t>utime)  # exactly: not every integer is a double
-    memcpy(at, &eight, 8)
+    put_uint64(at, <uint64_t>utime)  # exactly: not every integer is a double
     return True
 
 

@@ -5,12 +5,9 @@ from cpython.bytes cimport PyBytes_FromStringAndSize
 from libc.stdint cimport UINT32_MAX, uint32_t
 from libc.string cimport memcpy
 
+from vtbdrake.control.byte_order cimport get_uint32, put_uint32
 from vtbdrake.control.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, ProtocolError
 from vtbdrake.control.streams cimport Stream
-
-cdef extern from "<arpa/inet.h>" nogil:
-    uint32_t ntohl(uint32_t)
-    uint32_t htonl(uint32_t)
 
 cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
 cdef uint32_t _PUBLISH = PUBLISH
@@ -20,12 +17,6 @@ cdef uint32_t _UNSUBSCRIBE = UNSUBSCRIBE
 cdef Py_ssize_t _LARGE = 1 << 18
 
 
-cdef inline uint32_t _word(const char* at) noexcept:
-    cdef uint32_t word
-    memcpy(&word, at, 4)
-    return ntohl(word)
-
-
 def publication(bytes channel, bytes data):
     """The record that publishes ``data``.
 
@@ -33,16 +24,14 @@ def publication(bytes channel, bytes data):
         ValueError: it is too long for its length to be told.
     """
     cdef Py_ssize_t length = len(channel), size = len(data)
-    cdef uint32_t head[2]
-    cdef uint32_t count = htonl(<uint32_t>size)
     if length > UINT32_MAX or size > UINT32_MAX:
         raise ValueError(f"tcpq carries channels and data of less than 4 GiB, not {length} and {size} bytes")
     record = PyBytes_FromStringAndSize(NULL, 12 + length + size)
     cdef char* at = record
-    head[0], head[1] = htonl(_PUBLISH), htonl(<uint32_t>length)
-    memcpy(at, head, 8)
+    put_uint32(at, _PUBLISH)
+    put_uint32(at + 4, <uint32_t>length)
     memcpy(at + 8, <const char*>channel, length)
-    memcpy(at + 8 + length, &count, 4)
+    put_uint32(at + 8 + length, <uint32_t>size)
     memcpy(at + 12 + length, <const char*>data, size)
     return record
 
@@ -128,7 +117,7 @@ cdef class Reader(Stream):
             return self.filled == self.size
         if have < 8:
             return False
-        self.kind, self.length = _word(at), _word(at + 4)
+        self.kind, self.length = get_uint32(at), get_uint32(at + 4)
         if not self.greeted:
             if self.kind != MAGIC_CLIENT:
                 raise ProtocolError("greeting", f"begins with {self.kind:#010x}, a tcpq client with {MAGIC_CLIENT:#010x}")
@@ -147,7 +136,7 @@ cdef class Reader(Stream):
         if self.kind == _PUBLISH:
             if have < 12 + self.length:
                 return False
-            size = _word(at + 8 + self.length)
+            size = get_uint32(at + 8 + self.length)
             if size > self.max_message:
                 raise ProtocolError(
                     "too large", f"sends a message of {size} bytes, the largest allowed has {self.max_message}"

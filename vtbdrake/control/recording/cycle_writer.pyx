@@ -2,36 +2,21 @@
 
 from cpython.bytes cimport PyBytes_FromStringAndSize
 from libc.stdint cimport int64_t, uint32_t, uint64_t
-from libc.string cimport memcpy, memset
+from libc.string cimport memset
 
 import numpy as np
 
 cimport numpy as cnp
 
+from vtbdrake.control.byte_order cimport put_double, put_uint32, put_uint64
 from vtbdrake.control.kernels cimport entries_of
 from vtbdrake.control.recording.log_format import COMMANDED, CYCLE, EVENT, SENT, SYNC, VECTOR
 
 cnp.import_array()
 
-cdef extern from "<endian.h>" nogil:
-    uint32_t htobe32(uint32_t)
-    uint64_t htobe64(uint64_t)
-
 cdef int64_t _VECTOR = VECTOR
 cdef int _COMMANDED = COMMANDED
 cdef int _SENT = SENT
-
-
-cdef inline void _put_integer(char* at, int64_t number) noexcept:
-    cdef uint64_t bits = htobe64(<uint64_t>number)
-    memcpy(at, &bits, 8)
-
-
-cdef inline void _put_double(char* at, double number) noexcept:
-    cdef uint64_t bits
-    memcpy(&bits, &number, 8)
-    bits = htobe64(bits)
-    memcpy(at, &bits, 8)
 
 
 cdef int _put_vector(char* at, object value, Py_ssize_t size) except -1:
@@ -43,7 +28,7 @@ cdef int _put_vector(char* at, object value, Py_ssize_t size) except -1:
         if entries is NULL:
             raise ValueError(f"a vector has {size} entries, not {len(value)}")
     for i in range(size):
-        _put_double(at + 8 * i, entries[i])
+        put_double(at + 8 * i, entries[i])
     return 0
 
 
@@ -109,15 +94,14 @@ cdef class CycleWriter:
         cdef char* message = self.buffer
         cdef char* at = message + self.begin
         cdef Py_ssize_t size = len(self.buffer)
-        cdef uint32_t frame_size = htobe32(<uint32_t>(before + size))
         cdef dict fed = cycle.fed
         verdict = cycle.verdict
-        _put_integer(message + 4, number)  # in the event's head, after the sync word
-        _put_integer(message + 12, utime)
-        _put_integer(at, utime)
-        _put_integer(at + 8, cycle.number)
-        _put_double(at + 16, cycle.time)
-        _put_double(at + 24, cycle.now)
+        put_uint64(message + 4, <uint64_t>number)  # in the event's head, after the sync word
+        put_uint64(message + 12, <uint64_t>utime)
+        put_uint64(at, <uint64_t>utime)
+        put_uint64(at + 8, <uint64_t><int64_t>cycle.number)
+        put_double(at + 16, cycle.time)
+        put_double(at + 24, cycle.now)
         at[32] = bool(verdict.ok)
         memset(message + self.source, 0, 8 * self.num_sense)
         if self.news:
@@ -130,17 +114,19 @@ cdef class CycleWriter:
             self._put(message, self.commands[name], value, _COMMANDED)
         for name, value in verdict.commands.items():
             self._put(message, self.sent[name], value, _SENT)
-        memcpy(message + self.frame_size, &frame_size, 4)
+        put_uint32(message + self.frame_size, <uint32_t>(before + size))
         return PyBytes_FromStringAndSize(message, size - 4)
 
     cdef int _feed(self, char* message, str name, object value) except -1:
+        cdef int64_t source
         cdef Py_ssize_t i, offset, size
         i, offset, size = self.fed[name]
         if offset:
             _put_vector(message + offset, value, size)
-            _put_integer(message + self.source + 8 * i, _VECTOR)
+            put_uint64(message + self.source + 8 * i, <uint64_t>_VECTOR)
         else:
-            _put_integer(message + self.source + 8 * i, self.abstract[name].accepted(self.sensed[name].count))
+            source = self.abstract[name].accepted(self.sensed[name].count)
+            put_uint64(message + self.source + 8 * i, <uint64_t>source)
         return 0
 
     cdef int _put(self, char* message, tuple place, object value, int bit) except -1:

@@ -11,15 +11,9 @@ from cpython.memoryview cimport PyMemoryView_FromMemory
 from libc.stdint cimport int32_t, int64_t, uint32_t, uint64_t
 from libc.string cimport memcpy
 
+from vtbdrake.control.byte_order cimport get_uint32, get_uint64
 from vtbdrake.control.lcm_maps import LONGEST_CHANNEL_NAME
 from vtbdrake.control.recording.log_format import EVENT, SYNC
-
-cdef extern from *:
-    """
-    #include <endian.h>
-    """
-    uint32_t be32toh(uint32_t) nogil
-    uint64_t be64toh(uint64_t) nogil
 
 cdef packed struct Header:  # EVENT, in the byte order of the file
     uint32_t sync
@@ -32,18 +26,6 @@ assert sizeof(Header) == EVENT.size
 
 cdef uint32_t _SYNC = SYNC
 cdef int64_t _LONGEST_NAME = LONGEST_CHANNEL_NAME
-
-
-cdef inline uint32_t _number4(const unsigned char* at) noexcept nogil:
-    cdef uint32_t number
-    memcpy(&number, at, sizeof(number))
-    return be32toh(number)
-
-
-cdef inline uint64_t _number8(const unsigned char* at) noexcept nogil:
-    cdef uint64_t number
-    memcpy(&number, at, sizeof(number))
-    return be64toh(number)
 
 
 def find_events(content not None):
@@ -59,16 +41,16 @@ def find_events(content not None):
     while at < size:
         header = <const Header*>(data + at)
         whole = size - at >= <int64_t>sizeof(Header)
-        good = whole and be32toh(header.sync) == _SYNC and 0 < be32toh(header.name) <= _LONGEST_NAME
+        good = whole and get_uint32(&header.sync) == _SYNC and 0 < get_uint32(&header.name) <= _LONGEST_NAME
         if good:
-            begin = at + <int64_t>sizeof(Header) + be32toh(header.name)
-            end = begin + be32toh(header.length)
+            begin = at + <int64_t>sizeof(Header) + get_uint32(&header.name)
+            end = begin + get_uint32(&header.length)
             good = end <= size
-        if not good or (end < size and (size - end < 4 or _number4(data + end) != _SYNC)):
+        if not good or (end < size and (size - end < 4 or get_uint32(data + end) != _SYNC)):
             following = content.find(sync, at + 1)
             # Where an event lies within another one, the length of that is wrong; else what follows is.
             if not good or 0 <= following < end:
-                torn = following < 0 and (not whole or be32toh(header.sync) == _SYNC)
+                torn = following < 0 and (not whole or get_uint32(&header.sync) == _SYNC)
                 damages.append((at, "the file ends in the middle of an event" if torn else "no event"))
                 if following < 0:
                     break
@@ -81,7 +63,7 @@ def find_events(content not None):
         if entry is None:
             entry = places[channel] = array("q")
         found = entry
-        place[0], place[1] = <int64_t>be64toh(header.number), <int64_t>be64toh(header.utime)
+        place[0], place[1] = <int64_t>get_uint64(&header.number), <int64_t>get_uint64(&header.utime)
         place[2], place[3] = begin, end
         extend_buffer(found, <char*>place, 4)
         at = end
@@ -107,9 +89,9 @@ def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None)
             raise IndexError(f"bytes {begin} to {end} are not all in the {view.shape[0]} that there are")
         what = "a cycle of another length"
         if end - begin == size:
-            length = <int32_t>_number4(data + begin + size_at)
-            number = <int64_t>_number8(data + begin + number_at)
-            crc = _number4(data + end - 4)
+            length = <int32_t>get_uint32(data + begin + size_at)
+            number = <int64_t>get_uint64(data + begin + number_at)
+            crc = get_uint32(data + end - 4)
             if not size < length <= end or crc != <uint32_t>crc32(
                 PyMemoryView_FromMemory(<char*>data + end - length, length - 4, PyBUF_READ)
             ):
