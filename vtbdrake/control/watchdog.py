@@ -110,10 +110,14 @@ class Watchdog(Freshness):
 
     def examine(self, now: float, reception: Reception) -> Fault | None:
         fault = None
-        if self._range is None or self._range != reception.range:
-            fault = self._implausible(now, reception)
-        elif not self._compares:
-            self.trusted = reception.range
+        # Mostly they are not only equal but the same, from the second time on.
+        if self._range is not reception.range:
+            if self._range == reception.range:
+                self._range = reception.range
+            else:
+                fault = self._implausible(now, reception)
+        if not self._compares:
+            self.trusted = self._range
         if fault is None and self._tolerates:
             fault = self._jump(now, reception)
         if fault is None and self._delay is not None:
