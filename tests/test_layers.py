@@ -24,6 +24,10 @@ BELOW: dict[str, set[str]] = {
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization"},
 }
+# One module, which needs nothing of ours and not Drake: how objects travel to other processes.
+for _layers in BELOW.values():
+    _layers.add("pickling")
+BELOW["pickling"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

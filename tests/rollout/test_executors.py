@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -48,6 +49,22 @@ def test_what_cannot_travel_is_an_error_with_the_remedy():
     task = RolloutTask(AcrobotScenario(), 1.0, Quality(lambda t: float(lock.locked()), "time"))
     with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
         run_rollouts(executor, task, [{}], progress=False)
+
+
+def test_a_value_that_cannot_travel_is_named():
+    task = RolloutTask(AcrobotScenario(), 0.1, Quality(_angle, SHOULDER))
+    points = [{SHOULDER: 0.1, "dps.gain": threading.Lock()}]
+    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="dps.gain = <unlocked .* cannot be sent"):
+        list(executor.run(task, points))
+
+
+def test_a_module_that_workers_do_not_have_is_named(monkeypatch):
+    module = ModuleType("only_here")
+    exec("def f(theta):\n    return theta ** 2", module.__dict__)
+    monkeypatch.setitem(sys.modules, "only_here", module)
+    task = RolloutTask(AcrobotScenario(), 0.1, Quality(module.f, SHOULDER))
+    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="No module named 'only_here'"):
+        list(executor.run(task, [{}]))
 
 
 @pytest.mark.parametrize(("how", "kind"), [(KILL, "died"), (STOP, "time limit")])

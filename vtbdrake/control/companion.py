@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import select
 import signal
 import socket
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from vtbdrake.control.streams import Frames
+from vtbdrake.pickling import dumps
 
 _log = logging.getLogger(__name__)
 
@@ -78,8 +80,6 @@ class Companion:
     """
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
-        import cloudpickle
-
         program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.companion import main; main()"
         self.name = name
         self.dropped = 0
@@ -100,7 +100,7 @@ class Companion:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
-        self.post(cloudpickle.dumps((function, arguments)))
+        self.post(dumps((function, arguments)))
 
     @property
     def pid(self) -> int:
@@ -243,8 +243,6 @@ class Companion:
 
 def main() -> None:
     """The main program of a companion."""
-    import cloudpickle
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     # The loop may be confined to processors of its own, where nothing else is to work.
@@ -252,7 +250,7 @@ def main() -> None:
     with socket.socket(fileno=int(sys.argv[1])) as line:
         channel = Channel(line)
         try:
-            function, arguments = cloudpickle.loads(channel.receive())
+            function, arguments = pickle.loads(channel.receive())
             function(channel, *arguments)
         except (EOFError, BrokenPipeError, ConnectionResetError):
             return  # The loop's process has ended, or has closed the line.

@@ -16,6 +16,7 @@ from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import RESULT as CHANGE
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
 from vtbdrake.control.statistics import Histogram
+from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_function import Arrays, split_memory
 from vtbdrake.testbed.slow_part import SlowPart
 
@@ -224,10 +225,8 @@ class _Beside:
 
 
 def _sendable(path: str, part: SlowPart) -> bytes:
-    import cloudpickle
-
     try:
-        return bytes(cloudpickle.dumps(part.function))
+        return dumps(part.function)
     except Exception as error:
         raise ValueError(
             f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "

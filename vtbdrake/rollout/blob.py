@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cloudpickle
-
+from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
@@ -55,14 +54,49 @@ class Blobs:
 
 def _pickled(task: RolloutTask) -> Blob:
     try:
-        # cloudpickle also takes functions and scenarios that are defined in a notebook or a script.
-        content = bytes(cloudpickle.dumps(task))
+        content = dumps(task)
     except Exception as error:
         raise WorkerError(
             f"the problem cannot be sent to another process ({type(error).__name__}: {error}): use executor='threads' "
-            "or 'serial', or keep what cannot be pickled out of its quality function and scenario"
+            "or 'serial', keep what cannot be pickled out of its quality function and scenario, or move the class or "
+            "function that holds it from the notebook or script into a module"
         ) from error
     return Blob(content, hashlib.blake2b(content, digest_size=16).hexdigest())
+
+
+def pack(point: Mapping[str, Any]) -> bytes:
+    """Return a point (address -> value) as bytes; `unpack` reads them.
+
+    Raises:
+        WorkerError: a value cannot be pickled.
+    """
+    try:
+        return dumps(dict(point))
+    except Exception:
+        for address, value in point.items():
+            try:
+                dumps(value)
+            except Exception as error:
+                raise WorkerError(
+                    f"{address} = {value!r} cannot be sent to another process ({type(error).__name__}: {error}): vary "
+                    "a value that pickles, or use executor='threads' or 'serial'"
+                ) from error
+        raise
+
+
+def unpack(content: bytes) -> Any:
+    """Return what was pickled in another process.
+
+    Raises:
+        WorkerError: this process cannot import what it takes.
+    """
+    try:
+        return pickle.loads(content)
+    except Exception as error:
+        raise WorkerError(
+            f"a worker process cannot read what it was sent ({type(error).__name__}: {error}): it needs the same "
+            "modules as the main process, in the same versions"
+        ) from error
 
 
 class _Kept:
@@ -76,7 +110,7 @@ class _Kept:
     def task(self, blob: Blob) -> RolloutTask:
         with self._lock:
             if blob.digest not in self._tasks:
-                self._tasks[blob.digest] = pickle.loads(blob.content)
+                self._tasks[blob.digest] = unpack(blob.content)
                 if len(self._tasks) > _KEPT:
                     self._tasks.popitem(last=False)
             self._tasks.move_to_end(blob.digest)
@@ -88,10 +122,14 @@ _kept = _Kept()
 
 def run_blob(
     blob: Blob,
-    point: Mapping[str, Any],
+    point: bytes,
     *,
     cancel: threading.Event | None = None,
     begin: Callable[[], Any] | None = None,
 ) -> RolloutResult:
-    """One rollout of the task in ``blob``, in a process that keeps its testbed until the next; see `Runners.run`."""
-    return _kept.runners.run(_kept.task(blob), point, cancel=cancel, begin=begin)
+    """One rollout of the task in ``blob``, in a process that keeps its testbed until the next; see `Runners.run`.
+
+    Args:
+        point: as `pack` made it.
+    """
+    return _kept.runners.run(_kept.task(blob), unpack(point), cancel=cancel, begin=begin)

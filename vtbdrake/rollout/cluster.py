@@ -10,12 +10,12 @@ import threading
 import time
 import uuid
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import inf, isfinite
 from typing import Any
 
-from vtbdrake.rollout.blob import Blob, Blobs, run_blob
+from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob, unpack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.processes import checked_time_limit
 from vtbdrake.rollout.result import RolloutResult
@@ -120,7 +120,7 @@ class DaskExecutor(Executor):
     def _submit(self, name: str, index: int, point: Parameters) -> Future[bytes]:
         key = f"rollout-{uuid.uuid4().hex}"
         try:
-            return self._client.submit(roll_on_dask, name, index, dict(point), self._time_limit, key=key, pure=False)
+            return self._client.submit(roll_on_dask, name, index, pack(point), self._time_limit, key=key, pure=False)
         except ClosedClientError as error:
             raise _given_up(error) from error
 
@@ -193,13 +193,13 @@ class TaskPlugin(WorkerPlugin):
         self.blob = blob
 
 
-def roll_on_dask(name: str, index: int, point: Mapping[str, Any], time_limit: float) -> bytes:
+def roll_on_dask(name: str, index: int, point: bytes, time_limit: float) -> bytes:
     """One rollout on a worker, of the task that it knows by ``name``; the answer is that of `worker.answer`."""
     plugin: Any = get_worker().plugins[name]
     return answer(index, partial(_roll, plugin.blob, point, time_limit))
 
 
-def _roll(blob: Blob, point: Mapping[str, Any], time_limit: float) -> RolloutResult:
+def _roll(blob: Blob, point: bytes, time_limit: float) -> RolloutResult:
     cancel = threading.Event()
     timers = [threading.Timer(time_limit, cancel.set), threading.Timer(2.0 * time_limit, _die, [time_limit])]
 
@@ -211,7 +211,7 @@ def _roll(blob: Blob, point: Mapping[str, Any], time_limit: float) -> RolloutRes
     try:
         return run_blob(blob, point, cancel=cancel, begin=begin)
     except CancelledError:
-        return failed(point, f"it took longer than its time limit of {time_limit:g} s")
+        return failed(unpack(point), f"it took longer than its time limit of {time_limit:g} s")
     finally:
         for timer in timers:
             timer.cancel()

@@ -5,11 +5,10 @@ from __future__ import annotations
 import concurrent.futures
 import pickle
 import queue
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
-from vtbdrake.rollout.blob import Blob, Blobs, run_blob
+from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
@@ -77,7 +76,7 @@ class FuturesExecutor(Executor):
 
     def _submit(self, blob: Blob, index: int, point: Parameters) -> _Future:
         try:
-            return self._pool.submit(roll, blob, index, dict(point))
+            return self._pool.submit(roll, blob, index, pack(point))
         except RuntimeError as error:  # It is broken, or was shut down.
             raise WorkerError(f"the pool {type(self._pool).__name__} takes no more rollouts: {error}") from error
 
@@ -100,6 +99,6 @@ def _result(future: _Future, point: Parameters) -> RolloutResult:
     return result
 
 
-def roll(blob: Blob, index: int, point: Mapping[str, Any]) -> bytes:
+def roll(blob: Blob, index: int, point: bytes) -> bytes:
     """One rollout in a worker of any pool; the answer is that of `worker.answer`."""
     return answer(index, partial(run_blob, blob, point))

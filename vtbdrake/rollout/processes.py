@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from vtbdrake.rollout.arguments import as_number
-from vtbdrake.rollout.blob import Blobs
+from vtbdrake.rollout.blob import Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
@@ -169,7 +169,7 @@ class ProcessExecutor(Executor):
         """Gives the next one, unless the worker has died; one that is large is not given ahead."""
         index = waiting[0]
         kind = b"R" if self._time_limit == inf else b"L"
-        message = kind + pickle.dumps((index, dict(points[index])))
+        message = kind + pickle.dumps((index, pack(points[index])))
         if worker.jobs and len(message) > _SMALL:
             return True
         waiting.popleft()

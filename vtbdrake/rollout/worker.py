@@ -9,6 +9,8 @@ from functools import cache, partial
 from multiprocessing.connection import Connection
 from typing import Any
 
+from vtbdrake.pickling import dumps
+from vtbdrake.rollout.blob import unpack
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import Runners, Testbeds
@@ -27,7 +29,7 @@ def serve(connection: Connection, runners: Runners) -> None:
             kind, content = message[:1], message[1:]
             if kind == b"T":
                 # The same task each time, for its runner is known by it; what cannot be read raises each time.
-                load = cache(partial(pickle.loads, content))
+                load = cache(partial(unpack, content))
                 continue
             index, point = pickle.loads(content)
             assert load is not None, "a worker got a rollout before its task"
@@ -38,9 +40,9 @@ def serve(connection: Connection, runners: Runners) -> None:
 
 
 def _rollout(
-    runners: Runners, load: Callable[[], RolloutTask], point: Any, begin: Callable[[], Any] | None
+    runners: Runners, load: Callable[[], RolloutTask], point: bytes, begin: Callable[[], Any] | None
 ) -> RolloutResult:
-    return runners.run(load(), point, begin=begin)
+    return runners.run(load(), unpack(point), begin=begin)
 
 
 def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
@@ -50,17 +52,24 @@ def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
     except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
         return _pickled_error(index, error)
     try:
-        return pickle.dumps((index, result))
+        return _bytes((index, result))
     except Exception as error:
         remedy = f"a result cannot be sent from a worker process ({error}): record vectors, or use executor='serial'"
         return _pickled_error(index, TypeError(remedy))
+
+
+def _bytes(answer: tuple[int, Any]) -> bytes:
+    try:
+        return pickle.dumps(answer)
+    except Exception:  # Of a class that the main program defines: it goes back as it came.
+        return dumps(answer)
 
 
 def _pickled_error(index: int, error: BaseException) -> bytes:
     try:
         if isinstance(error, SystemExit):
             raise TypeError("an exit of the worker is an error of the main program")
-        reply = pickle.dumps((index, error))
+        reply = _bytes((index, error))
         pickle.loads(reply)  # Some exceptions pickle but cannot be read again.
     except Exception:
         reply = pickle.dumps((index, RuntimeError(f"{type(error).__name__}: {error}")))
