@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import System
@@ -11,7 +13,7 @@ from pydrake.systems.primitives import LinearSystem, MatrixGain
 
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Parameter, Problem
-from vtbdrake.rollout import Quality
+from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutTask
 from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
 
 THETA = "sim.sys.Pendulum.theta.position"
@@ -63,6 +65,32 @@ class DoubleIntegratorScenario(Scenario):
         )
         builder.sim_sensor("state", mass.get_output_port())
         builder.sim_actuator("force", mass.get_input_port())
+
+
+class StatedExecutor(Executor):
+    """Rollouts that are not simulated: a function states their outcomes.
+
+    Args:
+        outcome: maps what is set in s0 to (the quality, the further measures), or to None if the simulation fails.
+    """
+
+    def __init__(self, outcome: Callable[[Mapping[str, Any]], tuple[float, tuple[float, ...]] | None]) -> None:
+        self._outcome = outcome
+
+    def run(self, task: RolloutTask, points: Sequence[Mapping[str, Any]]) -> Iterator[tuple[int, RolloutResult]]:
+        for index, point in enumerate(points):
+            found, none = self._outcome(point), np.array([])
+            if found is None:
+                yield index, RolloutResult(point, "failed", none, none, message="stated to fail", wall_time=0.0)
+                continue
+            value, measures = found
+            h = float(task.quality.quality(value)) if task.quality else value
+            yield (
+                index,
+                RolloutResult(
+                    point, "horizon", none, none, t_star=0.0, h=h, value=value, measures=measures, wall_time=0.0
+                ),
+            )
 
 
 def run_for_ever(path: str, executor: str) -> None:

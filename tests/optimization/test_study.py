@@ -1,10 +1,12 @@
 """A study: what it finds, and that neither executor nor interruption changes it."""
 
+import os
 import random
 import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +26,8 @@ from tests.optimization.studies import (
 )
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
+from vtbdrake.optimization.solvers import Solver
+from vtbdrake.optimization.solvers.catalogue import CATALOGUE
 from vtbdrake.rollout import Constraint, Quality, QualityError
 from vtbdrake.testbed import SimulatorFields
 
@@ -146,7 +150,7 @@ def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
     path = tmp_path / "parts.db"
     first = pendulum_problem().study(path, solver=solver, seed=2)
     # As if it had been interrupted: the budget that the solver is made for is that of the run.
-    first._file.set("evaluations", 45)
+    first._file.set("budget", 45)
     first.run(rollouts=17, executor="serial", progress=False).close()
     with pendulum_problem().study(path) as second:
         assert second.run(rollouts=45, executor="threads", progress=False).reason == whole.reason
@@ -191,7 +195,7 @@ def test_points_given_between_two_budgets_are_told_where_the_study_goes_on(tmp_p
     study.add([0.25, 0.0])
     study.run(rollouts=40, executor="serial", progress=False)
     assert len(study) == len(study.trials) == 40
-    assert [t.number for t in study.trials if t.origin == "user"] == [24 + 4]
+    assert [t.number for t in study.trials if t.origin == "user"] == [24]
 
 
 def test_a_study_of_a_solver_that_cannot_be_told_again_ends_with_a_spent_budget_too():
@@ -241,7 +245,7 @@ def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
         study.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
         resumed = table(study)
     whole = pendulum_problem().study(solver="cmaes", seed=3)
-    whole._file.set("evaluations", 100_000)
+    whole._file.set("budget", 100_000)
     whole.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
     assert resumed == table(whole)
 
@@ -346,6 +350,57 @@ def test_a_solver_that_asks_only_for_what_is_known_ends_a_study():
 def test_a_budget_that_makes_no_sense_is_refused(budget, message):
     with pytest.raises(ValueError, match=message):
         pendulum_problem().study().run(**budget)
+
+
+def test_points_given_by_hand_have_their_turn_before_a_design_that_takes_the_whole_budget():
+    study = pendulum_problem().study(solver="sobol")
+    study.add([0.25, 0.0], [0.5, 1.0])
+    study.run(rollouts=10, executor="serial", progress=False)
+    assert [t.origin for t in study.trials] == ["user"] * 2 + ["solver"] * 8
+    # A design that is complete cannot be spared what was added since.
+    study.add([0.75, 0.0])
+    study.run(rollouts=11, executor="serial", progress=False)
+    assert [tuple(t.parameters.values()) for t in study.trials if t.origin == "user"][2:] == [(0.75, 0.0)]
+
+
+class Thinker(Solver):
+    """Asks for one point, and then thinks for ever."""
+
+    name = "thinker"
+
+    def __init__(self, search, *, name, disturb=None):
+        self._asked = False
+        self._disturb = disturb
+        self._never = threading.Event()
+
+    def ask(self):
+        if not self._asked:
+            self._asked = True
+            return [(0.5, 0.5)]
+        if self._disturb is not None:
+            os.kill(os.getpid(), signal.SIGINT)
+        self._never.wait()
+        return []
+
+    def tell(self, evaluations):
+        return
+
+    def close(self):
+        self._never.set()
+
+
+@pytest.mark.parametrize(
+    ("disturb", "budget", "reason"),
+    [(None, {"seconds": 0.5}, "time"), (1, {"seconds": 60.0}, "interrupted"), (1, {"rollouts": 10}, "interrupted")],
+)
+def test_a_study_ends_while_its_solver_thinks(tmp_path, monkeypatch, disturb, budget, reason):
+    monkeypatch.setitem(CATALOGUE, "thinker", Thinker)
+    options = {} if disturb is None else {"disturb": disturb}
+    with pendulum_problem().study(tmp_path / "a.db", solver="thinker", options=options) as study:
+        study.run(**budget, executor="serial", progress=False)
+        assert study.reason == reason and len(study) == len(study.trials) == 1
+    with Study.open(tmp_path / "a.db") as again:
+        assert again.trials[0].parameters == {THETA: 0.5, RATE: 0.5}
 
 
 # -- bad input
@@ -470,7 +525,7 @@ def test_given_points_are_checked_at_once(tmp_path):
         study.add(2.0)
     with pytest.raises(ValueError, match="wrong about nonsense"):
         study.add({THETA: 0.0, RATE: 0.0, "nonsense": 1.0})
-    assert study._file.waiting() == 0
+    assert study._file.queue() == []
 
 
 def test_a_study_says_what_it_is_about_and_what_happened(tmp_path):

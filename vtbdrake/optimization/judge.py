@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from math import ceil, inf, nan
+from dataclasses import replace
+from math import ceil, inf, isnan, nan
 
 import numpy as np
 
@@ -28,7 +30,10 @@ class Judge:
         run: runs the rollouts of some rows.
         racing: drop a point as soon as it can no longer be better than the best one known, whatever the conditions
             that it has not seen would say. It never drops the winner: the risk does not fall when a quality rises,
-            and the best that a quality can be is `Quality.upper` (of a cost, 0).
+            and the best that a quality can be is `Quality.upper` (of a cost, 0). A quality without ``upper`` can be
+            anything: under the mean, say, no point is dropped for its value then.
+        budget: how many rollouts the points may take together; only as many points run side by side as can be judged
+            to their end.
 
     Attributes:
         best: the best evaluation so far; None where there are several qualities.
@@ -57,6 +62,8 @@ class Judge:
         self.best: Evaluation | None = None
         # Not what is known, of which a study that is resumed has more.
         self._needed: set[Row] = set()
+        # How many rows each point has needed since it was last told.
+        self._news: Counter[Point] = Counter()
 
     def judge(self, points: Sequence[Point]) -> list[Evaluation]:
         """One evaluation per point, in their order."""
@@ -66,7 +73,11 @@ class Judge:
             count = self._affordable(len(waiting))
             evaluations |= self._judge_together(waiting[:count])
             waiting = waiting[count:]
-        return [evaluations[point] for point in points]
+        return [replace(evaluations[point], effort=self._effort(point)) for point in points]
+
+    def _effort(self, point: Point) -> float:
+        """The `Evaluation.effort` of a point that is going to be told."""
+        return self._news.pop(point, 0) / len(self._conditions)
 
     def _affordable(self, count: int) -> int:
         """How many of ``count`` points are judged together."""
@@ -84,7 +95,9 @@ class Judge:
         return evaluations
 
     def _complete(self, rows: Sequence[Row]) -> None:
-        self._needed.update(rows)
+        new = dict.fromkeys(row for row in rows if row not in self._needed)
+        self._needed.update(new)
+        self._news.update(point for point, _ in new)
         missing = [row for row in rows if row not in self._known]
         if missing:
             self._run(missing)
@@ -109,9 +122,9 @@ class Judge:
         """Lets the point that does best in the first condition meet the others too: the rest is held against it."""
         first = list(self._conditions)[:1]
         self._complete([(point, condition) for point in points for condition in first])
-        leads = [evaluation for point in points if (evaluation := self.evaluation(point, first)).feasible]
+        leads = [point for point in points if self.evaluation(point, first).feasible]
         if leads:
-            leader = max(leads, key=lambda evaluation: evaluation.values[0]).point
+            leader = max(leads, key=lambda point: self._known[point, first[0]].value * self._signs[0])
             self._complete([(leader, condition) for condition in self._conditions])
             self._remember(self.evaluation(leader))
 
@@ -145,7 +158,10 @@ class Judge:
         for k, (quality, sign) in enumerate(zip(objectives, self._signs, strict=True)):
             bound = sign * quality.bound(self._problem.task.horizon)
             h = [bound if o is None else sign * (o.value if k == 0 else o.measures[k - 1]) for o in outcomes]
-            values.append(self._problem.risk(np.array(h)))
+            # A risk of the user's may make NaN of infinities, where nothing bounds what is not seen.
+            with np.errstate(invalid="ignore"):
+                value = float(self._problem.risk(np.array(h)))
+            values.append(inf if isnan(value) and not exact else value)
         violations = [
             max((outcome.measures[len(objectives) - 1 + k] for outcome in seen), default=-inf)
             for k in range(constraints)

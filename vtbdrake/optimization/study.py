@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import Executor as FuturesExecutor
-from math import ceil
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.optimization.identity import describe, differences, plain_options, revision, versions
@@ -74,7 +73,7 @@ class Study(StudyRecord):
             "units": list(problem.units),
         }
         # An unknown solver, or one that cannot solve the problem, is told before there is a file.
-        made = _solver(problem, meta, budget=None)
+        made = _solver(problem, meta, rollouts=None)
         made.close()
         meta["solver"] = made.name
         given = {"solver": solver, "seed": seed, "options": options}
@@ -152,15 +151,14 @@ class Study(StudyRecord):
         return self
 
     def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
-        # With racing, a point may take one rollout only.
-        wanted = None if rollouts is None else ceil(rollouts / (1 if racing else len(problem.conditions)))
         self._meta = self._file.meta
-        made_for = self._meta.get("evaluations", 0)
+        made_for, raced = self._meta.get("budget", 0), self._meta.get("racing")
         # Another budget may be another sequence: a smaller one only ends the same one earlier.
-        if made_for is not None and (wanted is None or wanted > made_for):
-            self._file.begin_anew(evaluations=wanted)
+        larger = made_for is not None and (rollouts is None or rollouts > made_for)
+        if larger or racing != raced:
+            self._file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
             self._meta = self._file.meta
-        return _solver(problem, self._meta, budget=self._meta["evaluations"])
+        return _solver(problem, self._meta, rollouts=self._meta["budget"])
 
     def add(self, *points: Any) -> None:
         """Gives points by hand, each a mapping address -> value or values in the order of the parameters.
@@ -197,7 +195,9 @@ class Study(StudyRecord):
         return len(points)
 
 
-def _solver(problem: Problem, meta: Mapping[str, Any], *, budget: int | None) -> Solver:
+def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None) -> Solver:
+    """The solver of a study, made for a budget of rollouts."""
+    budget = None if rollouts is None else -(-rollouts // len(problem.conditions))
     return make_solver(
         meta["solver"],
         problem.parameters,

@@ -231,13 +231,16 @@ class StudyFile:
             if told is not None:
                 self._db.execute("INSERT OR REPLACE INTO meta VALUES ('told', ?)", (json.dumps(told),))
 
-    def begin_anew(self, *, evaluations: int | None) -> None:
-        """The solver is told from the start, for another budget. Trials so far stay, at positions below 0."""
+    def begin_anew(self, *, budget: int | None, racing: bool) -> None:
+        """The solver is told from the start, for another budget of rollouts, or with racing where there was none, say.
+
+        Trials so far stay, at positions below 0.
+        """
         (first, last) = self._read("SELECT min(position), max(position) FROM trials")[0]
         with self._transaction():
             if first is not None:
                 self._db.execute("UPDATE trials SET position = position - ?", (last - first + 1,))
-            rows = [("evaluations", json.dumps(evaluations)), ("told", json.dumps(0))]
+            rows = [(key, json.dumps(value)) for key, value in (("budget", budget), ("racing", racing), ("told", 0))]
             self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows)
 
     def trials(self) -> list[TrialRow]:
@@ -279,9 +282,10 @@ class StudyFile:
         rows = self._read("SELECT point FROM given WHERE batch = ? ORDER BY number", (batch,))
         return [decode(point) for (point,) in rows]
 
-    def waiting(self) -> int:
-        """How many points wait in the queue."""
-        return int(self._read("SELECT count(*) FROM given WHERE batch IS NULL")[0][0])
+    def queue(self) -> list[Point]:
+        """The points given by hand that wait to be judged."""
+        rows = self._read("SELECT point FROM given WHERE batch IS NULL ORDER BY number")
+        return [decode(point) for (point,) in rows]
 
 
 def encode(point: Point) -> str:

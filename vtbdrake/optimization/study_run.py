@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Sequence
 from math import inf, isfinite, isnan
+from queue import Empty, SimpleQueue
 
 from tqdm.auto import tqdm
 
@@ -28,7 +30,12 @@ _WITHOUT_NEWS = 50
 
 
 class _SpentError(Exception):
-    """The run is over, in the middle of a batch: (reason, message)."""
+    """The run is over, in the middle of a batch."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.message = message
 
 
 class StudyRun:
@@ -43,7 +50,7 @@ class StudyRun:
         self._executor = executor
         self._known: dict[Row, Outcome] = file.outcomes()
         # Not that of this run: how points are judged must not depend on where a study is interrupted.
-        budget = file.meta["evaluations"]
+        budget = file.meta["budget"]
         self._judge = Judge(
             problem, self._known, self._roll_out, racing=racing, budget=inf if budget is None else budget
         )
@@ -71,42 +78,91 @@ class StudyRun:
         with tqdm(total=rollouts, initial=len(self._known), desc=name, unit="rollout", disable=not shown) as self._bar:
             try:
                 return self._batches()
+            except _SpentError as spent:
+                return spent.reason, spent.message
+            except KeyboardInterrupt:
+                _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._known))
+                return INTERRUPTED, "it was interrupted"
             finally:
                 self._solver.close()
 
     def _batches(self) -> tuple[str, str]:
+        if self._told < self._new_from:
+            self._roll_out_queue()
         batch, silent = self._resume(), 0
-        while True:
-            if silent >= _WITHOUT_NEWS:
-                return SOLVER, f"{self._solver.name} asks only for points that are known"
+        while silent < _WITHOUT_NEWS:
             before = len(self._known)
-            method = self._solver.method
-            asked = [self._problem.point(point) for point in self._solver.ask()]
-            # A batch that was told before gets no new points by hand: it is to be what it was.
-            given = self._file.take(batch, new=batch >= self._new_from)
-            if not asked and not given:
+            if not self._one_batch(batch):
                 return SOLVER, self._solvers_end()
-            points = [*asked, *given]
-            try:
-                self._refuse_success(points)
-                evaluations = self._judge.judge(points)
-            except BaseException as error:
-                self._record(
-                    batch, [self._judge.evaluation(point) for point in points], len(asked), method, ended=False
-                )
-                if isinstance(error, _SpentError):
-                    return error.args[0], error.args[1]
-                if isinstance(error, KeyboardInterrupt):
-                    _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._known))
-                    return INTERRUPTED, "it was interrupted"
-                raise
-            self._solver.tell([self._with_gradient(evaluation) for evaluation in evaluations])
-            if batch >= self._told:
-                self._record(batch, evaluations, len(asked), method, ended=True)
             if batch >= self._new_from:
                 silent = 0 if len(self._known) > before else silent + 1
             self._show()
             batch += 1
+        return SOLVER, f"{self._solver.name} asks only for points that are known"
+
+    def _one_batch(self, batch: int) -> bool:
+        """Judges the points given by hand, then what the solver asks for; returns whether there were any."""
+        # A batch that was told before gets no new points by hand: it is to be what it was.
+        given = self._file.take(batch, new=batch >= self._new_from)
+        asked: list[Point] = []
+        try:
+            # By hand first: a solver may ask for all that the budget allows.
+            by_hand = self._judge_given(given)
+            asked = [self._problem.point(point) for point in self._ask()]
+            evaluations = self._judge_asked(asked)
+        except BaseException:
+            # It is judged again in the next run. What is complete can be seen until then.
+            self._record(
+                batch, *([self._judge.evaluation(p) for p in points] for points in (given, asked)), ended=False
+            )
+            raise
+        if batch >= self._told and (given or asked):
+            self._record(batch, by_hand, evaluations, ended=True)
+        return bool(given or asked)
+
+    def _roll_out_queue(self) -> None:
+        """Runs the points given by hand before a solver that was made anew comes to what is new.
+
+        It is told of them where the study goes on. Until then it would ask for what is known and, in the same batch,
+        for more than the budget allows.
+        """
+        points = self._file.queue()
+        rows = [(point, condition) for point in points for condition in range(len(self._problem.conditions))]
+        try:
+            self._roll_out([row for row in dict.fromkeys(rows) if row not in self._known])
+        finally:
+            self._record(self._new_from, [self._judge.evaluation(point) for point in points], [], ended=False)
+
+    def _judge_given(self, points: Sequence[Point]) -> list[Evaluation]:
+        if not points:
+            return []
+        self._refuse_success(points)
+        evaluations = self._judge.judge(points)
+        self._solver.tell(evaluations)
+        return evaluations
+
+    def _judge_asked(self, points: Sequence[Point]) -> list[Evaluation]:
+        if not points:
+            return []
+        self._refuse_success(points)
+        evaluations = self._judge.judge(points)
+        self._solver.tell([self._with_gradient(evaluation) for evaluation in evaluations])
+        return evaluations
+
+    def _ask(self) -> list[Point]:
+        """What the solver asks for. It is not waited for beyond the time limit, however long it thinks."""
+        if self._deadline == inf:
+            return self._solver.ask()
+        answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
+        # A daemon, so that a solver that never answers does not keep the program from its end.
+        threading.Thread(target=_think, args=(self._solver, answer), name="study: solver thinks", daemon=True).start()
+        try:
+            points = answer.get(timeout=max(0.0, self._deadline - time.monotonic()))
+        except Empty:
+            raise _SpentError(TIME, f"the time is over, while {self._solver.name} was thinking") from None
+        if isinstance(points, BaseException):
+            raise points
+        return points
 
     def _resume(self) -> int:
         """The batch to begin with: the first for a solver that can be told again, else the one where the study is."""
@@ -166,8 +222,9 @@ class StudyRun:
         if time.monotonic() >= self._deadline:
             raise _SpentError(TIME, "the time is over")
 
-    def _record(self, batch: int, evaluations: Sequence[Evaluation], asked: int, method: str, *, ended: bool) -> None:
+    def _record(self, batch: int, given: Sequence[Evaluation], asked: Sequence[Evaluation], *, ended: bool) -> None:
         """Records the points that are judged; a batch that has not ended is judged again in the next run."""
+        origins = [*(("user", "by hand") for _ in given), *(("solver", self._solver.method) for _ in asked)]
         rows: list[TrialRow] = [
             (
                 batch,
@@ -176,10 +233,9 @@ class StudyRun:
                 self._judge.in_the_users_terms(evaluation),
                 evaluation.violations,
                 evaluation.exact,
-                "solver" if position < asked else "user",
-                method if position < asked else "by hand",
+                *origin,
             )
-            for position, evaluation in enumerate(evaluations)
+            for position, (evaluation, origin) in enumerate(zip([*given, *asked], origins, strict=True))
             if (ended or evaluation.exact) and not self._recorded(evaluation)
         ]
         self._file.save_trials(rows, told=batch + 1 if ended else None)
@@ -194,6 +250,14 @@ class StudyRun:
             assert self._bar is not None
             (value,) = self._judge.in_the_users_terms(self._judge.best)
             self._bar.set_postfix_str(f"best {value:.6g}", refresh=False)
+
+
+def _think(solver: Solver, answer: SimpleQueue[list[Point] | BaseException]) -> None:
+    """Puts what a solver asks for, or the exception that it raises, into ``answer``."""
+    try:
+        answer.put(solver.ask())
+    except BaseException as error:
+        answer.put(error)
 
 
 def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:

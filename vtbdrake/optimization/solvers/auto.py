@@ -107,7 +107,7 @@ class Auto(BatchSolver):
             self._begin("start", Listed(free, name="start", points=[search.start]))
             yield
         if search.budget is not None and search.budget < design + 10 * default_population(search.size):
-            self._begin("sobol", Sobol(free, name="sobol", points=self._left))
+            self._begin("sobol", Sobol(replace(free, budget=self._left), name="sobol"))
             yield
             self._end(True, "the design is complete")
             return

@@ -12,15 +12,17 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, Solv
 class BatchSolver(Solver):
     """A solver that says what comes next (`_next`) and learns from it (`_learn`).
 
-    It asks for ``search.budget`` points at most. The batch that exceeds it is cut, so that no evaluation is wasted; the
-    method does not learn from a cut batch, since it is over then.
+    It asks until evaluations have taken ``search.budget``: a point is charged in full when it is asked for; what it did
+    not take (`Evaluation.effort`) comes back when it is told, and what points given by hand took is charged then. The
+    batch that exceeds the budget is cut, so that no evaluation is wasted; the method does not learn from a cut batch,
+    since it is over then.
     """
 
     def __init__(self, search: Search, *, name: str) -> None:
         self.name = name
         self.search = search
         self._asked: list[Point] = []
-        self._left = search.budget
+        self._budget: float | None = search.budget
         self._cut = False
         self._success: bool | None = None
         self._message = ""
@@ -43,6 +45,12 @@ class BatchSolver(Solver):
         """The budget is spent, and it did not end before."""
         self._end(False, f"the budget of {self.search.budget} evaluations is spent")
 
+    @property
+    def _left(self) -> int | None:
+        """How many evaluations may be asked for; None: any number."""
+        # Efforts are fractions, whose sum is not exact.
+        return None if self._budget is None else max(0, int(self._budget + 1e-6))
+
     def ask(self) -> list[Point]:
         if self._asked:
             raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
@@ -51,10 +59,10 @@ class BatchSolver(Solver):
         if self._success is not None:
             return []
         points = self._next()
-        if self._left is not None:
-            self._cut = len(points) > self._left
+        if self._budget is not None:
+            self._cut = len(points) > (self._left or 0)
             points = points[: self._left]
-            self._left -= len(points)
+            self._budget -= len(points)
         self._asked = points
         return list(points)
 
@@ -68,6 +76,8 @@ class BatchSolver(Solver):
         for evaluation in evaluations:
             self._check(evaluation)
         self._asked = []
+        if self._budget is not None:
+            self._budget = 0.0 if self._cut else self._budget + count - sum(e.effort for e in evaluations)
         if not self._cut:
             self._learn(evaluations[:count], evaluations[count:])
 

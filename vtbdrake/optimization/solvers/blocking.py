@@ -31,7 +31,8 @@ class BlockingSolver(BatchSolver):
     which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined.
 
     Failed simulations: these methods need a number. A failed point counts as worse than the worst point so far, by the
-    spread of the values so far (at least 1), and keeps that number. What was given by hand is ignored.
+    spread of the values so far (at least 1), and keeps that number. So does one that racing dropped, as it breaks a
+    constraint, before anything was known of its value. What was given by hand is ignored.
     """
 
     def __init__(self, search: Search, *, name: str) -> None:
@@ -69,14 +70,16 @@ class BlockingSolver(BatchSolver):
 
     def _numbers(self, evaluation: Evaluation) -> tuple[float, np.ndarray]:
         """The cost and the violations that the method sees."""
+        violations = self._broken
         if usable(evaluation):
             cost, violations = -evaluation.values[0], np.array(evaluation.violations)
-            self._lowest, self._highest = min(self._lowest, cost), max(self._highest, cost)
             self._broken = np.maximum(self._broken, violations)
-            return cost, violations
+            if np.isfinite(cost):
+                self._lowest, self._highest = min(self._lowest, cost), max(self._highest, cost)
+                return cost, violations
         if self._lowest > self._highest:
-            return 1.0, self._broken
-        return self._highest + max(self._highest - self._lowest, 1.0), self._broken
+            return 1.0, violations
+        return self._highest + max(self._highest - self._lowest, 1.0), violations
 
     def _at(self, u: np.ndarray) -> tuple[Evaluation, float, np.ndarray]:
         """The evaluation at ``u``, shape (n,), and its cost and violations, shape (constraints,)."""

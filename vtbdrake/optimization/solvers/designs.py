@@ -22,13 +22,18 @@ class Design(BatchSolver):
     """Asks for its points in batches and ends when there are no more.
 
     Any parameters, any objectives, any constraints: a design does not look at what it is told.
+
+    Args:
+        search: what is searched.
+        name: in the catalogue.
+        as_budgeted: it goes on until the budget is spent; otherwise it is as long as it is.
     """
 
-    def __init__(self, search: Search, *, name: str) -> None:
+    def __init__(self, search: Search, *, name: str, as_budgeted: bool = False) -> None:
         super().__init__(search, name=name)
         search.require(name, no_start=True)
-        # The design itself says how long it is.
-        self._left = None
+        if not as_budgeted:
+            self._budget = None
         self._points = self._generate()
 
     @abstractmethod
@@ -36,10 +41,13 @@ class Design(BatchSolver):
         """All its points."""
 
     def _next(self) -> list[Point]:
-        points = list(itertools.islice(self._points, BATCH))
+        points = list(itertools.islice(self._points, BATCH if self._left is None else min(BATCH, self._left)))
         if not points:
-            self._end(True, "the design is complete")
+            self._spent()
         return points
+
+    def _spent(self) -> None:
+        self._end(True, "the design is complete")
 
     def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
         return
@@ -99,23 +107,25 @@ class Sobol(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: how many; left away: the budget, or without one the first power of two that is at least 64 n.
+        points: how many; left away: until the budget is spent, or without one the first power of two that is at least
+            64 n.
 
     Owen, A. B. (1998): Scrambling Sobol' and Niederreiter-Xing points. Journal of Complexity 14.
     """
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
-        self._count = _count(search, points)
-        super().__init__(search, name=name)
+        as_budgeted = points is None and search.budget is not None
+        self._count = None if as_budgeted else _count(search, points)
+        super().__init__(search, name=name, as_budgeted=as_budgeted)
 
     def _generate(self) -> Iterator[Point]:
         # Imported here, since it takes long.
         from scipy.stats import qmc
 
         sequence = qmc.Sobol(self.search.size, scramble=True, rng=self.search.seed)
-        for begin in range(0, self._count, BATCH):
-            for u in sequence.random(BATCH)[: self._count - begin]:
-                yield self.search.point(u)
+        units = itertools.chain.from_iterable(sequence.random(BATCH) for _ in itertools.count())
+        for u in itertools.islice(units, self._count):
+            yield self.search.point(u)
 
 
 class LatinHypercube(Design):
@@ -124,19 +134,22 @@ class LatinHypercube(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: N; left away: the budget, or without one the first power of two that is at least 64 n.
+        points: N; left away: what the budget allows if no point is dropped, or without one the first power of two that
+            is at least 64 n.
 
     McKay, M. D., Beckman, R. J. and Conover, W. J. (1979), Technometrics 21.
     """
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
         self._count = _count(search, points)
-        super().__init__(search, name=name)
+        super().__init__(search, name=name, as_budgeted=points is None)
 
     def _generate(self) -> Iterator[Point]:
         from scipy.stats import qmc
 
-        for u in qmc.LatinHypercube(self.search.size, rng=self.search.seed).random(self._count):
+        # What points given by hand have taken before the first is not there any more.
+        count = self._count if self._left is None else self._left
+        for u in qmc.LatinHypercube(self.search.size, rng=self.search.seed).random(count):
             yield self.search.point(u)
 
 
@@ -146,13 +159,12 @@ class RandomSearch(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: how many; left away: the budget, or without one no end.
+        points: how many; left away: until the budget is spent, or without one no end.
     """
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
-        endless = points is None and search.budget is None
-        self._count = None if endless else _count(search, points)
-        super().__init__(search, name=name)
+        self._count = None if points is None else _count(search, points)
+        super().__init__(search, name=name, as_budgeted=points is None)
 
     def _generate(self) -> Iterator[Point]:
         generator = np.random.default_rng(self.search.seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isinf, isnan
 from typing import Any
 
 # A point s^0: one value per parameter, in their order.
@@ -25,11 +25,12 @@ class Judged:
 
     @property
     def failed(self) -> bool:
-        return not all(isfinite(value) for value in self.values)
+        """Whether it has no value: a bound that is infinite is one, of a point of which little is known yet."""
+        return any(isnan(value) or (self.exact and isinf(value)) for value in self.values)
 
     @property
     def feasible(self) -> bool:
-        """Whether it has a value and keeps all constraints."""
+        """Whether it has a value, or a bound of it, and keeps all constraints, as far as is known."""
         return not self.failed and all(violation <= 0.0 for violation in self.violations)
 
     @property
@@ -48,7 +49,11 @@ class Evaluation(Judged):
             if the point has none, since a simulation failed.
         violations: one number per constraint, at most 0 where it holds; NaN if the simulation failed.
         gradient: of the first value, shape (n,), where the solver asked for it.
-        exact: False if the point was dropped by racing, and ``values`` only bounds it from above.
+        exact: False if racing dropped the point before it had met all conditions. ``values`` then bounds it from above
+            (by infinity if nothing bounds it, and it was dropped since it breaks a constraint), ``violations`` from
+            below.
+        effort: the rollouts that this evaluation took, divided by the number of conditions: 1 if the point met all of
+            them for the first time, less if racing dropped it, 0 if it was known already.
     """
 
     point: Point
@@ -56,6 +61,7 @@ class Evaluation(Judged):
     violations: tuple[float, ...] = ()
     gradient: tuple[float, ...] | None = None
     exact: bool = True
+    effort: float = 1.0
 
 
 class Solver(ABC):
@@ -63,6 +69,12 @@ class Solver(ABC):
 
     What it asks for depends on its seed and on what it was told, and on nothing else: not on the number of workers, and
     not on time. So a study is the same in series and in parallel, and can be resumed by telling it again.
+
+    A budget counts evaluations under all conditions. One that took less (`Evaluation.effort`) leaves budget for others,
+    and points given by hand take from it: a solver that plans its budget goes by the efforts that it was told.
+
+    In each step a study first judges the points that were given by hand, if there are any, and tells them by
+    themselves; then it asks, judges and tells.
 
     Attributes:
         name: as the catalogue spells it.
@@ -93,8 +105,8 @@ class Solver(ABC):
     def tell(self, evaluations: Sequence[Evaluation]) -> None:
         """The evaluations of the last batch, in its order, and after them any that were given by hand.
 
-        Points given by hand may also be told before the first `ask`. TPE and its kin learn from them, and so does
-        `auto` when it begins anew; a local method, a design and CMA-ES go on as they would have without.
+        Points given by hand may also be told by themselves, before any `ask`. TPE and its kin learn from them, and so
+        does `auto` when it begins anew; a local method, a design and CMA-ES go on as they would have without.
 
         Raises:
             SolverError: the batch is not complete or not in its order, or there are not as many values or violations as

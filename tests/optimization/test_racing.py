@@ -1,0 +1,247 @@
+"""Racing: what it leaves out never changes the best point, whatever the kind of problem, risk and solver."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.optimization.studies import DAMPING, THETA, StatedExecutor
+from tests.testbeds import PendulumScenario
+from vtbdrake.optimization import CVaR, Mean, Parameter, Problem, Quantile, Risk, Worst
+from vtbdrake.optimization.judge import Judge
+from vtbdrake.optimization.outcome import Outcome
+from vtbdrake.optimization.solvers import known_solvers, make_solver
+from vtbdrake.optimization.solvers.blocking import BlockingSolver
+from vtbdrake.rollout import Constraint, Quality
+
+risks = st.one_of(
+    st.sampled_from([Mean(), Worst()]),
+    st.floats(0.01, 1.0).map(Quantile),
+    st.floats(0.01, 1.0).map(CVaR),
+)
+
+QUALITIES = {
+    "maximized": Quality(abs, THETA),
+    "maximized up to 1": Quality(abs, THETA, upper=1.0),
+    "an integral up to 1": Quality(abs, THETA, upper=1.0, reading="integral"),
+    "minimized": Quality(abs, THETA, minimize=True),
+}
+
+
+class Weighted(Risk):
+    """A mean in which some conditions count for nothing: what is infinite there becomes NaN."""
+
+    def __call__(self, h: np.ndarray) -> float:
+        return float(h @ (np.arange(h.size) % 2)) / h.size
+
+
+def problem(conditions: int, risk, *, quality=QUALITIES["maximized up to 1"], constraints=()):
+    """A problem with so many conditions, whose rollouts are not run here: their outcomes are stated."""
+    return Problem(
+        scenario=PendulumScenario(),
+        parameters=[Parameter(THETA, 0.0, 1.0)],
+        quality=quality,
+        horizon=1.0,
+        conditions=[{DAMPING: 0.01 * i} for i in range(conditions)],
+        risk=risk,
+        constraints=constraints,
+    )
+
+
+LIMIT = Constraint(abs, THETA, at_most=1.0)
+STATED = {
+    (n, quality, constrained): problem(n, "worst", quality=QUALITIES[quality], constraints=[LIMIT] * constrained)
+    for n in (2, 4, 7)
+    for quality in QUALITIES
+    for constrained in (False, True)
+}
+
+
+def outcome(value: float, violation: float | None = None, end: str = "horizon") -> Outcome:
+    return Outcome(value, value, () if violation is None else (violation,), 0.0, end, "", 0.0)
+
+
+def judged(stated: Problem, table: dict, batches, *, racing: bool, budget: float = np.inf):
+    """(evaluations by point, rollouts run)."""
+    known: dict = {}
+    judge = Judge(
+        stated, known, lambda rows: known.update({row: table[row] for row in rows}), racing=racing, budget=budget
+    )
+    evaluations = {e.point: e for batch in batches for e in judge.judge(batch)}
+    assert sum(e.effort for e in evaluations.values()) * len(stated.conditions) == pytest.approx(len(known))
+    return evaluations, len(known)
+
+
+def by_definition(risk: Risk, h: np.ndarray) -> float:
+    """The risk of all conditions, from its definition."""
+    match risk:
+        case Mean():
+            return sum(h) / len(h)
+        case Worst():
+            return min(h)
+        case Quantile(level):
+            return min(x for x in h if np.mean(h <= x) >= level - 1e-12)
+        case CVaR(level):
+            return max(c - np.mean(np.maximum(c - h, 0.0)) / level for c in h)
+        case _:
+            return sum(h[1::2]) / len(h)
+
+
+@given(
+    st.integers(0, 10_000),
+    st.one_of(risks, st.just(Weighted())),
+    st.sampled_from(list(STATED)),
+    st.sampled_from([0.0, 0.05, 0.9]),
+    st.sampled_from([10, 60, np.inf]),
+)
+def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk, kind, failing, budget):
+    rng = np.random.default_rng(seed)
+    stated, conditions, sign = STATED[kind], kind[0], -1.0 if kind[1] == "minimized" else 1.0
+    stated.risk = risk
+    points = [(float(p),) for p in rng.permutation(24) / 24.0]
+
+    def one():
+        if rng.random() < failing:
+            return outcome(np.nan, np.nan if kind[2] else None, end="failed")
+        return outcome(float(rng.random()), rng.uniform(-3.0, 1.0) if kind[2] else None)
+
+    table = {(p, c): one() for p in points for c in range(conditions)}
+    raced, run = judged(stated, table, [points[i : i + 6] for i in range(0, 24, 6)], racing=True, budget=budget)
+    assert run <= len(table)
+    truth = {}
+    for point in points:
+        rows = [table[point, c] for c in range(conditions)]
+        if all(o.end != "failed" and all(v <= 0.0 for v in o.measures) for o in rows):
+            truth[point] = by_definition(risk, sign * np.array([o.value for o in rows]))
+    best = max((e for e in raced.values() if e.counts), key=lambda e: e.values[0], default=None)
+    assert (best is None) == (not truth)
+    for point, evaluation in raced.items():
+        if evaluation.counts:
+            assert evaluation.values[0] == pytest.approx(truth[point])
+        if point in truth:
+            assert not evaluation.failed
+            assert evaluation.values[0] >= truth[point] - 1e-12, "what is dropped is bounded from above"
+            assert best.values[0] >= truth[point] - 1e-12
+
+
+BATCH_SOLVERS = [
+    name
+    for name in known_solvers()
+    if (name != "GP" or importlib.util.find_spec("torch"))
+    and name != "QMC"
+    and (
+        name == "differential-evolution"
+        or not isinstance(make_solver(name, STATED[2, "minimized", 0].parameters), BlockingSolver)
+    )
+]
+
+
+@pytest.mark.parametrize("solver", [*BATCH_SOLVERS, "LN_COBYLA", "SNOPT"])
+@pytest.mark.parametrize("kind", list(QUALITIES))
+def test_the_best_point_of_a_raced_study_is_that_of_all_its_points(solver, kind):
+    rng = np.random.default_rng([len(solver), len(kind)])
+    risk = [Mean(), Worst(), Quantile(0.5), CVaR(0.5)][rng.integers(4)]
+    centers = rng.uniform(0.2, 0.8, 4)
+
+    def f(values):
+        x, c = values[THETA], round(values[DAMPING] / 0.01)
+        return None if x > 0.9 and c == 1 else (1.0 / (1.0 + 20.0 * abs(x - centers[c])), (x - 0.7 + 0.05 * c,))
+
+    stated = problem(4, risk, quality=QUALITIES[kind], constraints=[LIMIT])
+    study = stated.study(solver=solver, seed=3).run(rollouts=160, executor=StatedExecutor(f), progress=False)
+    sign = -1.0 if kind == "minimized" else 1.0
+    truth = {}
+    for trial in study.trials:
+        rows = [f({THETA: trial.parameters[THETA], DAMPING: 0.01 * c}) for c in range(4)]
+        if all(row is not None and row[1][0] <= 0.0 for row in rows):
+            truth[trial.number] = by_definition(risk, sign * np.array([h for h, _ in rows]))
+    assert len(study) <= 160
+    assert sign * study.best.value == pytest.approx(max(truth.values()))
+
+
+def test_a_solver_may_ask_for_more_points_where_racing_drops_some():
+    # Every point but those next to 0.5 fails in the first condition, which the best point fares worst in.
+    def f(values):
+        return values[DAMPING] + max(0.0, 1.0 - abs(values[THETA] - 0.5)), ()
+
+    stated = problem(4, "worst", quality=QUALITIES["maximized"])
+    raced, full = (
+        stated.study(solver=solver).run(rollouts=400, racing=racing, executor=StatedExecutor(f), progress=False)
+        for solver, racing in (("sobol", True), ("sobol", False))
+    )
+    assert len(full.trials) == 100 and len(raced.trials) > 200
+    assert 396 < len(raced) <= 400, "what was not taken is not left"
+
+
+def test_auto_comes_to_its_local_search_under_racing():
+    def f(values):
+        return 1.0 / (1.0 + (values[THETA] - 0.321) ** 2 + values[DAMPING]), ()
+
+    study = problem(4, "mean", quality=QUALITIES["maximized up to 1"]).study()
+    study.run(rollouts=1200, executor=StatedExecutor(f), progress=False)
+    assert any("polish" in trial.method for trial in study.trials)
+
+
+def test_racing_saves_what_the_worst_condition_tells():
+    points = [(i / 16.0,) for i in range(1, 16)]
+    # The first is the best; of the others, condition 3 alone says that they are worse.
+    table = {(p, c): outcome(0.9 if c != 3 or p == points[0] else 0.1) for p in points for c in range(8)}
+    table[points[0], 3] = outcome(0.5)
+    _, run = judged(problem(8, "worst"), table, [points[:1], *[[p] * 1 for p in points[1:]]], racing=True)
+    assert run == 8 * 15, "alone, a point meets all conditions in one round of eight"
+    _, run = judged(problem(8, "worst"), table, [points[:1], points[1:]], racing=True)
+    assert run == 8 + 14, "together, each meets the condition in which the best fares worst, and is dropped"
+
+
+@pytest.mark.parametrize("budget", [4, 10, 23, 40])
+def test_racing_finishes_points_within_a_budget_that_is_too_small_for_all(budget):
+    class SpentError(Exception):
+        pass
+
+    known: dict = {}
+
+    def run(rows):
+        known.update({row: outcome(row[0][0]) for row in rows[: budget - len(known)]})
+        if len(known) == budget:
+            raise SpentError
+
+    judge = Judge(problem(4, "mean"), known, run, racing=True, budget=budget)
+    points = [(i / 64.0,) for i in range(1, 41)]
+    with pytest.raises(SpentError):
+        judge.judge(points)
+    assert sum(judge.evaluation(point).exact for point in points) >= 1
+
+
+def test_a_point_that_breaks_a_constraint_is_dropped():
+    stated = problem(4, "mean", constraints=[Constraint(abs, THETA, at_most=1.0)])
+    a, b = (0.1,), (0.2,)
+    table = {(a, c): outcome(0.2, -1.0) for c in range(4)} | {(b, c): outcome(0.9, c - 0.5) for c in range(4)}
+    evaluations, _ = judged(stated, table, [[a], [b]], racing=False)
+    assert evaluations[b].violations == (2.5,) and not evaluations[b].feasible
+    assert evaluations[a].feasible
+
+
+def test_one_failed_simulation_leaves_a_point_without_value():
+    a = (0.1,)
+    table = {(a, 0): outcome(0.2), (a, 1): outcome(np.nan, end="failed"), (a, 2): outcome(0.4)}
+    evaluations, _ = judged(problem(3, "mean"), table, [[a]], racing=False)
+    assert evaluations[a].failed and not evaluations[a].feasible
+
+
+def test_equal_points_are_judged_once():
+    a = (0.25,)
+    runs: list = []
+    known: dict = {}
+
+    def run(rows):
+        runs.extend(rows)
+        known.update({row: outcome(0.5) for row in rows})
+
+    judge = Judge(problem(2, "mean"), known, run)
+    first, second = judge.judge([a, a])
+    assert first.values == second.values and (first.effort, second.effort) == (1.0, 0.0)
+    assert runs == [(a, 0), (a, 1)]
+    judge.judge([a])
+    assert len(runs) == 2
