@@ -1,5 +1,6 @@
 """The runtime's loop in lock-step with a simulated clock: what is stepped, sent, missed, refused and survived."""
 
+import signal
 import threading
 
 import numpy as np
@@ -425,6 +426,23 @@ def test_an_interruption_sends_the_fallback_once():
 
     with pytest.raises(KeyboardInterrupt):
         runtime.run(cycles=100, until=interrupt)
+    assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
+
+
+def test_an_interruption_that_pybind11_drops_ends_the_loop():
+    runtime, bridge, _ = switched(rate=0.0)
+
+    def watch(cycle):
+        if runtime.cycles == 6:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise TypeError("incompatible function arguments") from None
+
+    runtime.watch(watch)
+    with pytest.raises(KeyboardInterrupt):
+        runtime.run(cycles=100)
+    assert runtime.cycles == 6
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 
 

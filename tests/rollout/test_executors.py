@@ -177,7 +177,7 @@ def test_ctrl_c_keeps_what_is_finished(executor, workers, tmp_path):
         for _ in range(4):
             assert process.stdout.readline().startswith("finished")
         os.killpg(process.pid, signal.SIGINT)
-        out, err = process.communicate(timeout=240)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     kept, count, complete, positive = out.splitlines()[-1].split()
     assert (kept, complete, positive) == ("kept", "False", "True")

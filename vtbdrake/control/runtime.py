@@ -21,6 +21,7 @@ from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepped import Stepped
 from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
+from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
 
@@ -135,16 +136,18 @@ class Runtime(Stepped):
         begin = self.clock.now()
         deadline, done = begin, 0
         try:
-            while not self._stop.is_set():
-                if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
-                    return
-                due, lateness = self._await(deadline)
-                # One that is paced by messages has just taken them in.
-                self.cycle(lateness=lateness, poll=self.pace is None)
-                done += 1
-                if until():
-                    return
-                deadline = self._next(due)
+            with Interruptible() as interruptible:
+                while not self._stop.is_set():
+                    if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
+                        return
+                    due, lateness = self._await(deadline)
+                    # One that is paced by messages has just taken them in.
+                    self.cycle(lateness=lateness, poll=self.pace is None)
+                    interruptible.check()
+                    done += 1
+                    if until():
+                        return
+                    deadline = self._next(due)
         except BaseException:
             self.send_fallback("the loop ended")
             raise

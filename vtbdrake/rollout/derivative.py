@@ -18,6 +18,7 @@ from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group, write_group
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
 
 # Of a parameter's own size, when what it does to the groups of a context is measured. Nearly all are linear in it.
 _STEP = 1e-6
@@ -86,9 +87,10 @@ class DerivativeRunner:
         t0 = context.get_time()
         samples, slopes, times = [], [], self.task.sample_times()
         for t in times:
-            if t > 0.0:
-                simulator.AdvanceTo(AutoDiffXd(t0 + float(t)))
-            value, slope = self._sample(simulator.get_context(), context, t0 + float(t), len(by))
+            with Interruptible():
+                if t > 0.0:
+                    simulator.AdvanceTo(AutoDiffXd(t0 + float(t)))
+                value, slope = self._sample(simulator.get_context(), context, t0 + float(t), len(by))
             samples.append(value)
             slopes.append(slope)
         return self._read(times, np.array(samples), np.array(slopes))

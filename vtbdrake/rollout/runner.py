@@ -16,6 +16,7 @@ from vtbdrake.rollout.readings import READINGS
 from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
 
 
 class SimulationError(Exception):
@@ -74,22 +75,24 @@ class RolloutRunner:
         begin = time.perf_counter()
         samples = _Samples(self)
         end, message = HORIZON, ""
-        try:
-            self._reset(parameters)
-            for t in self._times:
-                if cancel is not None and cancel.is_set():
-                    raise CancelledError
-                status = self._advance(t)
-                terminated = _terminated(status)
-                reached = self._context.get_time() - self._s0.get_time() if terminated else float(t)
-                if samples.take(reached) and not self.task.run_on:
-                    break
-                if terminated and status is not None:
-                    end, message = TERMINATED, status.FormatMessage()
-                    break
-        except SimulationError as failure:
-            end, message = FAILED, str(failure)
-        return samples.result(dict(parameters), end, message, begin)
+        with Interruptible() as interruptible:
+            try:
+                self._reset(parameters)
+                for t in self._times:
+                    if cancel is not None and cancel.is_set():
+                        raise CancelledError
+                    interruptible.check()
+                    status = self._advance(t)
+                    terminated = _terminated(status)
+                    reached = self._context.get_time() - self._s0.get_time() if terminated else float(t)
+                    if samples.take(reached) and not self.task.run_on:
+                        break
+                    if terminated and status is not None:
+                        end, message = TERMINATED, status.FormatMessage()
+                        break
+            except SimulationError as failure:
+                end, message = FAILED, str(failure)
+            return samples.result(dict(parameters), end, message, begin)
 
     def state(self, parameters: Mapping[str, Any], t: float) -> Any:
         """s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
@@ -102,11 +105,13 @@ class RolloutRunner:
         if abs(self._times[last] - t) > 1e-9:
             raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
         try:
-            self._reset(parameters)
-            for time_ in self._times[: last + 1]:
-                status = self._advance(time_)
-                if status is not None and _terminated(status):
-                    raise SimulationError(status.FormatMessage())
+            with Interruptible() as interruptible:
+                self._reset(parameters)
+                for time_ in self._times[: last + 1]:
+                    interruptible.check()
+                    status = self._advance(time_)
+                    if status is not None and _terminated(status):
+                        raise SimulationError(status.FormatMessage())
         except SimulationError as failure:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
         return self.testbed.snapshot(self._context)

@@ -19,6 +19,7 @@ from vtbdrake.rollout.result import FAILED, RolloutResult
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
 
 FIELD = "scenario."
 # How many testbeds are kept, beside one that is given.
@@ -131,7 +132,8 @@ class Runners:
             return RolloutRunner(task, self._testbeds.get(task.scenario))
         changed = replace(task, scenario=task.scenario.with_fields(fields))
         try:
-            testbed = self._testbeds.get(changed.scenario)
+            with Interruptible():
+                testbed = self._testbeds.get(changed.scenario)
         except ScenarioError:
             raise
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.

@@ -21,6 +21,7 @@ from vtbdrake.control.recording.replay_report import Difference, differences
 from vtbdrake.control.recording.replay_start import Target, begin
 from vtbdrake.control.switching import throw
 from vtbdrake.testbed import VirtualTestbed, slow_parts
+from vtbdrake.testbed.interrupt import Interruptible
 
 TICK = "tick"
 """Of the values of a result: the number of its sample."""
@@ -79,23 +80,25 @@ class ReplayRun:
         vectors = [(_differs(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
         changes = self._changes()
         digests = {i for i, _ in log.digests}
-        for i in range(self.count):
-            for new, name, values in vectors:
-                if new[i]:
-                    feed(name, values[i])
-            for name, value in self._decoders.items():
-                if event := log.sources[name][i]:
-                    feed(name, value(event))
-            # What is fed is there before a switch lets the DPS see it.
-            for change in changes.get(i, ()):
-                self._apply(change)
-            if not self._idle:
-                self._step(i)
-            self.times[i] = self._now
-            if i in digests:
-                self.digests.append((i, self._digest()))
-            for address, read in self._readers.items():
-                self.record[address].append(read(context))
+        with Interruptible() as interruptible:
+            for i in range(self.count):
+                interruptible.check()
+                for new, name, values in vectors:
+                    if new[i]:
+                        feed(name, values[i])
+                for name, value in self._decoders.items():
+                    if event := log.sources[name][i]:
+                        feed(name, value(event))
+                # What is fed is there before a switch lets the DPS see it.
+                for change in changes.get(i, ()):
+                    self._apply(change)
+                if not self._idle:
+                    self._step(i)
+                self.times[i] = self._now
+                if i in digests:
+                    self.digests.append((i, self._digest()))
+                for address, read in self._readers.items():
+                    self.record[address].append(read(context))
 
     def _time(self, steps: int) -> float:
         return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)

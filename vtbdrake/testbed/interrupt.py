@@ -1,0 +1,54 @@
+"""Ctrl-C while Drake runs: the exception is raised again where it would be lost."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+
+class Interruptible:
+    """A context manager that raises again what the handler of SIGINT raised inside of it, if that got lost.
+
+    Python raises KeyboardInterrupt wherever its main thread is. While pybind11 converts an argument (numpy makes an
+    array of a list, say) it drops that exception, and reports arguments that do not fit (TypeError) or tries the next
+    overload; and Python drops what is raised in a finalizer. A controller that writes its output at every step loses
+    about one Ctrl-C of 25 in this way, and the failed call would pass for a failed simulation.
+
+    Outside the main thread, where no handler runs, and where SIGINT has no handler, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._handler: Callable[[int, FrameType | None], Any] | None = None
+        self._raised: BaseException | None = None
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            handler = signal.getsignal(signal.SIGINT)
+            if callable(handler):
+                self._handler = handler
+                signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        assert self._handler is not None
+        try:
+            self._handler(number, frame)
+        except BaseException as error:
+            self._raised = error
+            raise
+
+    def check(self) -> None:
+        """Raise what the handler has raised, if anything: to be called from time to time in what takes long."""
+        if self._raised is not None:
+            raise self._raised
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
+        if error is not self._raised:
+            self.check()
