@@ -16,7 +16,9 @@ from vtbdrake.control.hub.reader import Reader, publication
 from vtbdrake.control.hub.shortcut import take_shortcut
 from vtbdrake.control.hub.tcpq import (
     MAGIC_CLIENT,
+    MAGIC_REFUSAL,
     MAGIC_SERVER,
+    MAX_REFUSAL,
     SUBSCRIBE,
     VERSION,
     ProtocolError,
@@ -32,6 +34,10 @@ _RECEIVE = 1 << 16
 _WORDS = struct.Struct(">II")
 _SO_TIMESTAMPNS = 35  # <asm-generic/socket.h>; the type of the control message, too
 _TIMESPEC = struct.Struct("@ll")
+
+
+class RefusedError(ConnectionRefusedError):
+    """There is a hub, which does not let this client in, and says why."""
 
 
 class Connection(ABC):
@@ -145,15 +151,22 @@ class TcpqConnection(Connection):
         self._stamped = stamped
 
     def _greet(self) -> None:
-        self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
-        answer = b""
-        while len(answer) < _WORDS.size:
-            chunk = self._socket.recv(_WORDS.size - len(answer))
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # Who is not let in may be told before that.
+            self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
+        magic, size = _WORDS.unpack(self._receive_exactly(_WORDS.size))
+        if magic == MAGIC_REFUSAL:
+            raise RefusedError(self._receive_exactly(min(size, MAX_REFUSAL)).decode(errors="replace"))
+        if magic != MAGIC_SERVER:
+            raise ConnectionError("what listens there is no tcpq hub")
+
+    def _receive_exactly(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            chunk = self._socket.recv(size - len(data))
             if not chunk:
                 raise ConnectionResetError("it closed the connection")
-            answer += chunk
-        if _WORDS.unpack(answer)[0] != MAGIC_SERVER:
-            raise ConnectionError("what listens there is no tcpq hub")
+            data += chunk
+        return data
 
     def fileno(self) -> int:
         return self._socket.fileno()

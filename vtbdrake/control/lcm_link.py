@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.lcm_connections import Connection, Handler, connect
+from vtbdrake.control.lcm_connections import Connection, Handler, RefusedError, connect
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
 """Seconds between attempts to connect; each is twice the one before."""
@@ -89,6 +89,8 @@ class LcmLink:
             return
         try:
             self._connection = self._connect()
+        except RefusedError as error:
+            raise BridgeError(f"the hub at {self.url} refuses the connection: {error}") from error
         except OSError as error:
             remedy = "start a hub there (vtbdrake hub)" if self.url.startswith("tcpq:") else "is the URL right?"
             raise BridgeError(f"no LCM bus at {self.url} ({error}); {remedy}") from error

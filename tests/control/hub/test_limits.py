@@ -1,8 +1,12 @@
 """Slow, silent and too many clients: none costs the others anything."""
 
 import contextlib
+import os
 import resource
+import signal
 from pathlib import Path
+
+import pytest
 
 from tests.control.hub.clients import Client, is_disconnected, raw_client, receive, record, wait_until
 from vtbdrake.control.hub import Hub
@@ -106,3 +110,101 @@ def test_without_file_descriptors_the_hub_goes_on_and_lets_the_next_client_in_wh
         resource.prlimit(hub.pid, resource.RLIMIT_NOFILE, allowed)
         assert receive(waiting, 8)[:4] == b"\x28\x76\x17\xfa"
     assert client.received == [("A", b"as before")]
+
+
+def test_a_message_that_is_not_completed_ends_the_connection() -> None:
+    with Hub(port=0, patience=0.2) as hub, raw_client(hub.url) as sock:
+        sock.sendall(record(1, b"A", b"whole") + record(1, b"A", DATA)[:-1])
+        assert is_disconnected(sock)
+        assert hub.statistics().disconnected == {"incomplete": 1}
+
+
+def test_drops_that_come_one_by_one_do_not_keep_a_message_alive() -> None:
+    with Hub(port=0, patience=0.2) as hub, raw_client(hub.url) as sock:
+        text = record(1, b"A", bytes(10_000_000))
+
+        def is_over() -> bool:
+            nonlocal text
+            with contextlib.suppress(ConnectionError):
+                sock.sendall(text[:1])
+                text = text[1:]
+            return hub.statistics().disconnected == {"incomplete": 1}
+
+        wait_until(is_over)
+
+
+def test_all_incomplete_messages_together_are_bounded() -> None:
+    limits = {"max_message": MEBIBYTE, "max_queue": 2 * MEBIBYTE, "max_memory": 4 * MEBIBYTE, "patience": 60.0}
+    with Hub(port=0, **limits) as hub, contextlib.ExitStack() as stack:
+        client = Client(hub.url, "A")
+        before = resident(hub.pid)
+        for _ in range(50):
+            with contextlib.suppress(ConnectionError):
+                stack.enter_context(raw_client(hub.url)).sendall(record(1, b"A", DATA)[:-1])
+        wait_until(lambda: hub.statistics().disconnected.get("memory", 0) >= 45)
+        client.publish("A")
+        client.wait(lambda: bool(client.received))
+        assert hub.statistics().clients <= 6
+        assert resident(hub.pid) - before < (4 + 8) * MEBIBYTE
+
+
+def test_all_backlogs_together_are_bounded_and_who_reads_is_spared() -> None:
+    limits = {"max_message": MEBIBYTE, "max_queue": 4 * MEBIBYTE, "max_memory": 16 * MEBIBYTE, "patience": 60.0}
+    with Hub(port=0, **limits) as hub, contextlib.ExitStack() as stack:
+        client = Client(hub.url, "A")
+        for _ in range(20):
+            stack.enter_context(raw_client(hub.url)).sendall(record(2, b"A"))
+        wait_until(lambda: hub.statistics().clients == 21)
+        for _ in range(20):
+            client.publish("A", DATA)
+            client.wait(lambda: bool(client.received))
+            assert client.received.pop() == ("A", DATA)
+        statistics = hub.statistics()
+        assert statistics.disconnected["memory"] >= 20 - 16 // 3
+        assert statistics.queued <= 16 * MEBIBYTE
+
+
+def test_refusals_do_not_flood_the_log(capfd: pytest.CaptureFixture[str]) -> None:
+    with Hub(port=0, protect=["COMMAND"], max_clients=2) as hub, raw_client(hub.url) as sock:
+        client = Client(hub.url)
+        client.publish("COMMAND")
+        client.sync()
+        for channel in (b"VTB_HUB", b"VTB_HUB_TAKE/COMMAND", b"VTB_HUB_TAKE/OTHER", b"COMMAND"):
+            sock.sendall(record(1, channel, b"") * 1000)
+        sock.sendall(b"".join(record(2, b"(%d" % i) for i in range(1000)))
+        wait_until(lambda: hub.statistics().refused == 4000)
+        for _ in range(50):
+            with raw_client(hub.url, greeting=b"") as other:
+                assert is_disconnected(other)
+    lines = capfd.readouterr().err.splitlines()
+    assert 4 < len(lines) < 40
+    assert any("VTB_HUB" in line for line in lines) and any("full" in line for line in lines)
+
+
+def test_who_sends_much_takes_turns_with_the_others(hub) -> None:
+    """A thousand messages wait at the hub before that of another client does; it need not wait for them."""
+    observer = Client(hub.url, "FLOOD.*", "QUIET")
+    with raw_client(hub.url) as flood, raw_client(hub.url) as quiet:
+        for sock in (flood, quiet):
+            receive(sock, 8)
+        os.kill(hub.pid, signal.SIGSTOP)
+        flood.sendall(b"".join(record(1, b"FLOOD_%d" % (i % 7), b"%d" % i) for i in range(2000)))
+        quiet.sendall(record(1, b"QUIET", b""))
+        os.kill(hub.pid, signal.SIGCONT)
+        observer.wait(lambda: len(observer.received) == 2001)
+    place = [channel for channel, _ in observer.received].index("QUIET")
+    assert place <= 2 * 64
+    assert [data for channel, data in observer.received if channel != "QUIET"] == [b"%d" % i for i in range(2000)]
+
+
+def test_new_channels_are_found_a_few_at_a_time(hub) -> None:
+    observer = Client(hub.url, "NEW.*", "QUIET")
+    with raw_client(hub.url) as flood, raw_client(hub.url) as quiet:
+        for sock in (flood, quiet):
+            receive(sock, 8)
+        os.kill(hub.pid, signal.SIGSTOP)
+        flood.sendall(b"".join(record(1, b"NEW_%d" % i, b"") for i in range(2000)))
+        quiet.sendall(record(1, b"QUIET", b""))
+        os.kill(hub.pid, signal.SIGCONT)
+        observer.wait(lambda: len(observer.received) == 2001)
+    assert [channel for channel, _ in observer.received].index("QUIET") <= 2 * 64 / 16

@@ -378,15 +378,16 @@ def test_who_holds_the_name_as_another_user_is_not_spoken_to(caplog: pytest.LogC
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
-def test_a_hub_of_root_is_trusted_by_everybody(hub) -> None:
-    code = f"""
+def test_a_hub_of_root_is_trusted_by_everybody() -> None:
+    with Hub(port=0, users=[65534]) as hub:
+        code = f"""
 import os, sys
 sys.path[:] = {sys.path!r}
 from vtbdrake.control.lcm_connections import TcpqConnection
 os.setuid(65534)
 print(TcpqConnection({hub.url!r}, {{}}, {TIMEOUT}).name)
 """
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert is_local(output)
 
 

@@ -3,10 +3,20 @@
 Unmodified LCM clients use it: ``lcm.LCM(hub.url)``, ``DrakeLcm(hub.url)``. It relays every publication, byte for byte,
 to all clients that subscribed to its channel, the publisher included.
 
-* **Nobody holds up the others.** The hub never waits for a client. What a client does not read is queued, up to
-  ``max_queue`` bytes; beyond that its oldest messages are dropped and counted; a client that takes nothing off its
-  queue for ``patience`` seconds is disconnected. So is one that breaks the protocol or sends a message larger than
-  ``max_message``.
+* **Clients** are processes of the hub's own user and of root, and of the users that ``users`` names (or ``all_users``).
+  LCM itself has no authentication: the kernel says whose a client is. Beyond loopback it cannot, and whoever reaches
+  the address is a client. One that is not let in is told why, as far as its LCM library shows it.
+* **Nobody holds up the others.** The hub never waits for a client.
+
+  1. Clients take turns: from one that sends much, only some messages are handled before it is another's turn.
+  2. What a client does not read is queued, up to ``max_queue`` bytes; beyond that its oldest messages are dropped and
+     counted. A client that takes nothing off its queue for ``patience`` seconds is disconnected. So is one that breaks
+     the protocol, that sends a message larger than ``max_message``, or that does not complete one in time.
+  3. When more than ``max_memory`` bytes are queued or incomplete, the clients with most of them are disconnected.
+  4. When there are ``max_clients``, a client that has neither subscribed nor published for ``patience`` seconds makes
+     room for the next one. Other users than the hub's own and root have a quarter of the places each, three together.
+  5. A client with more patterns than the hub can match quickly gets all messages; every client filters again.
+  6. What clients can cause many times a second is logged at a limited rate.
 * **Protected channels** have one publisher at a time, the owner.
 
   1. The first client to publish on the channel becomes the owner. Each of its publications renews its lease, which
@@ -29,7 +39,7 @@ to all clients that subscribed to its channel, the publisher included.
 * **Beside a control loop** it does best on the loop's own processor (``cpus``), at a lower ``priority``. On another
   one, every command that leaves has to wake that up, and at a higher priority the hub interrupts the cycle that sends.
 
-It listens on loopback unless another address is asked for by name; there, whoever reaches the address is a client.
+It listens on loopback unless another address is asked for by name.
 """
 
 from vtbdrake.control.hub.config import HubConfig

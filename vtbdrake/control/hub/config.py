@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pwd
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
@@ -25,8 +26,13 @@ class HubConfig:
     lease: float = 0.5  # s after its last publication during which an owner cannot be succeeded
     max_message: int = 16 * MEBIBYTE  # largest data of a message, in bytes
     max_queue: int = 32 * MEBIBYTE  # largest backlog of a client, in bytes
-    max_clients: int = 128
-    patience: float = 5.0  # s after which a client that does not greet, or does not read, is disconnected
+    max_memory: int = 512 * MEBIBYTE  # largest sum of all backlogs and of all incomplete messages, in bytes
+    max_clients: int = 128  # of them, other users than the hub's own and root have a quarter each, three together
+    users: Sequence[str | int] = ()  # who may connect besides the hub's own user and root, by name or number
+    all_users: bool = False  # whether every user of this machine may connect
+    # s after which a client that does not greet or does not read is disconnected, and one that does not complete a
+    # message (which may take a second more for each MiB of it)
+    patience: float = 5.0
     status_period: float = 1.0  # s between messages on the status channel
     priority: int = 0  # of SCHED_FIFO, 1 to 99, where the system grants it; 0: ordinary scheduling
     cpus: Sequence[int] = ()  # processors to run on, where the system grants them; empty: any
@@ -44,10 +50,14 @@ class HubConfig:
         object.__setattr__(self, "cpus", tuple(self.cpus))
         if any(not isinstance(cpu, int) or cpu < 0 for cpu in self.cpus):
             raise ValueError(f"processors have the numbers 0, 1, ..., unlike {self.cpus!r}")
+        if isinstance(self.users, str):
+            raise ValueError(f"users takes a sequence of users, such as [{self.users!r}], not a string")
+        object.__setattr__(self, "users", tuple(map(_user_number, self.users)))
         ranges: dict[str, tuple[float, float]] = {
             "port": (0, 65535),
             "max_message": (1, 256 * MEBIBYTE),  # LCM_MAX_MESSAGE_SIZE
             "max_queue": (self.max_message + 12 + MAX_CHANNEL, inf),
+            "max_memory": (self.max_queue, inf),
             "max_clients": (1, inf),
             "priority": (0, 99),
         }
@@ -59,3 +69,12 @@ class HubConfig:
             value = getattr(self, name)
             if not 0.0 < value < inf:
                 raise ValueError(f"{name} is a positive time in seconds, it cannot be {value!r}")
+
+
+def _user_number(user: str | int) -> int:
+    if isinstance(user, str) and not user.isdecimal():
+        try:
+            return pwd.getpwnam(user).pw_uid
+        except KeyError:
+            raise ValueError(f"there is no user {user!r} on this machine: give a name or a number") from None
+    return int(user)

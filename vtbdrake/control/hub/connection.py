@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import socket
 from collections import deque
-from collections.abc import Callable
 
-from vtbdrake.control.hub.patterns import matcher
+from vtbdrake.control.hub.patterns import Subscriptions
 from vtbdrake.control.hub.reader import Reader
 from vtbdrake.control.hub.tcpq import ProtocolError, address_name
 
 # A slice of a large message: while it is copied to the kernel, or from there, all others wait (some 50 us).
 SLICE = 256 * 1024
 
-MAX_SUBSCRIPTIONS = 1024
+# Seconds after which the kernel asks whether the other machine is still there, between two such questions, and how
+# often it asks.
+_KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 3}
 
 
 class Connection:
@@ -23,33 +24,55 @@ class Connection:
         sock: connected; the connection owns it.
         max_message, max_queue: in bytes.
         now: the time, on the hub's clock, in seconds.
+        user: whose the client is; None if nobody knows.
 
     Attributes:
         name: of the client; see `address_name`.
+        user: as above.
         reader: of what comes from it.
+        subscriptions: its subscriptions.
+        published: whether it has published anything.
+        connected: when it connected.
         progressed: when it connected, when its queue began, or when it last took something off it.
+        begun: when the message began to come that is not complete yet; None if there is none.
         watched: whether the hub waits for it to take more.
         queued: bytes that wait for it.
         closed: whether the hub has closed it.
     """
 
-    def __init__(self, sock: socket.socket, *, max_message: int, max_queue: int, now: float) -> None:
+    def __init__(self, sock: socket.socket, *, max_message: int, max_queue: int, now: float, user: int | None) -> None:
         self.socket = sock
         self.fileno = sock.fileno()
         self.name = address_name(sock.getpeername())
+        self.user = user
         self.reader = Reader(max_message=max_message)
-        self.progressed = now
+        self.subscriptions = Subscriptions()
+        self.published = False
+        self.connected = self.progressed = now
+        self.begun: float | None = None
         self.watched = False
         self.queued = 0
         self.closed = False
         self._max_queue = max_queue
         self._queue: deque[bytes | bytearray] = deque()
         self._offset = 0  # of the first message of the queue: so much of it is sent
-        self._subscriptions: list[tuple[bytes, Callable[[str], object]]] = []
         self._by_tcp = sock.family == socket.AF_INET
         sock.setblocking(False)
         if self._by_tcp:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for option, value in _KEEP_ALIVE.items():
+                sock.setsockopt(socket.IPPROTO_TCP, option, value)
+
+    @property
+    def idle(self) -> bool:
+        """Whether it has never asked for anything, nor said anything."""
+        return not self.published and not self.subscriptions
+
+    @property
+    def held(self) -> int:
+        """Return how many bytes are kept for it: what waits for it, and what it has begun to send."""
+        return self.queued + self.reader.held
 
     def acknowledge(self) -> None:
         """Acknowledges at once what was read: liblcm writes a message in five pieces, and leaves Nagle's algorithm on,
@@ -57,26 +80,6 @@ class Connection:
         The kernel forgets the option, so it takes one call for every piece read."""
         if self._by_tcp:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-
-    def subscribe(self, pattern: bytes) -> None:
-        """
-        Raises:
-            ProtocolError: it is not text, or one too many.
-        """
-        if len(self._subscriptions) >= MAX_SUBSCRIPTIONS:
-            raise ProtocolError("malformed", f"subscribes more than {MAX_SUBSCRIPTIONS} times")
-        self._subscriptions.append((pattern, matcher(text(pattern))))
-
-    def unsubscribe(self, pattern: bytes) -> None:
-        """Ends one subscription of the pattern; there may be more."""
-        for i, (subscribed, _) in enumerate(self._subscriptions):
-            if subscribed == pattern:
-                del self._subscriptions[i]
-                return
-
-    def wants(self, channel: str) -> bool:
-        """Whether it has subscribed to the channel."""
-        return any(matches(channel) for _, matches in self._subscriptions)
 
     def send(self, messages: list[bytes | bytearray], now: float) -> int:
         """Sends messages, or queues what of them cannot be sent at once; says how many messages that drops.

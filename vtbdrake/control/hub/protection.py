@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from math import inf
 
 from vtbdrake.control.hub.connection import Connection
+from vtbdrake.control.hub.log_rate import limited_logger
 from vtbdrake.control.hub.statistics import ChannelStatistics
 
-_log = logging.getLogger(__name__)
-
-_LOG_PERIOD = 1.0
+_log = limited_logger(__name__)
 
 
 class ProtectedChannel:
@@ -32,7 +30,6 @@ class ProtectedChannel:
         self._renewed = -inf
         self._refused = 0
         self._last_refused: str | None = None
-        self._logged = -inf
         self._taken = 0
 
     def admit(self, client: Connection, now: float) -> bool:
@@ -90,15 +87,12 @@ class ProtectedChannel:
     def _refuse(self, client: Connection, now: float, what: str) -> None:
         self._refused += 1
         self._last_refused = client.name
-        # An intruder may publish a thousand times a second.
-        if now - self._logged >= _LOG_PERIOD:
-            self._logged = now
-            _log.warning(
-                "%s: refused, %s %s and its owner is %s%s (%d refused so far)",
-                self.name,
-                client.name,
-                what,
-                self._holder,
-                ", whose lease runs on" if self.owner is None else "",
-                self._refused,
-            )
+        _log.warning(
+            "%s: refused, %s %s and its owner is %s%s (%d refused so far)",
+            self.name,
+            client.name,
+            what,
+            self._holder,
+            ", whose lease runs on" if self.owner is None else "",
+            self._refused,
+        )

@@ -65,6 +65,11 @@ cdef class Reader(Stream):
         """Whether a record has begun, and is not taken off."""
         return self.large is not None or self.end > self.begin
 
+    @property
+    def held(self):
+        """How many bytes have come that are not taken off."""
+        return self.end - self.begin + (self.filled if self.large is not None else 0)
+
     def record(self):
         """The next record: its type, its channel or pattern, and the record as it came; None if it is not there yet.
 

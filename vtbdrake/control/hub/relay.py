@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import logging
 from typing import NamedTuple
 
 from vtbdrake.control.hub import tcpq
 from vtbdrake.control.hub.config import HubConfig
 from vtbdrake.control.hub.connection import Connection, text
+from vtbdrake.control.hub.log_rate import limited_logger
 from vtbdrake.control.hub.protection import ProtectedChannel
 from vtbdrake.control.hub.reader import publication
 from vtbdrake.control.hub.statistics import Statistics
 
-_log = logging.getLogger(__name__)
+_log = limited_logger(__name__)
 
 # Channels whose subscribers are remembered; clients may publish on any number of channels.
 _MAX_ROUTES = 4096
+
+# What it costs to handle a record, and one on a channel whose subscribers have to be found, in the same unit.
+_RECORD, _NEW_CHANNEL = 1, 16
 
 
 class _Route(NamedTuple):
@@ -72,26 +75,36 @@ class Relay:
         disconnected = self._statistics.disconnected
         disconnected[reason] = disconnected.get(reason, 0) + 1
 
-    def handle(self, client: Connection, record: tcpq.Record, now: float) -> None:
-        """
+    def handle(self, client: Connection, record: tcpq.Record, now: float) -> int:
+        """Does what a client asks for; returns what that cost: 1, or 16 where the subscribers had to be found.
+
         Raises:
             ProtocolError: the client is of no use any more.
         """
         kind, channel, content = record
         if kind == tcpq.PUBLISH:
-            self._publish(client, channel, content, now)
-        elif kind == tcpq.SUBSCRIBE:
-            client.subscribe(channel)
-            self._routes.clear()
+            return self._publish(client, channel, content, now)
+        if kind == tcpq.SUBSCRIBE:
+            self._forget(client.subscriptions.add(text(channel)))
         elif kind == tcpq.UNSUBSCRIBE:
-            client.unsubscribe(channel)
-            self._routes.clear()
+            self._forget(client.subscriptions.remove(text(channel)))
         else:
             self._send(client, tcpq.GREETING)
+        return _RECORD
 
-    def _publish(self, client: Connection, channel: bytes, content: bytes | bytearray, now: float) -> None:
+    def _forget(self, channel: str | None) -> None:
+        """Forgets who has subscribed to a channel; to all of them, if it is None."""
+        if channel is None:
+            self._routes.clear()
+        else:
+            self._routes.pop(channel.encode(), None)
+
+    def _publish(self, client: Connection, channel: bytes, content: bytes | bytearray, now: float) -> int:
         statistics = self._statistics
-        route = self._routes.get(channel) or self._find_route(channel)
+        client.published = True
+        cost, route = _RECORD, self._routes.get(channel)
+        if route is None:
+            cost, route = _NEW_CHANNEL, self._find_route(channel)
         if route.reserved:
             self._answer(client, route.channel, now)
         elif route.protection is not None and not self._admit(client, route.protection, now):
@@ -100,12 +113,13 @@ class Relay:
             statistics.messages += 1
             statistics.volume += len(content)
             self._distribute(route, content)
+        return cost
 
     def _find_route(self, channel: bytes) -> _Route:
         name = text(channel)
         route = _Route(
             channel=name,
-            subscribers=tuple(client for client in self._clients if client.wants(name)),
+            subscribers=tuple(client for client in self._clients if client.subscriptions.wants(name)),
             protection=self._protected.get(name),
             reserved=name == tcpq.STATUS_CHANNEL or name.startswith(tcpq.TAKE_PREFIX),
         )

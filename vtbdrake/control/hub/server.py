@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import logging
 import os
 import select
 import socket
@@ -12,15 +12,20 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from vtbdrake.control.hub import tcpq
-from vtbdrake.control.hub.config import HubConfig
+from vtbdrake.control.hub.admission import FULL, Admission
+from vtbdrake.control.hub.config import MEBIBYTE, HubConfig
 from vtbdrake.control.hub.connection import SLICE, Connection
+from vtbdrake.control.hub.log_rate import limited_logger
 from vtbdrake.control.hub.relay import Relay
 from vtbdrake.control.hub.shortcut import LOOPBACK, open_shortcut
 from vtbdrake.control.hub.statistics import Statistics
 
-_log = logging.getLogger(__name__)
+_log = limited_logger(__name__)
 
 _READS = 8  # liblcm writes a message in five pieces
+_TURN = 64  # what the records of one client may cost, see `Relay.handle`, before it is another's turn
+_LEAST_RATE = MEBIBYTE  # bytes a second that come of a message once `HubConfig.patience` is over
+_MEMORY_CHECK = MEBIBYTE  # bytes that come between two looks at how much is held for all clients
 _NEWS_PERIOD = 0.01
 _ACCEPT_PAUSE = 1.0
 
@@ -102,6 +107,9 @@ class HubServer:
             self._epoll.register(fileno, select.EPOLLIN)
 
         self._clients: dict[int, Connection] = {}
+        self._waiting: dict[int, Connection] = {}  # those of them that have sent more than a turn's records
+        self._unchecked = 0  # bytes that have come since the last look at the memory
+        self._admission = Admission(config, on_loopback=self._listeners[0].getsockname()[0].startswith(LOOPBACK))
         self._relay = Relay(config)
         self._running = True
         self._now = time.monotonic()
@@ -116,12 +124,12 @@ class HubServer:
         due = self._due()
         try:
             while self._running:
-                events = self._epoll.poll(max(0.0, due - self._now))
+                events = self._epoll.poll(0.0 if self._waiting else max(0.0, due - self._now))
                 self._now = time.monotonic()
                 if self._now > due:
                     # The hub was held up. What its clients sent meanwhile has not been read.
-                    relay.excuse(self._now - due)
-                for fileno, event in events:
+                    self._excuse(self._now - due)
+                for fileno, event in [*events, *((fileno, 0) for fileno in self._waiting)]:
                     client = self._clients.get(fileno)
                     if client is not None:
                         self._attend(client, event)
@@ -130,6 +138,8 @@ class HubServer:
                         self._others[fileno]()
                     if relay.behind or relay.lost:
                         self._follow_up()
+                if self._unchecked >= _MEMORY_CHECK:
+                    self._check_memory()
                 if relay.news or self._now >= due:
                     self._keep_house()
                     self._follow_up()
@@ -147,6 +157,7 @@ class HubServer:
         for client in self._clients.values():
             client.close()
         self._clients.clear()
+        self._waiting.clear()
         if not self._epoll.closed:
             self._epoll.close()
             for listener in self._listeners:
@@ -189,14 +200,19 @@ class HubServer:
                 self._epoll.unregister(listener.fileno())
             self._paused = self._now
             return
-        if len(self._clients) >= self.config.max_clients:
-            _log.warning("a client is turned away: there are %d, the most allowed", len(self._clients))
-            self._relay.turn_away("too many")
+        user, reason, message = self._admission.decide(sock, self._clients.values())
+        if reason == FULL and self._make_room():
+            user, reason, message = self._admission.decide(sock, self._clients.values())
+        if reason:
+            _log.warning("a client is not let in: %s", message)
+            self._relay.turn_away(reason)
+            with contextlib.suppress(OSError):
+                sock.send(tcpq.refusal(message), socket.MSG_DONTWAIT)
             sock.close()
             return
         try:
             client = Connection(
-                sock, max_message=self.config.max_message, max_queue=self.config.max_queue, now=self._now
+                sock, max_message=self.config.max_message, max_queue=self.config.max_queue, now=self._now, user=user
             )
         except OSError:  # It is gone already.
             sock.close()
@@ -205,11 +221,24 @@ class HubServer:
         self._relay.join(client)
         self._epoll.register(client.fileno, select.EPOLLIN)
 
+    def _make_room(self) -> bool:
+        """Disconnects the client that has neither subscribed nor published for longest; returns whether there is one
+        that has not for as long as the hub's patience."""
+        idle = [c for c in self._clients.values() if c.idle and self._now - c.connected > self.config.patience]
+        if not idle:
+            return False
+        first = min(idle, key=lambda client: client.connected)
+        self._disconnect(first, "idle", "has neither subscribed nor published, and makes room for another client")
+        return True
+
     def _attend(self, client: Connection, event: int) -> None:
         try:
             if event & select.EPOLLOUT:
                 self._flush(client)
-            if event & ~select.EPOLLOUT:
+            if client.fileno in self._waiting:
+                if not event & ~select.EPOLLOUT:  # Its turn comes by the list of those that wait.
+                    self._handle(client)
+            elif event & ~select.EPOLLOUT:
                 self._read(client)
         except BlockingIOError:
             pass
@@ -232,20 +261,60 @@ class HubServer:
             if size == 0:
                 self._disconnect(client, "closed", "closed its connection")
                 return
-            while (record := client.reader.record()) is not None:
-                self._relay.handle(client, record, self._now)
+            self._unchecked += size
+            handled_all = self._handle(client)
             client.acknowledge()
             # The rest of a message is there as soon as its beginning is acknowledged; but large messages come in turns.
-            if not client.reader.partial or size == SLICE:
+            if not handled_all or not client.reader.partial or size == SLICE:
                 return
+
+    def _handle(self, client: Connection) -> bool:
+        """Handles what a client has sent, but no more than is its turn; returns whether that was all."""
+        reader, left, first = client.reader, _TURN, True
+        while left > 0:
+            record = reader.record()
+            if record is None:
+                self._waiting.pop(client.fileno, None)
+                if not reader.partial:
+                    client.begun = None
+                elif not first or client.begun is None:
+                    client.begun = self._now
+                return True
+            first = False
+            left -= self._relay.handle(client, record, self._now)
+        client.begun = None
+        self._waiting[client.fileno] = client
+        return False
 
     def _disconnect(self, client: Connection, reason: str, message: str) -> None:
         client.close()
+        self._waiting.pop(client.fileno, None)
         if self._clients.pop(client.fileno, None) is not None:
             # A client that ends with messages unread is lost, too: nothing to worry about.
             log = _log.info if reason in ("closed", "lost") else _log.warning
             log("%s %s", client.name, message)
             self._relay.leave(client, reason)
+
+    def _excuse(self, seconds: float) -> None:
+        """A time in which the hub was held up ends here; it does not count against anybody."""
+        self._relay.excuse(seconds)
+        for client in self._clients.values():
+            client.connected += seconds
+            client.progressed += seconds
+            if client.begun is not None:
+                client.begun += seconds
+
+    def _check_memory(self) -> None:
+        """Disconnects the clients for which most is held, until all together are within the limit."""
+        self._unchecked = 0
+        held = {client: client.held for client in self._clients.values()}
+        total = sum(held.values())
+        for client in sorted(held, key=lambda client: -held[client]):
+            if total <= self.config.max_memory:
+                break
+            total -= held[client]
+            message = f"is disconnected: it holds {held[client]} bytes, and all together more than max_memory"
+            self._disconnect(client, "memory", message)
 
     def _follow_up(self) -> None:
         """Sees to the clients that did not take what was sent to them."""
@@ -273,6 +342,14 @@ class HubServer:
                 )
             elif not client.reader.greeted:
                 self._disconnect(client, "greeting", f"has not greeted for {patience:g} s")
+        for client in list(self._clients.values()):
+            came = client.reader.held
+            if client.begun is not None and now - client.begun > patience + came / _LEAST_RATE:
+                self._disconnect(
+                    client,
+                    "incomplete",
+                    f"has not completed a message for {now - client.begun:.3g} s, {came} bytes of it have come",
+                )
         if self._paused is not None and now >= self._paused + _ACCEPT_PAUSE:
             self._paused = None
             for listener in self._listeners:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import struct
+
+from vtbdrake.control.hub.peers import peer_user
 
 _log = logging.getLogger(__name__)
 
 LOOPBACK = "127."
-_CREDENTIALS = struct.Struct("iII")  # process, user, group
 
 # The kernel counts over 1 KiB for a small message: with the buffer that it gives, 200 bytes at 1 kHz would be dropped
 # when the hub is held up for 0.17 s. It grants what /proc/sys/net/core/wmem_max allows.
@@ -56,16 +56,15 @@ def take_shortcut(host: str, port: int) -> socket.socket | None:
     try:
         sock.bind(b"")  # to a name that the kernel chooses, and by which the hub knows the client
         sock.connect(name)
-        credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        user = peer_user(sock)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
     except OSError:
         sock.close()
         return None
     # Anybody can take the name while no hub has it, and nothing that is said on the socket would tell him from the hub.
     # But the kernel says whose he is. Our own user could as well end the hub and take its port; a stranger could not.
-    user = _CREDENTIALS.unpack(credentials)[1]
     if user not in (0, os.geteuid()):
         sock.close()
-        _log.warning("%r belongs to the user %d, neither to us nor to root: the hub is sought by TCP", name, user)
+        _log.warning("%r belongs to the user %s, neither to us nor to root: the hub is sought by TCP", name, user)
         return None
     return sock

@@ -7,6 +7,9 @@ Client and hub greet each other with (magic, version). A client then sends recor
     unsubscribe  3, length of the pattern, pattern
 
 and receives publications, in the same form as it sends them.
+
+Instead of its greeting, this package's hub may send (refusal, length of a text, text) and close the connection. To
+liblcm's clients that is no hub; this package's own show the text.
 """
 
 from __future__ import annotations
@@ -17,7 +20,9 @@ import struct
 
 MAGIC_SERVER = 0x287617FA
 MAGIC_CLIENT = 0x287617FB
+MAGIC_REFUSAL = 0x287617FC
 VERSION = 0x0100
+MAX_REFUSAL = 500  # bytes of its text
 
 GREET = 0  # not on the wire: what `reader.Reader` makes of a client's greeting
 PUBLISH, SUBSCRIBE, UNSUBSCRIBE = 1, 2, 3
@@ -31,6 +36,13 @@ TAKE_PREFIX = "VTB_HUB_TAKE/"
 _PAIR = struct.Struct(">II")
 
 GREETING = _PAIR.pack(MAGIC_SERVER, VERSION)
+
+
+def refusal(reason: str) -> bytes:
+    """What a client gets that is not let in."""
+    text = reason.encode()[:MAX_REFUSAL]
+    return _PAIR.pack(MAGIC_REFUSAL, len(text)) + text
+
 
 # (type, channel or pattern, the record as it came)
 Record = tuple[int, bytes, bytes | bytearray]
