@@ -1,4 +1,4 @@
-"""What the arm does when its DPS cannot be relied on: it floats where it is."""
+"""What the arm does when its DPS cannot be relied on, or its sensors cannot: it floats where it is, or brakes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,29 @@ from numpy.typing import NDArray
 from diagrams.manipulator.arm import JOINTS, Arm
 from diagrams.manipulator.dynamics import ArmDynamics, function
 from diagrams.manipulator.laws import LAWS
-from vtbdrake.control.fallback import Fallback, Zero
+from vtbdrake.control.fallback import NO_COMMAND, Fallback, NoCommand, Sample, Silence
+from vtbdrake.testbed import Interface, Signal
 
 # The switch to real is refused where the command is further than this from the measured torque (N m).
 CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
 
+POSITION, VELOCITY = "joint_position", "joint_velocity"
+
+JUMP_TOLERANCE = {POSITION: 0.03, VELOCITY: 0.3, "joint_torque_measured": 50.0, "wrench": 100.0}
+"""In the signals' units."""
+
+DISAGREEMENT = 0.2
+"""How far the measured velocity may be from that of the positions (rad/s)."""
+
+SMOOTHING = 0.01
+"""Time constant of the positions' velocity (s)."""
+
 SLIP = 0.02
 """How far the held pose may be from the arm (rad)."""
+
+
+CARRY = 0.2
+"""Seconds for which the arm's weight is carried by the last known pose."""
 
 
 class FloatInPlace(Fallback):
@@ -26,11 +42,15 @@ class FloatInPlace(Fallback):
     - D v.
 
     The pose h is dragged along where the arm is more than `SLIP` away: the arm is held wherever it was when this takes
-    over, and gives way to who pushes it. Without a fresh position it carries the weight of the last one (which does not
-    accelerate the arm much, unlike no torque at all); without any, there is no torque.
+    over, and gives way to who pushes it. The measured velocity counts only as far as the positions bear it out, to
+    `DISAGREEMENT`.
+
+    Without a fresh position this carries the weight at the last pose that was accepted, for `CARRY` seconds from that
+    sample on. Then, or if no position was ever accepted, it sends nothing: the arm's own time-out lets its brakes fall
+    in. An arm that nobody sees cannot be held by torques.
     """
 
-    otherwise = Zero()
+    otherwise = Silence()
 
     def __init__(self, arm: Arm | None = None) -> None:
         model = ArmDynamics(arm)
@@ -38,23 +58,45 @@ class FloatInPlace(Fallback):
         self._gravity = function("gravity", {"q": q}, {"torque": model.inverse_dynamics(q, zero, zero)})
         gains = LAWS["joint_impedance"].parameters
         self._stiffness, self._damping = (np.array(gains[name][0]) for name in ("stiffness", "damping"))
-        self._position: NDArray[np.float64] | None = None
-        self._held: NDArray[np.float64] | None = None
+        self.take_over()
+
+    def check(self, signal: Signal, *, interface: Interface) -> None:
+        sizes = {sensor.name: sensor.size for sensor in interface.sense}
+        if signal.size != JOINTS or any(sizes.get(name) != JOINTS for name in (POSITION, VELOCITY)):
+            raise ValueError(
+                f"FloatInPlace commands {JOINTS} torques from the sensor signals {POSITION} and {VELOCITY} of that "
+                f"size; it cannot command {signal.name} from {', '.join(sizes) or 'none'}"
+            )
 
     def take_over(self) -> None:
-        self._position = self._held = None
+        self._held: NDArray[np.float64] | None = None
+        self._before: NDArray[np.float64] | None = None
+        self._velocity = np.zeros(JOINTS)
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> NDArray[np.float64]:
-        fresh = "joint_position" in sensed and "joint_velocity" in sensed
-        if fresh:
-            self._position = q = np.array(sensed["joint_position"])
+    def command(
+        self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float
+    ) -> NDArray[np.float64] | NoCommand:
+        last = known.get(POSITION)
+        if last is None or (POSITION not in sensed and last.age > CARRY):
+            self.take_over()
+            return NO_COMMAND
+        q: NDArray[np.float64] = last.value
+        torque: NDArray[np.float64] = self._gravity(q).full().ravel()
+        if POSITION in sensed and VELOCITY in sensed:
             self._held = q.copy() if self._held is None else np.clip(self._held, q - SLIP, q + SLIP)
-        if self._position is None or self._held is None:
-            raise RuntimeError("no position of the arm is known")
-        torque: NDArray[np.float64] = self._gravity(self._position).full().ravel()
-        if fresh:
-            torque += self._stiffness * (self._held - self._position) - self._damping * sensed["joint_velocity"]
+            v = self._borne_out(q, sensed[VELOCITY], dt)
+            torque += self._stiffness * (self._held - q) - self._damping * v
         return torque
+
+    def _borne_out(self, q: NDArray[np.float64], v: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """The measured velocity ``v``, no larger than what the positions say, and none that they contradict."""
+        if self._before is None:
+            self._velocity = v.copy()  # What the guards accepted until now; the positions correct it.
+        elif dt > 0.0:
+            self._velocity += min(dt / SMOOTHING, 1.0) * ((q - self._before) / dt - self._velocity)
+        self._before = q
+        lower, upper = np.minimum(self._velocity, 0.0), np.maximum(self._velocity, 0.0)
+        return np.clip(v, lower - DISAGREEMENT, upper + DISAGREEMENT)
 
 
 def arm_fallback() -> dict[str, Fallback]:

@@ -14,7 +14,7 @@ from diagrams.manipulator.dps import gravity_torque, make_dps
 from diagrams.manipulator.dynamics import ArmDynamics
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import HOME, MOTIONS
-from diagrams.manipulator.safety import CONTINUITY, arm_fallback
+from diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm_fallback
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import (
     ErrorModel,
@@ -109,11 +109,13 @@ class ManipulatorScenario(Scenario):
                     unit="rad",
                     lower=arm.lower - margin,
                     upper=arm.upper + margin,
+                    rate=2.0 * arm.speeds,
                     max_age=age,
                 ),
-                Signal("joint_velocity", size=JOINTS, unit="rad/s", lower=-10.0, upper=10.0, max_age=age),
-                Signal("joint_torque_measured", size=JOINTS, unit="N m", lower=-1e3, upper=1e3, max_age=age),
-                Signal("wrench", size=6, unit="N m, N", lower=-2e3, upper=2e3, max_age=age),
+                Signal("joint_velocity", size=JOINTS, unit="rad/s", lower=-10.0, upper=10.0, rate=1e3, max_age=age),
+                # Impacts are quick: for torque and wrench, only what cannot be is told apart.
+                Signal("joint_torque_measured", size=JOINTS, unit="N m", lower=-1e3, upper=1e3, rate=1e5, max_age=age),
+                Signal("wrench", size=6, unit="N m, N", lower=-2e3, upper=2e3, rate=1e5, max_age=age),
             ],
             act=[
                 Signal(
@@ -152,7 +154,8 @@ class ManipulatorScenario(Scenario):
 
     def operation(self) -> Operation:
         """How the DPS is run on the arm: after a fault, the arm floats in place."""
-        return Operation(period=self.period, guards={"fallback": arm_fallback()}, continuity=CONTINUITY)
+        guards = {"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE}
+        return Operation(period=self.period, guards=guards, continuity=CONTINUITY)
 
     def residuals(self) -> ResidualConfig:
         """The machine's samples are compared with those of an arm whose sensors do nothing by chance."""

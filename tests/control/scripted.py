@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,8 +50,11 @@ class ScriptedBridge(Bridge):
             reception.value, reception.arrived, reception.count = np.asarray(value), now, reception.count + 1
         return len(values)
 
-    def publish(self, commands: Mapping[str, Any]) -> None:
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+        if not self.up:
+            return tuple(commands)
         self.sent.append((self._clock.now(), {name: np.array(value) for name, value in commands.items()}))
+        return ()
 
 
 class Servo(LeafSystem):

@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pytest
 
-from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Zero, chain, default_fallback
+from vtbdrake.control.fallback import (
+    NO_COMMAND,
+    Brake,
+    Fallback,
+    FallbackController,
+    Hold,
+    Sample,
+    Silence,
+    Zero,
+    chain,
+    default_fallback,
+)
 from vtbdrake.testbed import Interface, Signal
 
 TORQUE = Signal("joint_torque", size=2, unit="N m", idle=0.0)
@@ -16,23 +30,30 @@ INTERFACE = Interface(
 
 
 def test_hold_keeps_the_last_command() -> None:
-    assert Hold().command(np.array([1.0, 2.0]), {}, 1e-3).tolist() == [1.0, 2.0]
+    assert Hold().command(np.array([1.0, 2.0]), {}, {}, 1e-3).tolist() == [1.0, 2.0]
 
 
 def test_zero_is_zero() -> None:
-    assert Zero().command(np.array([1.0, 2.0]), {}, 1e-3).tolist() == [0.0, 0.0]
+    assert Zero().command(np.array([1.0, 2.0]), {}, {}, 1e-3).tolist() == [0.0, 0.0]
 
 
 def test_brake_acts_against_the_measured_velocity() -> None:
     brake = Brake("joint_state", gain=[2.0, 3.0], entries=slice(2, 4))
-    command = brake.command(np.zeros(2), {"joint_state": np.array([9.0, 9.0, 1.0, -0.5])}, 1e-3)
+    command = brake.command(np.zeros(2), {"joint_state": np.array([9.0, 9.0, 1.0, -0.5])}, {}, 1e-3)
     assert command.tolist() == [-2.0, 1.5]
 
 
 def test_controller_gets_what_a_fallback_gets() -> None:
-    controller = FallbackController(lambda last, sensed, dt: last + dt * sensed["joint_state"][:2], otherwise=Hold())
-    command = controller.command(np.array([1.0, 2.0]), {"joint_state": np.array([1.0, 2.0, 0.0, 0.0])}, 0.5)
-    assert command.tolist() == [1.5, 3.0]
+    def command(last: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        return last + dt * sensed["joint_state"][:2] + known["picture"].age
+
+    controller = FallbackController(command, otherwise=Hold())
+    sensed, known = {"joint_state": np.array([1.0, 2.0, 0.0, 0.0])}, {"picture": Sample("cat", 7.0)}
+    assert controller.command(np.array([1.0, 2.0]), sensed, known, 0.5).tolist() == [8.5, 10.0]
+
+
+def test_silence_commands_nothing() -> None:
+    assert Silence().command(np.zeros(2), {}, {}, 1e-3) is NO_COMMAND
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Zero
+from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
 from vtbdrake.control.guard import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal
 
@@ -122,6 +122,19 @@ def test_sensor_that_jumps_is_a_fault_if_asked_for() -> None:
     assert loop.cycle({"torque": [0.0, 0.0]}).ok
     loop.receptions["velocity"].value = np.array([0.0, 1.0])
     assert kinds(loop.cycle({"torque": [0.0, 0.0]})) == [("velocity", "jump")]
+
+
+def test_level_that_a_sensor_jumped_to_is_accepted_by_a_reset_or_while_nothing_is_driven() -> None:
+    for driven in (True, False):
+        loop = Loop(TORQUE, sense=Signal("velocity", size=2, rate=1.0), jump_tolerance={"velocity": 0.01})
+        commands = {"torque": [0.0, 0.0]} if driven else {}
+        loop.cycle(commands)
+        loop.receptions["velocity"].value = np.array([0.0, 1.0])
+        found = [kinds(loop.cycle(commands)) for _ in range(200)]
+        assert found[:99] == [[("velocity", "jump")]] * 99
+        assert found[-1] == ([("velocity", "jump")] if driven else [])
+        assert loop.reset() == ()
+        assert loop.cycle({"torque": [0.0, 0.0]}).ok
 
 
 def test_sensor_that_is_not_on_real_is_not_watched() -> None:
@@ -247,6 +260,113 @@ def test_brake_brakes_while_its_velocity_is_fresh_and_fades_to_zero_after() -> N
     assert [fault.kind for fault in loop.guards.log] == ["not finite", "stale", "fallback"]
 
 
+def test_fallback_gets_the_last_accepted_samples_with_their_age_whatever_the_fault() -> None:
+    seen: list[tuple[Mapping[str, Any], Mapping[str, Sample]]] = []
+
+    def look(last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        seen.append((dict(sensed), dict(known)))
+        return last_sent
+
+    loop = Loop(TORQUE, fallback={"torque": FallbackController(look, otherwise=Zero())})
+    loop.receptions["velocity"].value = np.array([1.0, 2.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.receptions["velocity"].value = np.array([9.0, 9.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    sensed, known = seen[-1]
+    assert "velocity" not in sensed and known["velocity"].value.tolist() == [1.0, 2.0]
+    assert known["velocity"].age == pytest.approx(T)
+    loop.receptions["velocity"].value = np.array([3.0, 4.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    assert seen[-1][0]["velocity"].tolist() == [3.0, 4.0] and seen[-1][1]["velocity"].age == 0.0
+    loop.silent = True
+    for _ in range(30):
+        loop.cycle({"torque": [0.0, 0.0]})
+    sensed, known = seen[-1]
+    assert sensed == {} and known["velocity"].value.tolist() == [3.0, 4.0]
+    assert known["velocity"].age == pytest.approx(30 * T)
+
+
+def test_fallback_gets_what_the_machine_senses_though_the_dps_listens_to_the_simulation() -> None:
+    loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
+    sensed = {"velocity": Reception(value=np.array([2.0, -2.0]), arrived=T, count=1)}
+    verdict = loop.guards.check(T, {}, {"torque": [nan, nan]}, others=sensed)
+    assert verdict.commands["torque"] == pytest.approx([-0.1, 0.1])
+
+
+def test_silent_fallback_sends_nothing_and_the_next_command_departs_from_what_is_measured() -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": Silence()})
+    loop.guards.departures = {"torque": "acting"}
+    loop.receptions["acting"].value = np.array([3.0, -3.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    assert loop.cycle({"torque": [nan, 0.0]}).commands == {}
+    for _ in range(20):
+        loop.guards.withheld(())
+        assert loop.cycle({"torque": [0.0, 0.0]}).commands == {}
+    assert loop.reset() == ()
+    assert loop.cycle({"torque": [0.0, 0.0]}).commands["torque"] == pytest.approx([2.9, -2.9])
+
+
+# -- commands that did not leave
+
+
+def test_command_that_did_not_leave_counts_for_nothing() -> None:
+    loop = Loop(TORQUE, POSITION)
+    for _ in range(3):
+        loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]})
+        loop.guards.withheld(("torque",))
+    verdict = loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]})
+    assert verdict.commands["torque"] == pytest.approx([0.1, 0.1])
+    assert verdict.commands["position"].item() > 50.0 * T**2
+    loop.guards.withheld(())
+    assert loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]}).commands["torque"] == pytest.approx([0.2, 0.2])
+
+
+def test_commands_that_cannot_be_sent_for_long_are_a_fault_until_one_is() -> None:
+    loop = Loop(TORQUE)
+    for _ in range(11):
+        assert loop.cycle({"torque": [1.0, 1.0]}).ok
+        loop.guards.withheld(("torque",))
+    verdict = loop.cycle({"torque": [1.0, 1.0]})
+    assert kinds(verdict) == [("torque", "not sent")]
+    assert loop.reset() == ("the last 11 commands torque could not be sent",)
+    loop.guards.withheld(())
+    loop.cycle({"torque": [1.0, 1.0]})
+    assert loop.reset() == ()
+
+
+@pytest.mark.parametrize("measures", [True, False])
+def test_first_command_after_an_outage_departs_from_what_is_measured_or_from_what_left_last(measures: bool) -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
+    if measures:
+        loop.guards.departures = {"torque": "acting"}
+    for _ in range(20):
+        loop.cycle({"torque": [2.0, 2.0]})
+        loop.guards.withheld(())
+    for _ in range(50):
+        loop.cycle({"torque": [9.0, 9.0]})
+        loop.guards.withheld(("torque",))
+    loop.receptions["acting"].value = np.array([-5.0, 1.0])
+    expected = [-5.0, 1.0] if measures else [2.0, 2.0]
+    assert loop.cycle({"torque": [9.0, 9.0]}).commands["torque"] == pytest.approx(expected)
+
+
+def test_after_an_outage_nothing_is_sent_until_what_it_departs_from_is_fresh() -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor)
+    loop.guards.departures = {"torque": "acting"}
+    loop.cycle({"torque": [0.1, 0.1]})
+    loop.silent = True
+    for _ in range(40):
+        loop.guards.withheld(tuple(loop.cycle({"torque": [0.1, 0.1]}).commands))
+    assert loop.cycle({"torque": [0.1, 0.1]}).commands == {}
+    loop.guards.withheld(())
+    loop.silent = False
+    loop.receptions["acting"].value = np.array([4.0, 4.0])
+    assert loop.cycle({"torque": [0.1, 0.1]}).commands["torque"] == pytest.approx([3.9, 3.9])
+
+
 def test_fallback_is_limited_like_any_command() -> None:
     loop = Loop(POSITION, fallback={"position": FallbackController(lambda *_: [100.0], otherwise=Hold())})
     loop.cycle({"position": [nan]})
@@ -272,7 +392,7 @@ def test_fallback_controller_that_fails_is_stood_in_for_and_logged_once(function
 
 def test_last_command_stays_if_every_fallback_fails() -> None:
     class Broken(Fallback):
-        def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+        def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
             raise SystemExit(1)
 
     loop = Loop(TORQUE, fallback={"torque": Broken()})
@@ -283,7 +403,7 @@ def test_last_command_stays_if_every_fallback_fails() -> None:
 def test_fallback_learns_how_much_time_has_passed() -> None:
     spans = []
 
-    def note(last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+    def note(last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         spans.append(dt)
         return last_sent
 

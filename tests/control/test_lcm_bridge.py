@@ -130,8 +130,8 @@ def test_command_that_must_not_leave_is_withheld_with_its_whole_message(hub: Hub
     with closing(bridge(hub.url)) as arm:
         arm.open()
         in_step(arm, peer)
-        arm.publish({"position": value, "torque": np.zeros(7)})
-        arm.publish({"torque": np.ones(7)})
+        assert arm.publish({"position": value, "torque": np.zeros(7)}) == ("position", "torque")
+        assert arm.publish({"torque": np.ones(7)}) == ()
         heard = peer.hear(2)
     assert [command(data)[1].tolist() for _, data in heard[1:]] == [[1.0] * 7]
     assert arm.sent["position"].withheld == {reason: 1}
@@ -192,7 +192,7 @@ def test_killed_hub_is_noticed_by_the_next_poll_and_its_successor_found() -> Non
         while arm.poll():  # what the hub still said
             pass
         assert not arm.connected
-        arm.publish({"position": np.zeros(7)})
+        assert arm.publish({"position": np.zeros(7)}) == ("position",)
         assert arm.sent["position"].withheld == {"no bus": 1}
         with Hub(port=port):
             assert wait(arm, lambda: arm.connected)
@@ -403,8 +403,10 @@ def test_bridge_whose_commands_the_hub_refuses_counts_and_logs_it(caplog: pytest
         def both_publish() -> bool:
             for arm in (first, second):
                 arm.poll()
-                arm.publish({"position": np.full(7, 1.0)})
-            return second.sent["position"].withheld.get("refused", 0) >= 3
+                left_out = arm.publish({"position": np.full(7, 1.0)})
+            refused = second.sent["position"].withheld.get("refused", 0)
+            assert left_out == (("position",) if refused else ())
+            return refused >= 3
 
         first.publish({"position": np.full(7, 1.0)})
         wait(first, lambda: hub.statistics().protected["IIWA_COMMAND"].owner is not None)

@@ -416,6 +416,24 @@ def test_a_request_that_was_given_up_is_left_out():
     assert served.done() and done == ["served"]
 
 
+def test_after_an_outage_the_first_command_departs_from_what_the_machine_reports():
+    machine = {**still(0.0), "speed": [0.0, 0.0]}
+    runtime, bridge, _ = switched(rate=2.0, sensors=lambda t: machine)
+    runtime.run(cycles=100)
+    assert sent(bridge)[-1] == pytest.approx([0.2, -0.2])
+    bridge.up = False
+    runtime.run(cycles=300)
+    assert runtime.guards.latched[0].kind == "not sent"
+    machine["speed"] = [-0.6, 0.0]
+    count = len(bridge.sent)
+    bridge.up = True
+    runtime.run(cycles=2)
+    assert np.abs(sent(bridge)[count] - machine["speed"]).max() <= 2.0 * PERIOD * (1 + 1e-9)
+    runtime.reset()
+    runtime.run(cycles=300)
+    assert np.abs(np.diff(sent(bridge)[count:], axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
+
+
 def test_an_interruption_sends_the_fallback_once():
     runtime, bridge, _ = switched(rate=0.0)
 

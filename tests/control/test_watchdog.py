@@ -74,16 +74,50 @@ def test_implausible_sample_is_a_fault_until_the_next_one() -> None:
     assert kind(watchdog, 0.02, reception) is None
 
 
-def test_jump_is_what_exceeds_rate_and_tolerance() -> None:
+def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
     watchdog = Watchdog(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
     at = [
         received(np.array([0.0, 0.0]), 0.00, 1),
         received(np.array([0.09, 0.0105]), 0.01, 2),
         received(np.array([0.09, 0.0225]), 0.02, 3),
-        received(np.array([-0.02, 0.0225]), 0.03, 4),
-        received(np.array([-0.02, 0.0225]), 0.04, 5),
+        received(np.array([0.09, 0.0315]), 0.03, 4),
+        received(np.array([-0.32, 0.0315]), 0.04, 5),
+        received(np.array([-0.32, 0.0315]), 0.08, 6),
     ]
-    assert [kind(watchdog, r.arrived, r) for r in at] == [None, None, "jump", "jump", None]
+    assert [kind(watchdog, r.arrived, r) for r in at] == [None, None, "jump", None, "jump", None]
+    assert (watchdog.value.tolist(), watchdog.arrived) == ([-0.32, 0.0315], 0.08)
+
+
+def test_false_level_is_not_accepted_by_being_repeated() -> None:
+    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    for k in range(2, 500):
+        assert kind(watchdog, 0.001 * k, received(np.full(2, 0.1), 0.001 * k, k)) == "jump"
+    assert watchdog.value.tolist() == [0.0, 0.0]
+    assert kind(watchdog, 0.5, received(np.full(2, 0.02), 0.5, 500)) is None
+
+
+def test_samples_among_false_ones_are_accepted() -> None:
+    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    samples = [received(np.full(2, 0.001 * k + (k % 3 == 1)), 0.001 * k, k + 1) for k in range(300)]
+    found = [kind(watchdog, r.arrived, r) for r in samples]
+    # The very first is taken for true.
+    assert found[1:] == ["jump" if k % 3 == 1 else None for k in range(1, 300)]
+
+
+@pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
+def test_level_jumped_to_can_be_accepted_once_it_is_steady(swing: float, accepted: bool) -> None:
+    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    for k in range(2, 100):
+        watchdog.check(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
+    watchdog.accept_steady()
+    assert watchdog.value.tolist() == [0.0, 0.0], "not yet"
+    for k in range(100, 104):
+        last = received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k)
+        watchdog.check(0.001 * k, last)
+    watchdog.accept_steady()
+    assert (kind(watchdog, 0.103, last) is None) == accepted
 
 
 def test_longer_silence_allows_a_larger_change() -> None:
@@ -159,3 +193,5 @@ def test_jumps_need_a_finite_rate_and_a_vector() -> None:
         Watchdog(signal(), jump_tolerance=0.1)
     with pytest.raises(ValueError, match="abstract"):
         Watchdog(Signal("picture", model_value=""), jump_tolerance=0.1)
+    with pytest.raises(ValueError, match="not negative"):
+        Watchdog(signal(rate=1.0), jump_tolerance=[0.1, -0.1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -57,9 +57,13 @@ class Bridge(ABC):
         """Takes in what has arrived, waiting up to ``timeout`` seconds for the first; says how many messages came."""
 
     @abstractmethod
-    def publish(self, commands: Mapping[str, Any]) -> None:
-        """Sends actuator signals, by name. A signal that is not named is not sent: there is no message for "no
-        command"."""
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+        """Send actuator signals, by name. A signal that is not named is not sent: there is no message for "no
+        command".
+
+        Returns:
+            The signals whose commands did not leave, as far as is known; mostly empty.
+        """
 
     @property
     @abstractmethod

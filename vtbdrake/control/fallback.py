@@ -4,12 +4,35 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.testbed import Interface, Signal
+
+
+class Sample(NamedTuple):
+    """The newest sample of a sensor signal that was accepted as plausible.
+
+    Attributes:
+        value: of the signal; an array of shape (size,), or an abstract value.
+        age: seconds since it arrived.
+    """
+
+    value: Any
+    age: float
+
+
+class NoCommand:
+    """The type of `NO_COMMAND`."""
+
+    def __repr__(self) -> str:
+        return "NO_COMMAND"
+
+
+NO_COMMAND: Final = NoCommand()
+"""What a fallback returns to have nothing sent: the machine's own time-out then brakes it."""
 
 
 class Fallback(ABC):
@@ -32,12 +55,15 @@ class Fallback(ABC):
         """Called before its first command after a fault: what it remembers of an earlier one is long over."""
 
     @abstractmethod
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
-        """What is to be sent.
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        """Return what is to be sent, or `NO_COMMAND`.
 
         Args:
             last_sent: what was sent last, shape (size,).
-            sensed: the sensor signals that are fresh and plausible; a stale one is not in it.
+            sensed: values of the sensor signals that are fresh and plausible at present. The signal that caused the
+                fault is usually not in it.
+            known: the newest sample of every sensor signal that was accepted, however old it is. A signal of which no
+                sample was ever accepted is not in it.
             dt: seconds since the cycle before.
         """
 
@@ -46,7 +72,7 @@ class Hold(Fallback):
     """The last command stays, or what comes closest to it within the limits: a commanded position comes to rest, as
     quickly as the limit of acceleration allows."""
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return last_sent
 
 
@@ -57,8 +83,15 @@ class Zero(Fallback):
         if not signal.is_vector:
             raise ValueError(f"the actuator signal {signal.name} is abstract, it has no zero: take another fallback")
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return np.zeros(len(last_sent))
+
+
+class Silence(Fallback):
+    """Sends nothing, so that the machine's own time-out brakes it: for machines that have one."""
+
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        return NO_COMMAND
 
 
 class Brake(Fallback):
@@ -94,7 +127,7 @@ class Brake(Fallback):
                 f"{self.velocity} and gains of shape {self.gain.shape}: they must agree"
             )
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return -self.gain * sensed[self.velocity][self.entries]
 
 
@@ -106,12 +139,14 @@ class FallbackController(Fallback):
         otherwise: takes over for the cycle if it raises or returns what cannot be sent.
     """
 
-    def __init__(self, function: Callable[[Any, Mapping[str, Any], float], Any], *, otherwise: Fallback) -> None:
+    def __init__(
+        self, function: Callable[[Any, Mapping[str, Any], Mapping[str, Sample], float], Any], *, otherwise: Fallback
+    ) -> None:
         self.function = function
         self.otherwise = otherwise
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], dt: float) -> Any:
-        return self.function(last_sent, sensed, dt)
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        return self.function(last_sent, sensed, known, dt)
 
 
 _BY_UNIT: dict[str, type[Fallback]] = {

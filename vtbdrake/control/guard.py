@@ -5,19 +5,23 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
-from math import isnan
+from math import inf, isnan
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.fallback import Fallback, chain, default_fallback
+from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
 from vtbdrake.control.kernels import found
 from vtbdrake.control.limits import NOT_STARTED, AbstractGuard, CommandFault, CommandGuard
 from vtbdrake.control.watchdog import Fault, Watchdog
 from vtbdrake.testbed import Interface, Signal
 
 _log = logging.getLogger(__name__)
+
+MOST_UNSENT = 10
+"""Commands in a row that may fail to leave before that is a fault."""
 
 
 class Verdict(NamedTuple):
@@ -46,21 +50,28 @@ class Guards:
     A signal with a limit of its rate or acceleration needs `start` before it is commanded. What has neither a start nor
     a command that was sent is not sent at all: there is nothing to hold.
 
-    Fallbacks go on when the machine is gone, with the sensor signals that are still fresh: `Brake` turns into `Zero`
-    when its velocity is stale.
+    Fallbacks go on when the machine is gone: they get the sensor signals that are still fresh, and the last accepted
+    sample of each with its age. `Brake` turns into `Zero` when its velocity is stale.
+
+    A command that did not leave does not count (see `withheld`). After more than `MOST_UNSENT` of them in a row, or as
+    long a silence of a fallback, nobody knows what the machine did meanwhile: its commands depart anew, from what
+    `departures` measures. Until that is fresh, nothing is sent.
 
     Args:
         interface: of the DPS.
         period: of the loop, in seconds.
         fallback: by actuator signal; see `default_fallback` for the others.
         jump_tolerance, max_delay: by sensor signal; see `Watchdog`.
-        max_missed: more deadlines missed in a row are a fault.
+        max_missed: more deadlines missed in a row are a fault. So are more commands in a row that did not leave, but
+            of those never more than `MOST_UNSENT` are allowed.
         log_size: how many faults `log` keeps.
 
     Attributes:
         commands: the guard of each actuator signal, with its counts.
         watchdogs: of each sensor signal.
         log: the newest faults, each once while it lasts.
+        departures: actuator signal -> sensor signal that measures what acts there; the `Runtime` takes it from its
+            continuity. Without one, commands go on from the last one that left.
 
     Raises:
         ValueError: a fallback is missing, for an unknown signal or does not fit its signal.
@@ -91,6 +102,7 @@ class Guards:
             for s in interface.sense
         }
         self.log: deque[Fault] = deque(maxlen=log_size)
+        self.departures: Mapping[str, str] = {}
         self._fallbacks = {
             s.name: chain(fallback.get(s.name) or default_fallback(s), s, interface=interface) for s in interface.act
         }
@@ -103,6 +115,11 @@ class Guards:
         self._failed: set[Fallback] = set()
         self._active: tuple[str, ...] = ()
         self._last: float | None = None
+        self._most_unsent = min(max_missed, MOST_UNSENT)
+        # By actuator signal, for how many cycles nothing left: because it could not, or because a fallback is silent.
+        self._unsent: dict[str, int] = {}
+        self._held_back: frozenset[str] = frozenset()
+        self._silent: frozenset[str] = frozenset()
 
     @property
     def latched(self) -> tuple[Fault, ...]:
@@ -143,8 +160,9 @@ class Guards:
         error: BaseException | None = None,
         missed: int = 0,
         not_ready: str | None = None,
+        others: Mapping[str, Reception] = MappingProxyType({}),
     ) -> Verdict:
-        """One cycle. What it returns counts as sent.
+        """Judge one cycle. What it returns counts as sent, unless `withheld` says otherwise.
 
         Args:
             now: the time on the clock of `Reception.arrived`, in seconds.
@@ -155,9 +173,12 @@ class Guards:
             error: what the DPS raised, if it did.
             missed: how many deadlines were missed in a row, up to now.
             not_ready: why the machine is not ready, if it is not.
+            others: receptions of sensor signals that are not on real: fallbacks may use them.
         """
         driven = self._activate(active if active is not None else self._active if error else commands)
         causes = self._whole(now, error, missed, not_ready)
+        if self._unsent:
+            causes += self._depart_anew(now, {**others, **receptions})
         wanted = []
         if error is None:
             for name in driven:
@@ -175,10 +196,26 @@ class Guards:
             self._note(causes, doubts)
             if self._faults and driven and not self._latched:
                 self._latch(self._faults)
+            if not driven:
+                self._accept_steady()
         if self._latched:
-            return Verdict(self._fall_back(now, receptions), False, self._faults)
+            return Verdict(self._fall_back(now, {**others, **receptions}), False, self._faults)
         self._last = now
+        self._silent = frozenset()
         return Verdict({name: guard.send(values) for name, guard, values in wanted}, True, self._faults)
+
+    def withheld(self, names: Collection[str]) -> None:
+        """Take note of which commands of the last verdict did not leave: those do not count as sent.
+
+        Args:
+            names: their actuator signals; empty if all have left.
+        """
+        if not names and not self._unsent and not self._silent:
+            return
+        for name in names:
+            self.commands[name].take_back()
+        self._held_back = frozenset(names)
+        self._unsent = {name: self._unsent.get(name, 0) + 1 for name in (*names, *(self._silent - self._held_back))}
 
     def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
@@ -190,11 +227,12 @@ class Guards:
 
     def reset(self, now: float, receptions: Mapping[str, Reception]) -> tuple[str, ...]:
         """Releases the latch, unless a cause persists: the DPS's and the loop's as of the last `check`, the sensor
-        signals' as of now.
+        signals' as of now. A sensor signal that has jumped is accepted where it is, if it has been steady there.
 
         Returns:
             Why it stays; empty if it was released.
         """
+        self._accept_steady()
         reasons = tuple(fault.reason for fault in (*self._causes, *found(now, self.watchdogs, receptions)))
         if not reasons:
             self._latched = ()
@@ -221,6 +259,29 @@ class Guards:
             faults.append(Fault(now, None, "not ready", f"the machine is not ready: {not_ready}"))
         return faults
 
+    def _depart_anew(self, now: float, receptions: Mapping[str, Reception]) -> list[Fault]:
+        """Has commands that have not left for long depart from what is measured now; gives what is wrong."""
+        causes = []
+        for name, count in self._unsent.items():
+            if count <= self._most_unsent or name not in self._active:
+                continue
+            if name in self._held_back:
+                causes.append(Fault(now, name, "not sent", f"the last {count} commands {name} could not be sent"))
+            guard = self.commands[name]
+            sensor = self.departures.get(name)
+            if not guard.needs_start or sensor is None:
+                continue
+            reception = receptions.get(sensor)
+            if reception is not None and self.watchdogs[sensor].check(now, reception) is None:
+                guard.start_from(reception.value)
+            else:
+                guard.release()
+        return causes
+
+    def _accept_steady(self) -> None:
+        for watchdog in self.watchdogs.values():
+            watchdog.accept_steady()
+
     def _note(self, causes: list[Fault], doubts: list[Fault]) -> None:
         """Logs the faults that the cycle before did not have."""
         known = {(fault.signal, fault.kind) for fault in self._faults}
@@ -242,13 +303,23 @@ class Guards:
             for name, reception in receptions.items()
             if self.watchdogs[name].check(now, reception) is None
         }
-        return {
-            name: self._fallback_command(name, now, sensed, dt)
-            for name, guard in self.commands.items()
-            if name in self._active and guard.has_start
+        known = {
+            name: Sample(watchdog.value, now - watchdog.arrived)
+            for name, watchdog in self.watchdogs.items()
+            if watchdog.arrived > -inf
         }
+        commands = {
+            name: self._fallback_command(name, now, sensed, known, dt)
+            for name in self._active
+            if self.commands[name].has_start
+        }
+        sent = {name: command for name, command in commands.items() if command is not NO_COMMAND}
+        self._silent = frozenset(self._active) - frozenset(sent)
+        return sent
 
-    def _fallback_command(self, name: str, now: float, sensed: Mapping[str, Any], dt: float) -> Any:
+    def _fallback_command(
+        self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float
+    ) -> Any:
         guard: Any = self.commands[name]
         last_sent = guard.last_sent
         for fallback in self._fallbacks[name]:
@@ -256,7 +327,8 @@ class Guards:
                 if fallback not in self._begun:
                     self._begun.add(fallback)
                     fallback.take_over()
-                return guard.limit(fallback.command(last_sent, sensed, dt))
+                command = fallback.command(last_sent, sensed, known, dt)
+                return command if command is NO_COMMAND else guard.limit(command)
             except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
                 if fallback not in self._failed:
                     self._failed.add(fallback)

@@ -194,15 +194,20 @@ cdef class Freshness:
 
     Attributes:
         trusted: the `Reception.range` with which values need not be examined; None if all have to be.
+        value: the newest sample that nothing was wrong with; None before the first.
+        arrived: when that sample arrived, in seconds; -inf before the first.
     """
 
     cdef readonly double max_age
+    cdef readonly object value
+    cdef readonly double arrived
     cdef public object trusted
     cdef int64_t count
     cdef object fault
 
     def __init__(self, double max_age):
         self.max_age = max_age
+        self.arrived = -INFINITY
 
     cpdef check(self, double now, Reception reception):
         """What is wrong with the signal at the time ``now``, in seconds; None if nothing is."""
@@ -216,7 +221,52 @@ cdef class Freshness:
                 self.fault = None
             else:
                 self.fault = self.examine(now, reception)
+            if self.fault is None:
+                self.value = reception.value
+                self.arrived = reception.arrived
         return self.fault
+
+    def accept(self, value, double arrived):
+        """Takes a sample for accepted, whatever was found wrong with it."""
+        self.value = value
+        self.arrived = arrived
+        self.fault = None
+
+
+cdef class Reach:
+    """How far the entries of a sensor signal may be from its last accepted sample.
+
+    Args:
+        rate: the fastest change of each entry, per second.
+        tolerance: the change of each entry that is allowed at any time.
+    """
+
+    cdef Py_ssize_t size
+    cdef double* rate
+    cdef double* tolerance
+
+    def __cinit__(self, rate, tolerance):
+        if len(rate) != len(tolerance):
+            raise ValueError(f"each entry has a rate and a tolerance, not {len(rate)} rates and {len(tolerance)} tolerances")
+        self.size = len(rate)
+        self.rate = _doubles(rate)
+        self.tolerance = _doubles(tolerance)
+
+    def __dealloc__(self):
+        PyMem_Free(self.rate)
+        PyMem_Free(self.tolerance)
+
+    def contains(self, before, value, double seconds):
+        """Whether entries can change from ``before`` to ``value`` in so many seconds; both are arrays of doubles."""
+        cdef double* b = entries_of(before, self.size)
+        cdef double* v = entries_of(value, self.size)
+        cdef Py_ssize_t i
+        if b is NULL or v is NULL:
+            return False
+        for i in range(self.size):
+            if not fabs(v[i] - b[i]) <= self.rate[i] * seconds + self.tolerance[i]:  # so a NaN is not within
+                return False
+        return True
 
 
 def found(double now, dict watches, receptions):

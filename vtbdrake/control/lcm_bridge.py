@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, Reception
@@ -150,7 +150,7 @@ class LcmBridge(Bridge):
     def poll(self, timeout: float = 0.0) -> int:
         return self._link.take(timeout, self._burst)
 
-    def publish(self, commands: Mapping[str, Any]) -> None:
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
         """
         Raises:
             ValueError: there is no such actuator signal.
@@ -161,17 +161,22 @@ class LcmBridge(Bridge):
         self._utime = utime = max(self._utime + 1, int((self._time_of_day + time.monotonic()) * 1e6))
         leaving = [(outlet, data) for outlet in self._outlets if (data := outlet.message(commands, utime)) is not None]
         if not leaving:
-            return
+            return tuple(commands)
         if self._watches:
             for outlet, data in leaving:
                 self._watches[outlet.channel].expect(data)
         left = self._link.publish(*[(outlet.channel, data) for outlet, data in leaving])
+        gone: set[str] = set()
         for outlet, data in leaving:
             # What is refused has left all the same: the hub lets it pass as soon as the channel is free.
             refused = "refused" if outlet.channel in self._ownership.foreign else ""
-            outlet.count(refused if left else "no bus")
+            problem = refused if left else "no bus"
+            outlet.count(problem)
+            if not problem:
+                gone.update(outlet.named)
             if left and self.tap is not None:
                 self.tap(outlet.channel, data)
+        return () if len(gone) == len(commands) else tuple(name for name in commands if name not in gone)
 
     def _tapped(self, inlet: Inlet) -> Handler:
         def take(channel: str, data: bytes) -> None:

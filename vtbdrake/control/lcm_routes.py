@@ -131,7 +131,12 @@ class Transmission:
 
 
 class Outlet:
-    """Makes the messages of one channel."""
+    """Makes the messages of one channel.
+
+    Attributes:
+        channel: its name.
+        named: the signals of the last message.
+    """
 
     def __init__(
         self, map: LcmMap, signals: Sequence[Signal], transmissions: MutableMapping[str, Transmission]
@@ -147,15 +152,15 @@ class Outlet:
         self._form = map.form(signals, self._ranges)
         self._transmissions = transmissions
         self._all = list(self._ranges)
-        self._named: list[str] = []
+        self.named: list[str] = []
 
     def message(self, commands: Mapping[str, Any], utime: int) -> bytes | None:
         """The message of those commands that are this channel's; None if there are none, or none may leave."""
         if self._form is not None and (message := self._form.fill(commands, utime)) is not None:
-            self._named = self._all
+            self.named = self._all
             return message
         values = {name: commands[name] for name in self._ranges if name in commands}
-        self._named = list(values)
+        self.named = list(values)
         if not values:
             return None
         faults = {name: reason for name in values if (reason := self._ranges[name].check(values[name]))}
@@ -172,7 +177,7 @@ class Outlet:
 
     def count(self, problem: str) -> None:
         """Counts what became of the last message: it left, if there was no problem."""
-        for name in self._named:
+        for name in self.named:
             if problem:
                 self._transmissions[name].withhold(problem)
             else:

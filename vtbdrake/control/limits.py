@@ -100,8 +100,9 @@ class CommandGuard:
         )
         self.needs_start = bool(np.isfinite(steps).any() or np.isfinite(changes).any())
         self.has_start = False
-        # s and x of above.
-        self._sent, self._step_before = np.zeros(self._size), np.zeros(self._size)
+        # s and x of above, and what they were before the last command.
+        self._state, self._state_before = np.zeros((2, self._size)), np.zeros((2, self._size))
+        self._sent, self._step_before = self._state
         self._passage = Passage(self._limits)
 
     @property
@@ -125,6 +126,10 @@ class CommandGuard:
     def release(self) -> None:
         """Forgets what was sent: from now on somebody else commands."""
         self.has_start = False
+
+    def take_back(self) -> None:
+        """Take the last command for one that was never sent. It needs a command since the last start."""
+        self._state[:] = self._state_before
 
     def limit(self, command: ArrayLike) -> NDArray[np.float64]:
         """What may be sent for ``command``, of shape (size,); it counts as sent.
@@ -158,6 +163,7 @@ class CommandGuard:
             if self.needs_start:
                 raise CommandFault("not started", NOT_STARTED)
             self.start_from(values)
+        self._state_before[:] = self._state
         passed = self._passage.advance(values, self._sent, self._step_before)
         if passed is not None:
             return passed
@@ -206,6 +212,7 @@ class AbstractGuard:
         self.signal = signal
         self.counts: dict[str, LimitCount] = {}
         self.last_sent: Any = None
+        self._sent_before: Any = None
 
     @property
     def has_start(self) -> bool:
@@ -217,6 +224,9 @@ class AbstractGuard:
     def release(self) -> None:
         self.last_sent = None
 
+    def take_back(self) -> None:
+        self.last_sent = self._sent_before
+
     def limit(self, command: Any) -> Any:
         return self.send(self.checked(command))
 
@@ -226,5 +236,5 @@ class AbstractGuard:
         return command
 
     def send(self, command: Any) -> Any:
-        self.last_sent = command
+        self._sent_before, self.last_sent = self.last_sent, command
         return command

@@ -54,7 +54,7 @@ class Runtime(Stepped):
             signals' largest ages, so that a silent machine is noticed by a cycle. A paced loop that is held up for
             longer has missed cycles.
         continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
-            differ by more.
+            differ by more. Commands depart from that sensor signal, also after a time in which none left.
         ready: says why the machine is not ready to be commanded, or None.
         statistics: of the loop's timing.
         watchers: called with every `Cycle`; one that raises is left out from then on, and the loop goes on.
@@ -89,6 +89,7 @@ class Runtime(Stepped):
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
         self.continuity = dict(continuity or {})
+        self.guards.departures = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.ready = ready
         self.cycles = 0
         self.pace = pace
@@ -223,9 +224,9 @@ class Runtime(Stepped):
             # Who slept for long wakes up to old messages: those deadlines count before anything is sent.
             missed=self.statistics.run + int(lateness / self.period),
             not_ready=self.not_ready() if active else None,
+            others=self.bridge.sensed,
         )
-        if verdict.commands:
-            self.bridge.publish(verdict.commands)
+        self.guards.withheld(self.bridge.publish(verdict.commands) if verdict.commands else ())
         self.slow_parts.send()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         changes, new = self.news()

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, isnan, nan
+from math import inf, isfinite, isnan, nan
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.kernels import Freshness
+from vtbdrake.control.kernels import Freshness, Reach
 from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
 # By how many seconds in one the clocks of two computers may drift apart: NTP's largest correction.
 _DRIFT = 500e-6
+
+SETTLING = 0.1
+"""Seconds for which samples have to agree before the level that a signal has jumped to can be accepted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +28,8 @@ class Fault:
         time: when it was found, on the loop's clock, in seconds.
         signal: the one it is about; None if it is about all.
         kind: of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``,
-            ``not finite``, ``not started`` or ``fallback``; of all ``raised``, ``missed``, ``not ready`` or ``told``.
+            ``not finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``not ready``
+            or ``told``.
         reason: one sentence.
     """
 
@@ -70,6 +74,11 @@ class Watchdog(Freshness):
     all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
     What the bridge has checked by the same limits is not checked again.
 
+    A sample that is further from the last accepted one than the signal can have changed is a *jump*. The signal stays
+    implausible until a sample is within reach of the last accepted one again. While samples are refused, that reach
+    grows for `max_age` at most (or for the gap before the first of them, if that was longer): a wrong value does not
+    become right by being repeated. `accept_steady` is the way on for a sensor that really is elsewhere.
+
     Args:
         signal: its limits count.
         jump_tolerance: a scalar or one per entry, in the signal's unit. If given, entries may change from one accepted
@@ -87,19 +96,23 @@ class Watchdog(Freshness):
             raise ValueError(f"the sensor signal {signal.name} has a positive max_delay, not {max_delay} s")
         self.signal = signal
         super().__init__(signal.max_age)
-        self._arrived = -inf
-        self._value: np.ndarray | None = None
+        # The newest sample that was refused as a jump, and since when such samples have agreed with each other.
+        self._refused: np.ndarray | None = None
+        self._refused_at = self._steady_since = -inf
+        self._longest_gap = inf
         self._delay = None if max_delay is None else Delay(max_delay)
         self._range = None if signal.size is None else Range(signal)
-        self._tolerates = jump_tolerance is not None
-        self._compares = self._tolerates or self._delay is not None
+        self._reach: Reach | None = None
+        self._compares = jump_tolerance is not None or self._delay is not None
         if jump_tolerance is not None:
             if signal.size is None:
                 raise ValueError(f"the sensor signal {signal.name} is abstract: there is no jump to tolerate")
-            self._rate = signal.vector(signal.rate)
-            if not np.isfinite(self._rate).all():
+            rate, tolerance = signal.vector(signal.rate), signal.vector(jump_tolerance)
+            if not np.isfinite(rate).all():
                 raise ValueError(f"the sensor signal {signal.name} may jump: to tell a jump, it needs a finite rate")
-            self._tolerance = signal.vector(jump_tolerance)
+            if not (tolerance >= 0.0).all():
+                raise ValueError(f"the jump_tolerance of {signal.name} is not negative, unlike {tolerance.tolist()}")
+            self._reach = Reach(rate.tolist(), tolerance.tolist())
 
     def stale(self, now: float, reception: Reception) -> Fault:
         name = self.signal.name
@@ -118,11 +131,20 @@ class Watchdog(Freshness):
                 fault = self._implausible(now, reception)
         if not self._compares:
             self.trusted = self._range
-        if fault is None and self._tolerates:
-            fault = self._jump(now, reception)
         if fault is None and self._delay is not None:
             fault = self._delayed(now, reception, self._delay)
+        if fault is None and self._reach is not None:
+            fault = self._jump(now, reception, self._reach)
         return fault
+
+    def accept_steady(self) -> None:
+        """Accept the level that the signal has jumped to, if its samples have agreed with each other for `SETTLING`.
+
+        To be called when somebody takes the responsibility (a reset by hand), or nothing depends on the signal.
+        """
+        if self._refused is not None and self._refused_at - self._steady_since >= SETTLING:
+            self.accept(self._refused, self._refused_at)
+            self._refused = None
 
     def _implausible(self, now: float, reception: Reception) -> Fault | None:
         if self._range is None:
@@ -137,16 +159,25 @@ class Watchdog(Freshness):
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
         return Fault(now, name, "implausible", reason)
 
-    def _jump(self, now: float, reception: Reception) -> Fault | None:
-        value = np.array(reception.value, dtype=float)
-        before, since = self._value, reception.arrived - self._arrived
-        self._value, self._arrived = value, reception.arrived
-        if before is None:
+    def _jump(self, now: float, reception: Reception, reach: Reach) -> Fault | None:
+        value = np.asarray(reception.value, dtype=float)
+        if self.value is None:
             return None
-        excess = abs(value - before) - (self._rate * max(since, 0.0) + self._tolerance)
-        if not excess.max() > 0.0:
+        accepted = np.asarray(self.value, dtype=float)
+        since = max(reception.arrived - self.arrived, 0.0)
+        within = since if self._refused is None else min(since, self._longest_gap)
+        if reach.contains(accepted, value, within):
+            self._refused = None
             return None
-        reason = f"sensor signal {self.signal.name} jumps within {1e3 * since:.1f} ms from {before} to {value}"
+        if self._refused is None:
+            self._longest_gap = max(since, self.max_age) if isfinite(self.max_age) else since
+        if self._refused is None or not reach.contains(self._refused, value, reception.arrived - self._refused_at):
+            self._steady_since = reception.arrived
+        self._refused, self._refused_at = value, reception.arrived
+        reason = (
+            f"sensor signal {self.signal.name} jumps within {1e3 * since:.1f} ms from {accepted.tolist()} to "
+            f"{value.tolist()}"
+        )
         return Fault(now, self.signal.name, "jump", reason)
 
     def _delayed(self, now: float, reception: Reception, delay: Delay) -> Fault | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import Any
 
@@ -53,7 +53,7 @@ class Ear(Bridge):
             self._inlets[channel].take(channel, data)
         return count
 
-    def publish(self, commands: Mapping[str, Any]) -> None:
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
         raise AssertionError("who only listens commands nothing")
 
 
@@ -86,12 +86,13 @@ class Line(Ear):
                 ear.heard.append(told)
         return super().poll()
 
-    def publish(self, commands: Mapping[str, Any]) -> None:
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
         self._utime += 1
         for outlet in self._outlets:
             data = outlet.message(commands, self._utime)
             assert data is not None
             self.machine.receive(outlet.channel, data)
+        return ()
 
 
 def loop(
