@@ -153,7 +153,7 @@ def test_boundary_for_all_and_for_each_condition() -> None:
     lines = program.stdout.splitlines()
     assert lines[0] == str(expected)
     lower, upper = expected.by_condition[1]
-    assert lines[2] == f"  condition 1 ({DAMPING} = 0.5): safe up to {lower:.6g}, not at {upper:.6g} rad"
+    assert lines[2] == f"  condition 1 ({DAMPING} = 0.5): safe up to {lower:.6g} rad, not at {upper:.6g} rad"
 
 
 @pytest.mark.parametrize("form", ["mermaid", "svg"])

@@ -7,6 +7,7 @@ import pytest
 
 import vtbdrake as vtb
 from tests.testbeds import PendulumScenario
+from vtbdrake.optimization import Risk
 from vtbdrake.rollout import Executor, SerialExecutor
 
 THETA = "sim.sys.Pendulum.theta.position"
@@ -122,3 +123,81 @@ def test_an_interrupted_sweep_is_still_one_after_its_file(tmp_path):
 def test_an_interrupted_search_says_nothing():
     with pytest.raises(KeyboardInterrupt):
         _problem(threshold=1.0).boundary(resolution=1.0, coarse=4.0, executor=Interrupted(2), progress=False)
+
+
+def _speed(omega):
+    return abs(omega)
+
+
+@pytest.mark.parametrize("risk", ["worst", "mean", vtb.Quantile(0.5), vtb.CVaR(0.7)])
+@pytest.mark.parametrize(("minimize", "limit"), [(False, 9.0), (False, 2.0), (True, 2.0)])
+def test_the_best_of_a_sweep_is_that_of_a_study(risk, minimize, limit, tmp_path):
+    problem = _problem(
+        parameters=[vtb.Parameter(OMEGA, 0.0, 6.0)],
+        quality=vtb.Quality(lambda theta: (theta - 0.4) ** 2, THETA, minimize=minimize, reading="end"),
+        conditions=[{DAMPING: 0.0}, {DAMPING: 0.3}, {DAMPING: 1.0, THETA: 0.5}],
+        risk=risk,
+        constraints=[vtb.Constraint(_speed, OMEGA, at_most=limit)],
+        horizon=0.5,
+    )
+    speeds = [4.0, 1.0, 5.0, 2.0, 3.0, 0.0, 6.0]
+    sweep = problem.sweep(values=speeds, executor="serial", progress=False)
+    study = problem.study(solver="grid", options={"points": len(speeds)})
+    study.run(rollouts=3 * len(speeds), executor="serial", progress=False, racing=False)
+    assert sorted(trial.parameters[OMEGA] for trial in study.trials) == sorted(speeds)
+    assert sweep.best() == (dict(study.best.parameters), study.best.value)
+    # With the lower limit, the fast ones violate the constraint.
+    assert any(not trial.feasible for trial in study.trials) == (limit == 2.0)
+    sweep.save(tmp_path / "sweep.vtb")
+    assert vtb.Sweep.load(tmp_path / "sweep.vtb").best() == sweep.best()
+
+
+def test_a_sweep_without_a_single_best_point_says_why():
+    two = _problem(quality=[vtb.Quality(_angle, THETA), vtb.Quality(_speed, OMEGA)])
+    with pytest.raises(ValueError, match="of several qualities there is no best point"):
+        two.sweep(values=[1.0, 2.0], executor="serial", progress=False).best()
+    strict = _problem(constraints=[vtb.Constraint(_speed, OMEGA, at_least=50.0)])
+    with pytest.raises(ValueError, match="no point .* under all conditions and keeps the constraints"):
+        strict.sweep(values=[1.0, 2.0], executor="serial", progress=False).best()
+
+
+class Best(Risk):
+    """A class of the user's own."""
+
+    def __call__(self, h):
+        return float(max(h))
+
+
+def test_a_risk_that_a_file_cannot_hold_is_asked_for(tmp_path):
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}], risk=Best(), horizon=0.5)
+    sweep = problem.sweep(values=[1.0, 2.0], executor="serial", progress=False)
+    sweep.save(tmp_path / "sweep.vtb")
+    loaded = vtb.Sweep.load(tmp_path / "sweep.vtb")
+    with pytest.raises(ValueError, match=r"set it by dataclasses.replace\(sweep, risk=...\)"):
+        loaded.best()
+    assert replace(loaded, risk=Best()).best() == sweep.best()
+
+
+def test_values_stay_in_their_order():
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}], horizon=0.2)
+    sweep = problem.sweep(values=[3.0, 1.0, 2.0], executor="threads", workers=2, progress=False)
+    assert sweep.points[:, 0].tolist() == [3.0, 3.0, 1.0, 1.0, 2.0, 2.0]
+    assert sweep.condition.tolist() == [0, 1, 0, 1, 0, 1]
+    assert [rollout.parameters[OMEGA] for rollout in sweep.rollouts] == sweep.points[:, 0].tolist()
+
+
+def test_costs_too_small_for_one_over_one_plus_c_have_a_best_point():
+    quality = vtb.Quality(lambda omega: 1e-20 * (omega - 2.0) ** 2, OMEGA, minimize=True, reading="worst")
+    sweep = _problem(quality=quality, horizon=0.05).sweep(values=[5.0, 2.0, 4.0], executor="serial", progress=False)
+    assert len(set(sweep.h.tolist())) == 1
+    assert sweep.best()[0] == {OMEGA: 2.0}
+
+
+def test_a_grid_is_spaced_as_its_parameter_says():
+    log = _problem(parameters=[vtb.Parameter(OMEGA, 0.01, 1.0, log=True)], horizon=0.1)
+    np.testing.assert_allclose(log.sweep(3, executor="serial", progress=False).points[:, 0], [0.01, 0.1, 1.0])
+    whole = _problem(parameters=[vtb.Parameter(OMEGA, 0, 5, integer=True)], horizon=0.1)
+    points = whole.sweep(4, executor="serial", progress=False).points[:, 0].tolist()
+    assert points == [0.0, 2.0, 3.0, 5.0]
+    with pytest.raises(ValueError, match="does not have 7 different whole numbers in equal steps"):
+        whole.sweep(7, executor="serial", progress=False)

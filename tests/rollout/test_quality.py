@@ -1,5 +1,6 @@
 """Equations (12) to (17) on trajectories made by hand, and through a simulation."""
 
+from dataclasses import replace
 from math import inf, nan
 
 import numpy as np
@@ -9,9 +10,11 @@ from hypothesis import strategies as st
 
 from tests.testbeds import AcrobotScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutRunner, RolloutTask
-from vtbdrake.rollout.quality import best_sample, exceedances
+from vtbdrake.rollout.quality import best_sample, exceeds
+from vtbdrake.testbed import SimulatorFields
 
 PERIOD = 0.1
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
 
 
 def _roll(trajectory, *, threshold=inf, **options):
@@ -71,7 +74,28 @@ def test_the_definitions_word_by_word(values, threshold):
     g1 = {t for t in times if values[t] > threshold}
     g2 = {t for t in times if all(values[t] >= values[s] for s in times)}
     assert best_sample(np.array(values), threshold=threshold) == (min(g1) if g1 else min(g2))
-    assert set(exceedances(np.arange(len(values)), np.array(values), threshold=threshold)) == g1
+    assert set(np.flatnonzero(exceeds(np.array(values), threshold))) == g1
+    # Of a cost, all is mirrored.
+    g1 = {t for t in times if values[t] < threshold}
+    g2 = {t for t in times if all(values[t] <= values[s] for s in times)}
+    cost = best_sample(np.array(values), threshold=threshold, minimize=True)
+    assert cost == (min(g1) if g1 else min(g2))
+    assert set(np.flatnonzero(exceeds(np.array(values), threshold, minimize=True))) == g1
+
+
+@pytest.mark.parametrize("scale", [1e-18, 1e-12, 1.0, 1e12])
+def test_costs_of_any_size_are_compared_themselves(scale):
+    # 1 / (1 + c) is 1 for all costs below 1e-16.
+    costs = [5.0 * scale, 3.0 * scale, 2.0 * scale, 4.0 * scale]
+    quality = Quality(lambda t: costs[round(t / PERIOD)], "time", minimize=True)
+    task = RolloutTask(AcrobotScenario(), 3 * PERIOD, quality, sample_period=PERIOD)
+    result = RolloutRunner(task).run({})
+    assert (result.t_star, result.value, result.end) == (pytest.approx(0.2), 2.0 * scale, "horizon")
+    assert result.exceedances.size == 0
+    stopped = RolloutRunner(replace(task, threshold=3.5 * scale)).run({})
+    assert (stopped.t_star, stopped.value, stopped.end) == (pytest.approx(0.1), 3.0 * scale, "threshold")
+    assert stopped.exceedances == pytest.approx([0.1])
+    assert stopped.threshold == 1.0 / (1.0 + 3.5 * scale)
 
 
 @pytest.mark.parametrize(
@@ -123,3 +147,44 @@ def test_a_task_that_makes_no_sense_is_refused(arguments, message):
 )
 def test_samples_are_the_multiples_of_the_period_and_the_horizon(horizon, period, expected):
     np.testing.assert_allclose(RolloutTask(AcrobotScenario(), horizon, sample_period=period).sample_times(), expected)
+
+
+@pytest.mark.parametrize(("period", "sample_period"), [(0.02, 0.1), (0.01, 0.07), (0.005, 0.015)])
+@pytest.mark.parametrize("start", [0.0, 0.3, 12.34])
+def test_samples_cost_no_steps_of_their_own_where_events_coincide(period, sample_period, start):
+    # 3 * 0.1 and 15 * 0.02 differ in the last bit, and so do 0.3 + 0.1 k and 0.02 n.
+    scenario = AcrobotScenario(period=period)
+    testbed = scenario.build()
+    context = testbed.default_context()
+    context.SetTime(start)
+    start_state = testbed.snapshot(context)
+    count = 140
+    task = RolloutTask(
+        scenario, count * sample_period, Quality(abs, SHOULDER), sample_period=sample_period, start=start_state
+    )
+    assert any(k * sample_period != round(k * sample_period / period) * period for k in range(count + 1)), (
+        "this would show nothing"
+    )
+    ((own_period, offset),) = testbed.event_timings()
+    assert (own_period, offset) == (period, 0.0)
+    instants = task.instants(start, testbed.event_timings())
+    np.testing.assert_allclose(instants, start + task.sample_times(), rtol=0.0, atol=1e-14)
+    # Where the clock is to be at an event, it is there to the last bit.
+    events = np.round(instants / period) * period
+    coincide = np.abs(instants - events) < 1e-12
+    assert coincide.sum() >= count / 10
+    np.testing.assert_array_equal(instants[coincide][1:], events[coincide][1:])
+
+
+def test_a_rollout_takes_the_steps_of_a_simulation_that_stops_at_events():
+    scenario = AcrobotScenario(simulator=SimulatorFields("runge_kutta3", 0.02, use_error_control=False))
+    task = RolloutTask(scenario, 15.0, Quality(abs, SHOULDER), sample_period=0.1)
+    runner = RolloutRunner(task)
+    result = runner.run({SHOULDER: 0.5})
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {SHOULDER: 0.5})
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(750 * 0.02)
+    assert runner.steps == simulator.get_num_steps_taken() == 750
+    assert result.quality[-1] == abs(testbed.read(context, SHOULDER))

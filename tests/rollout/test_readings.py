@@ -81,7 +81,7 @@ def test_a_cost_below_its_threshold_ends_the_rollout():
     limit = 0.05
     full = rollout(Quality(square, THETA, minimize=True))
     first = int(np.argmax(swing(TIMES) ** 2 < limit))
-    stopped = rollout(Quality(square, THETA, minimize=True), threshold=1.0 / (1.0 + limit))
+    stopped = rollout(Quality(square, THETA, minimize=True), threshold=limit)
     assert stopped.end == "threshold" and stopped.t_star == TIMES[first]
     assert np.array_equal(stopped.quality, full.quality[: first + 1])
 
@@ -116,6 +116,10 @@ def test_f_may_not_exceed_its_stated_upper_end():
         (
             lambda: RolloutTask(PendulumScenario(), 1.0, Quality(above, THETA, reading="end"), threshold=1.0),
             "leave the threshold out, or read it as 'best'",
+        ),
+        (
+            lambda: RolloutTask(PendulumScenario(), 1.0, Quality(above, THETA, minimize=True), threshold=0.0),
+            "positive and finite, not 0.0",
         ),
     ],
 )

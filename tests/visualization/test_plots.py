@@ -31,6 +31,7 @@ def rollout(quality: np.ndarray, threshold: float = np.inf, failed: bool = False
         h=np.nan if failed else quality[best],
         value=np.nan if failed else quality[best],
         threshold=threshold,
+        exceedances=TIMES[above[:1]],
     )
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from vtbdrake.cli.options import converted, parse_range
 from vtbdrake.cli.study import (
@@ -34,12 +33,30 @@ from vtbdrake.testbed import Scenario
 @click.option("--threshold", type=float, required=True, metavar="F", help="f_m: a rollout whose f exceeds it is bad.")
 @click.option("--resolution", type=float, required=True, metavar="R", help="Width of the interval to be found.")
 @click.option("--coarse", type=float, required=True, metavar="C", help="Step of the grid to begin with.")
+@click.option(
+    "--repeats",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Repeat values close to the boundary N times with jitter, until they are safe, or unsafe, each time.",
+)
+@click.option(
+    "--jitter",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    metavar="J",
+    help="How far these repeats move the parameter at most, as a fraction of its range.",
+)
 @execution_options
 def find_boundary(
     scenario: Scenario,
     vary: Parameter,
     resolution: float,
     coarse: float,
+    repeats: int,
+    jitter: float,
     executor: str,
     workers: int | None,
     save: Path | None,
@@ -58,7 +75,9 @@ def find_boundary(
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
     stated = make_problem(scenario, [vary], **problem)
-    found = stated.boundary(resolution=resolution, coarse=coarse, executor=executor, workers=workers)
+    found = stated.boundary(
+        resolution=resolution, coarse=coarse, repeats=repeats, jitter=jitter, executor=executor, workers=workers
+    )
     sweep = found.sweep
     assert sweep is not None
     write_files(sweep, save=save, csv=csv, plot=plot)
@@ -71,22 +90,18 @@ def _report(found: Boundary, sweep: Sweep) -> str:
     lines = [str(found)]
     if len(sweep.conditions) > 1:
         for i, (lower, upper) in enumerate(found.by_condition):
-            lines.append(f"  {condition_text(i, sweep.conditions[i])}: {_interval(lower, upper, unit)}")
+            lines.append(f"  {condition_text(i, sweep.conditions[i])}: {found.interval_text(lower, upper)}")
+    for chance in found.worst_chances:
+        which = f" under condition {chance.condition}" if len(sweep.conditions) > 1 else ""
+        lines.append(f"  {number(chance.value)} {unit}: {chance}{which}")
     if found.safe_beyond:
         lines.append(f"not monotonic: safe all the same at {_values(found.safe_beyond)} {unit}")
-    if found.undecided:
-        lines.append(f"undecided, counted as exceeded: the simulation failed at {_values(found.undecided)} {unit}")
-    seconds = sum(rollout.wall_time for rollout in sweep.rollouts)
-    lines.append(f"{len(sweep)} rollouts, {seconds:.3g} s of simulation")
+    if found.failed_at:
+        lines.append(f"counted as unsafe: the simulation failed at {_values(found.failed_at)} {unit}")
+    rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]
+    seconds = sum(rollout.wall_time for rollout in rollouts)
+    lines.append(f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation")
     return "\n".join(lines)
-
-
-def _interval(lower: float, upper: float, unit: str) -> str:
-    if np.isinf(upper):
-        return f"safe up to {number(lower)} {unit}, the largest value examined"
-    if np.isinf(lower):
-        return f"not safe at {number(upper)} {unit}, the smallest value examined"
-    return f"safe up to {number(lower)}, not at {number(upper)} {unit}"
 
 
 def _values(values: tuple[float, ...]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from vtbdrake.cli.study import (
 )
 from vtbdrake.cli.text import number
 from vtbdrake.optimization import Parameter, Sweep
+from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.testbed import Scenario
 
 
@@ -61,12 +62,12 @@ def run_sweep(
     click.echo(points_table(sweep))
     write_files(sweep, save=save, csv=csv, plot=plot)
     refuse_failures(sweep)
-    click.echo("\n" + _conclusion(sweep, threshold=stated.task.threshold))
+    click.echo("\n" + _conclusion(sweep))
     if not sweep.complete:
         raise FailedError("the sweep was interrupted: the table shows what is finished")
 
 
-def _conclusion(sweep: Sweep, *, threshold: float) -> str:
+def _conclusion(sweep: Sweep) -> str:
     lines = []
     if len(sweep.conditions) > 1:
         lines += [condition_text(i, c) for i, c in enumerate(sweep.conditions)]
@@ -76,6 +77,6 @@ def _conclusion(sweep: Sweep, *, threshold: float) -> str:
         raise FailedError(one_line(error)) from error
     at = ", ".join(f"{address} = {number(value)}" for address, value in point.items())
     lines.append(f"best: h = {number(h)} at {at}")
-    if isfinite(threshold) and len(sweep.parameters) == 1 and sweep.complete:
+    if not why_no_boundary(sweep):
         lines.append(f"boundary: {sweep.boundary()}")
     return "\n".join(lines)

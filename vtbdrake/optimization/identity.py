@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from math import inf
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
@@ -38,7 +39,7 @@ def describe(problem: Problem) -> dict[str, Any]:
         "conditions": [{key: np.asarray(value).tolist() for key, value in c.items()} for c in problem.conditions],
         "risk": _text(problem.risk),
         "horizon": float(task.horizon),
-        "threshold": repr(task.threshold),
+        "threshold": repr(inf if task.threshold is None else task.threshold),
         "sample_period": float(task.sample_period),
         "start": _start(problem),
     }

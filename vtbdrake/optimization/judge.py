@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from math import ceil, inf, isnan, nan
+from math import ceil, inf, nan
 
 import numpy as np
 
-from vtbdrake.optimization.outcome import Outcome, Row
+from vtbdrake.optimization.outcome import Outcome, Row, aggregate
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout.result import FAILED
@@ -153,20 +153,14 @@ class Judge:
         if any(outcome.end == FAILED for outcome in seen):
             # One failed simulation leaves nothing to be said, and nothing to be gained by the others.
             return Evaluation(point, (nan,) * self._signs.size, (nan,) * constraints, exact=exact)
-        objectives = self._problem.objectives
-        values = []
-        for k, (quality, sign) in enumerate(zip(objectives, self._signs, strict=True)):
-            bound = sign * quality.bound(self._problem.task.horizon)
-            h = [bound if o is None else sign * (o.value if k == 0 else o.measures[k - 1]) for o in outcomes]
-            # A risk of the user's may make NaN of infinities, where nothing bounds what is not seen.
-            with np.errstate(invalid="ignore"):
-                value = float(self._problem.risk(np.array(h)))
-            values.append(inf if isnan(value) and not exact else value)
-        violations = [
-            max((outcome.measures[len(objectives) - 1 + k] for outcome in seen), default=-inf)
-            for k in range(constraints)
-        ]
-        return Evaluation(point, tuple(values), tuple(violations), exact=exact)
+        values, violations = aggregate(
+            outcomes,
+            risk=self._problem.risk,
+            minimize=[quality.minimize for quality in self._problem.objectives],
+            constraints=constraints,
+            bounds=[quality.bound(self._problem.task.horizon) for quality in self._problem.objectives],
+        )
+        return Evaluation(point, values, violations, exact=exact)
 
     def in_the_users_terms(self, evaluation: Evaluation) -> tuple[float, ...]:
         """The values, a cost as a cost."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf, isnan
 from typing import Any
 
+import numpy as np
+
+from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers.solver import Judged, Point
 from vtbdrake.rollout import RolloutResult
 
@@ -29,6 +33,39 @@ class Outcome:
     def of(cls, result: RolloutResult) -> Outcome:
         """Without its trajectories."""
         return cls(**{name: getattr(result, name) for name in cls.__dataclass_fields__})
+
+
+def aggregate(
+    outcomes: Sequence[Outcome | RolloutResult | None],
+    *,
+    risk: Risk,
+    minimize: Sequence[bool],
+    constraints: int,
+    bounds: Sequence[float],
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What the outcomes of one point under several conditions say together.
+
+    Args:
+        outcomes: one per condition, none of them failed; None where a condition was not tried.
+        risk: how the qualities under several conditions become one.
+        minimize: whether a quality is a cost, for each of them.
+        constraints: how many there are.
+        bounds: the best that each quality can be, in the user's terms; it stands in for what was not tried.
+
+    Returns:
+        The qualities, larger is better (a cost appears negated), and the worst violation of each constraint.
+    """
+    values = []
+    for k, (cost, bound) in enumerate(zip(minimize, bounds, strict=True)):
+        own = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]
+        # A risk of the user's may make NaN of infinities, where nothing bounds what was not tried.
+        with np.errstate(invalid="ignore"):
+            value = float(risk(np.array([-number if cost else number for number in own])))
+        values.append(inf if isnan(value) and None in outcomes else value)
+    tried = [outcome for outcome in outcomes if outcome is not None]
+    first = len(values) - 1
+    violations = [max((o.measures[first + k] for o in tried), default=-inf) for k in range(constraints)]
+    return tuple(values), tuple(violations)
 
 
 @dataclass(frozen=True)

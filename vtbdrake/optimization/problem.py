@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.optimization.boundary import Boundary
@@ -85,10 +83,12 @@ class Problem:
             horizon=horizon,
             quality=self.objectives[0],
             measures=(*self.objectives[1:], *self.constraints),
-            threshold=_f_m(self.objectives, threshold),
+            threshold=threshold,
             sample_period=sample_period,
             start=start,
         )
+        if self.task.threshold is not None and len(self.objectives) > 1:
+            raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
         self.scenario = self.task.scenario
         self.testbed: VirtualTestbed = self.scenario.build()
         self._testbeds = Testbeds(self.testbed)
@@ -239,27 +239,46 @@ class Problem:
         *,
         resolution: float,
         coarse: float,
+        repeats: int = 0,
+        jitter: float = 1e-6,
         executor: str | Executor = "auto",
         workers: int | None = None,
         progress: bool = True,
     ) -> Boundary:
-        """How far may the parameter go: the largest value below which every rollout examined has an empty G1.
+        """How far may the parameter go: the largest value below which every rollout examined is safe.
 
-        A coarse grid over the range is refined below the first failure under each condition; bisection alone could be
-        fooled, as the outcome need not be monotonic.
+        A rollout is safe if it does not exceed the threshold, keeps all constraints and does not fail. A coarse grid
+        over the range is refined below the first unsafe value under each condition; bisection alone could be fooled, as
+        the outcome need not be monotonic. An unsafe range narrower than the coarse step can be missed; the answer says
+        so (`Boundary.gap`).
+
+        Close to the boundary, a contact-rich simulation is chaotic: the last digits of s0 decide. With ``repeats``,
+        values around the boundary are repeated, each time with the parameter moved a little: downwards until a value
+        is safe each time, upwards until one is unsafe each time. What lies between is undecided.
 
         Args:
-            resolution: width of the interval to be found, in the parameter's unit.
-            coarse: step of the coarse grid.
+            resolution: step of the fine grid, in the parameter's unit; of a parameter with a logarithmic range, the
+                ratio of neighbouring values, above 1.
+            coarse: step of the coarse grid, likewise.
+            repeats: rollouts with jitter for each value close to the boundary and each condition; 0 for none.
+            jitter: how far the parameter is moved at most in these, as a fraction of its range (on its own scale).
 
         Raises:
-            ValueError: there is not exactly one parameter, no threshold, or the steps do not fit the range.
+            ValueError: there is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
+                (which is a goal, not a danger), or the steps do not fit the range.
             KeyboardInterrupt: it was interrupted, so that nothing can be said.
         """
         from vtbdrake.optimization import examine
 
         return examine.boundary(
-            self, resolution=resolution, coarse=coarse, executor=executor, workers=workers, progress=progress
+            self,
+            resolution=resolution,
+            coarse=coarse,
+            repeats=repeats,
+            jitter=jitter,
+            executor=executor,
+            workers=workers,
+            progress=progress,
         )
 
     def casadi_function(self, **options: Any) -> ProblemFunction:
@@ -291,17 +310,3 @@ class Problem:
         from vtbdrake.optimization.study import Study
 
         return Study.of(self, path, solver=solver, seed=seed, options=options)
-
-
-def _f_m(objectives: Sequence[Quality], threshold: float | None) -> float:
-    """f_m of the threshold in the user's terms."""
-    threshold = None if threshold is None else as_number("the threshold f_m", threshold)
-    if threshold is None or (threshold == inf and not objectives[0].minimize):
-        return inf
-    if len(objectives) > 1:
-        raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
-    if not objectives[0].minimize:
-        return float(threshold)
-    if not 0.0 < threshold < inf:
-        raise ValueError(f"the cost below which a rollout ends is positive and finite, not {threshold}")
-    return float(objectives[0].quality(np.array(threshold)))

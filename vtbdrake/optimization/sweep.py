@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from math import inf, prod
+from math import inf, nan, prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.optimization.boundary import Boundary, boundary_of
+from vtbdrake.optimization.boundary import Boundary, boundary_of, why_no_boundary
+from vtbdrake.optimization.outcome import aggregate
 from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
+from vtbdrake.optimization.solvers.solver import Evaluation
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.arguments import all_of, as_whole
 from vtbdrake.state.archive import read_archive, write_archive
@@ -22,7 +25,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 KIND = "vtbdrake sweep"
-VERSION = 2
+VERSION = 3
+
+# The risks that a file can hold.
+_RISKS: dict[str, type[Risk]] = {kind.__name__: kind for kind in (Mean, Worst, Quantile, CVaR)}
 
 
 @dataclass(frozen=True)
@@ -31,13 +37,17 @@ class Sweep:
 
     Attributes:
         parameters: what was varied; p of them.
-        units: theirs.
+        units: the units of the parameters.
         conditions: address -> value of each condition.
         points: shape (n, p).
         condition: number of the condition in each row, shape (n,).
-        rollouts: n results.
+        rollouts: n results, in the order in which the points were given.
         scenario: the scenario's name and fields.
         complete: False if it was interrupted; what is here is finished.
+        minimize: of each of the problem's qualities, whether it is a cost.
+        constraints: the name of each of the problem's constraints.
+        risk: how a quality under several conditions becomes one; None after loading a sweep whose risk was of a class
+            that a file cannot hold.
     """
 
     parameters: tuple[Parameter, ...]
@@ -48,6 +58,9 @@ class Sweep:
     rollouts: tuple[RolloutResult, ...]
     scenario: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
+    minimize: tuple[bool, ...] = (False,)
+    constraints: tuple[str, ...] = ()
+    risk: Risk | None = field(default_factory=Worst)
 
     def __len__(self) -> int:
         return len(self.rollouts)
@@ -68,40 +81,85 @@ class Sweep:
         return np.array([rollout.exceedances.size > 0 for rollout in self.rollouts], dtype=bool)
 
     @property
+    def violated(self) -> np.ndarray:
+        """Whether a constraint of the problem was violated, shape (n,); False where the rollout failed."""
+        first = len(self.minimize) - 1
+        return np.array([max(rollout.measures[first:], default=0.0) > 0.0 for rollout in self.rollouts], dtype=bool)
+
+    @property
+    def unsafe(self) -> np.ndarray:
+        """Whether the threshold was exceeded, a constraint violated, or the simulation failed, shape (n,)."""
+        return self.exceeded | self.violated | self.failed
+
+    @property
     def failed(self) -> np.ndarray:
         """Whether the simulation failed, shape (n,)."""
         return np.array([rollout.failed for rollout in self.rollouts], dtype=bool)
 
-    def best(self) -> tuple[dict[str, float], float]:
-        """(s^0*, h(s^0*)), equation (18), over the points examined; of several conditions, the worst counts.
-
-        Of a cost, its value stands in the place of h.
+    @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        """How good each point is that has finished all its conditions, as a study judges it.
 
         Raises:
-            ValueError: no point has finished all its conditions.
+            ValueError: the sweep was loaded from a file that could not hold its risk.
         """
-        # By point and condition, (h, the same in the user's terms).
-        scores: dict[tuple[float, ...], dict[int, tuple[float, float]]] = {}
+        risk = self.risk
+        if risk is None:
+            raise ValueError(
+                "the file of the sweep could not hold its risk, which is of a class of your own: set it by "
+                "dataclasses.replace(sweep, risk=...)"
+            )
+        rows: dict[tuple[float, ...], dict[int, RolloutResult]] = {}
         for point, condition, rollout in zip(self.points, self.condition, self.rollouts, strict=True):
-            scores.setdefault(tuple(point.tolist()), {})[int(condition)] = rollout.h, rollout.value
-        finished = {
-            point: min(pairs.values())
-            for point, pairs in scores.items()
-            if len(pairs) == len(self.conditions) and not np.isnan(list(pairs.values())).any()
-        }
-        if not finished:
-            raise ValueError("no point of the sweep has a quality under all conditions" + self._first_failure())
-        best = max(finished, key=lambda point: finished[point])
-        return {p.address: value for p, value in zip(self.parameters, best, strict=True)}, finished[best][1]
+            rows.setdefault(tuple(point.tolist()), {})[int(condition)] = rollout
+        return tuple(
+            self._evaluation(point, [results[c] for c in sorted(results)], risk)
+            for point, results in rows.items()
+            if len(results) == len(self.conditions)
+        )
+
+    def _evaluation(self, point: tuple[float, ...], results: Sequence[RolloutResult], risk: Risk) -> Evaluation:
+        count = len(self.minimize), len(self.constraints)
+        if any(result.failed for result in results):
+            return Evaluation(point, (nan,) * count[0], (nan,) * count[1])
+        values, violations = aggregate(
+            results, risk=risk, minimize=self.minimize, constraints=count[1], bounds=(nan,) * count[0]
+        )
+        return Evaluation(point, values, violations)
+
+    def best(self) -> tuple[dict[str, float], float]:
+        """(s^0*, h(s^0*)), equation (18), over the points examined: the best that keeps all constraints.
+
+        Several conditions count as the problem's risk says, as in `Study.best`. Of a cost, its value
+        stands in the place of h.
+
+        Raises:
+            ValueError: there are several qualities; no point has finished all its conditions and keeps the constraints;
+                or the sweep was loaded from a file that could not hold its risk.
+        """
+        if len(self.minimize) > 1:
+            raise ValueError("of several qualities there is no best point: use problem.study() and its pareto()")
+        found = [evaluation for evaluation in self.evaluations if evaluation.feasible]
+        if not found:
+            kept = " and keeps the constraints" if self.constraints else ""
+            raise ValueError(f"no point of the sweep has a quality under all conditions{kept}{self._first_failure()}")
+        best = max(found, key=lambda evaluation: evaluation.values[0])
+        value = -best.values[0] if self.minimize[0] else best.values[0]
+        # Adding 0 makes 0 of -0.
+        return {p.address: v for p, v in zip(self.parameters, best.point, strict=True)}, value + 0.0
 
     def boundary(self) -> Boundary:
-        """The largest parameter value below which every rollout examined here has an empty G1.
+        """The largest parameter value below which every rollout examined here was safe.
+
+        A rollout is safe if it did not exceed the threshold, kept all constraints and did not fail.
 
         Raises:
-            ValueError: the sweep has several parameters or no rollouts, or was interrupted.
+            ValueError: the sweep has several parameters or no rollouts, was interrupted, or has nothing by which a
+                rollout could be unsafe.
         """
-        if not self.complete:
-            raise ValueError("the sweep was interrupted: its boundary could lie where nothing was examined")
+        reason = why_no_boundary(self)
+        if reason:
+            raise ValueError(reason)
         return boundary_of(self)
 
     def _first_failure(self) -> str:
@@ -149,7 +207,8 @@ class Sweep:
                 if not isinstance(value, np.ndarray):
                     raise ValueError(f"the recording of {key} is not an array, and cannot be saved")
                 arrays[f"record/{i}/{key}"] = value
-            arrays |= {f"times/{i}": rollout.times, f"quality/{i}": rollout.quality}
+            for name in ("times", "quality", "exceedances"):
+                arrays[f"{name}/{i}"] = getattr(rollout, name)
             scalars = ("end", "message", "t_star", "h", "value", "threshold", "wall_time")
             row = {name: _plain(getattr(rollout, name)) for name in scalars}
             rows.append({**row, "measures": [_plain(number) for number in rollout.measures]})
@@ -159,6 +218,9 @@ class Sweep:
             "conditions": [{k: np.asarray(v).tolist() for k, v in c.items()} for c in self.conditions],
             "scenario": dict(self.scenario),
             "complete": self.complete,
+            "minimize": list(self.minimize),
+            "constraints": list(self.constraints),
+            "risk": _risk_to_file(self.risk),
             "rollouts": rows,
         }
         write_archive(path, kind=KIND, version=VERSION, header=header, arrays=arrays)
@@ -183,6 +245,7 @@ class Sweep:
                     parameters={**conditions[condition[i]], **values},
                     times=arrays[f"times/{i}"],
                     quality=arrays[f"quality/{i}"],
+                    exceedances=arrays[f"exceedances/{i}"],
                     record={k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)},
                     measures=tuple(_number(number) for number in row.pop("measures")),
                     **{name: _number(value) for name, value in row.items()},
@@ -197,7 +260,19 @@ class Sweep:
             rollouts=tuple(rollouts),
             scenario=header["scenario"],
             complete=header["complete"],
+            minimize=tuple(header["minimize"]),
+            constraints=tuple(header["constraints"]),
+            risk=_risk_from_file(header["risk"]),
         )
+
+
+def _risk_to_file(risk: Risk | None) -> dict[str, Any] | None:
+    kind = type(risk).__name__
+    return {"kind": kind, "options": vars(risk)} if _RISKS.get(kind) is type(risk) else None
+
+
+def _risk_from_file(data: Mapping[str, Any] | None) -> Risk | None:
+    return None if data is None else _RISKS[data["kind"]](**data["options"])
 
 
 def _plain(value: Any) -> Any:
@@ -212,9 +287,12 @@ def _number(value: Any) -> Any:
 def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.ndarray:
     """Every combination of equally spaced values of one or two parameters, ends included; shape (n, p).
 
+    The values of a parameter with a logarithmic range are equally spaced on that scale; those of an integer are rounded
+    to whole numbers.
+
     Raises:
-        ValueError: there are more than two parameters, too few points for one of them, or more in all than there is
-            memory for.
+        ValueError: there are more than two parameters, too few points for one of them, more than an integer has values,
+            or more in all than there is memory for.
     """
     if not 1 <= len(parameters) <= 2:
         raise ValueError(f"a sweep goes over one or two parameters, not {len(parameters)}")
@@ -223,11 +301,23 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     counts = [as_whole("a number of points", count) for count in all_of(object, each, name="points", form=form)]
     if len(counts) != len(parameters) or min(counts) < 2:
         raise ValueError(f"a sweep has at least two points for each of its {len(parameters)} parameters, not {points}")
+    for parameter, count in zip(parameters, counts, strict=True):
+        if parameter.integer and len(_axis(parameter, min(count, 10**6))) < count:
+            raise ValueError(
+                f"{parameter.address} is an integer in {parameter.range_text}, which does not have {count} different "
+                "whole numbers in equal steps: take fewer points, or give values"
+            )
     try:
-        axes = [np.linspace(p.lower, p.upper, count) for p, count in zip(parameters, counts, strict=True)]
+        axes = [_axis(parameter, count) for parameter, count in zip(parameters, counts, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
     except (MemoryError, ValueError, OverflowError):
         raise ValueError(f"a sweep of {prod(counts):.3g} points does not fit into memory: take fewer") from None
+
+
+def _axis(parameter: Parameter, count: int) -> np.ndarray:
+    spaced = np.geomspace if parameter.log else np.linspace
+    values = spaced(parameter.lower, parameter.upper, count)
+    return np.unique(np.round(values)) if parameter.integer else values
 
 
 def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:

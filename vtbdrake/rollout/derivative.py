@@ -86,11 +86,11 @@ class DerivativeRunner:
         simulator.get_mutable_context().SetTime(AutoDiffXd(context.get_time()))
         t0 = context.get_time()
         samples, slopes, times = [], [], self.task.sample_times()
-        for t in times:
+        for instant in self.task.instants(t0, self.testbed.event_timings()).tolist():
             with Interruptible():
-                if t > 0.0:
-                    simulator.AdvanceTo(AutoDiffXd(t0 + float(t)))
-                value, slope = self._sample(simulator.get_context(), context, t0 + float(t), len(by))
+                if instant > t0:
+                    simulator.AdvanceTo(AutoDiffXd(instant))
+                value, slope = self._sample(simulator.get_context(), context, instant, len(by))
             samples.append(value)
             slopes.append(slope)
         return self._read(times, np.array(samples), np.array(slopes))

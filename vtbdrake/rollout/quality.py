@@ -153,12 +153,18 @@ class Constraint(Measure):
         return max(violations)
 
 
-def exceedances(times: np.ndarray, quality: np.ndarray, *, threshold: float = inf) -> np.ndarray:
-    """G1, equation (14): the sample times at which the quality exceeds the threshold, strictly."""
-    return np.asarray(times)[np.asarray(quality) > threshold]
+def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = False) -> np.ndarray:
+    """Which samples exceed the threshold, strictly: f above it or, with ``minimize``, the cost below it.
+
+    A cost is compared itself, and not as 1 / (1 + cost), where small costs that differ are equal to the last bit.
+    """
+    samples = np.asarray(samples, dtype=float)
+    if threshold is None:
+        return np.zeros(samples.shape, dtype=bool)
+    return samples < threshold if minimize else samples > threshold
 
 
-def best_sample(quality: np.ndarray, *, threshold: float = inf) -> int:
-    """The sample at t*, equations (14) to (16): the first above ``threshold`` (strictly), else the first maximum."""
-    above = np.flatnonzero(np.asarray(quality) > threshold)
-    return int(above[0]) if above.size else int(np.argmax(quality))
+def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize: bool = False) -> int:
+    """The sample at t*, equations (14) to (16): the first that exceeds ``threshold``, else the first of the best."""
+    found = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
+    return int(found[0]) if found.size else int(np.argmin(samples) if minimize else np.argmax(samples))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from vtbdrake.rollout.quality import exceedances
 from vtbdrake.state import Snapshot
 
 THRESHOLD = "threshold"
@@ -34,7 +33,9 @@ class RolloutResult:
         h: f'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
         value: h in the user's terms: the cost, if f is one, else h.
         measures: what else was asked to be measured, in its order; empty if the rollout failed.
-        threshold: f_m.
+        threshold: f_m, that of f': of a cost, 1 / (1 + the threshold of the cost).
+        exceedances: G1, equation (14): the sample times at which f' exceeded f_m, in seconds from t0; all of it only if
+            the rollout was asked to run on.
         times: sample times from t0, in seconds, shape (n,).
         quality: the quality trajectory f' at ``times``, equation (13), shape (n,); of a cost, 1 / (1 + cost).
         record: by address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
@@ -51,6 +52,7 @@ class RolloutResult:
     value: float = nan
     measures: tuple[float, ...] = ()
     threshold: float = inf
+    exceedances: np.ndarray = field(default_factory=lambda: np.array([]))
     message: str = ""
     record: Mapping[str, Any] = field(default_factory=dict)
     state: Snapshot | None = None
@@ -58,12 +60,8 @@ class RolloutResult:
 
     @property
     def failed(self) -> bool:
+        """Whether the simulation failed."""
         return self.end == FAILED
-
-    @property
-    def exceedances(self) -> np.ndarray:
-        """G1, equation (14); all of it only if the rollout was asked to run on."""
-        return exceedances(self.times[: self.quality.size], self.quality, threshold=self.threshold)
 
     def identical(self, other: RolloutResult) -> bool:
         """True if nothing but the wall time differs, to the last bit."""
@@ -76,6 +74,7 @@ class RolloutResult:
             and _same(self.value, other.value)
             and _same(list(self.measures), list(other.measures))
             and self.threshold == other.threshold
+            and _same(self.exceedances, other.exceedances)
             and _same(self.times, other.times)
             and _same(self.quality, other.quality)
             and self.record.keys() == other.record.keys()

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from vtbdrake.rollout.quality import Measure, Quality, QualityError, best_sample
+from vtbdrake.rollout.quality import Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.readings import READINGS
 from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
 from vtbdrake.rollout.task import RolloutTask
@@ -58,6 +58,7 @@ class RolloutRunner:
             self.testbed.restore(self._s0, task.start)
             # In a rollout there is no reality: a copy of the running robot throws its switches.
             self.testbed.switch(self._s0, "sim")
+        self._instants = task.instants(self._s0.get_time(), self.testbed.event_timings())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
         self._config = self.testbed.simulator_fields.config()
@@ -78,11 +79,11 @@ class RolloutRunner:
         with Interruptible() as interruptible:
             try:
                 self._reset(parameters)
-                for t in self._times:
+                for t, instant in zip(self._times, self._instants, strict=True):
                     if cancel is not None and cancel.is_set():
                         raise CancelledError
                     interruptible.check()
-                    status = self._advance(t)
+                    status = self._advance(t, instant)
                     terminated = _terminated(status)
                     reached = self._context.get_time() - self._s0.get_time() if terminated else float(t)
                     if samples.take(reached) and not self.task.run_on:
@@ -107,9 +108,9 @@ class RolloutRunner:
         try:
             with Interruptible() as interruptible:
                 self._reset(parameters)
-                for time_ in self._times[: last + 1]:
+                for time_, instant in zip(self._times[: last + 1], self._instants[: last + 1], strict=True):
                     interruptible.check()
-                    status = self._advance(time_)
+                    status = self._advance(time_, instant)
                     if status is not None and _terminated(status):
                         raise SimulationError(status.FormatMessage())
         except SimulationError as failure:
@@ -135,11 +136,11 @@ class RolloutRunner:
                     "it: vary what that event reads"
                 )
 
-    def _advance(self, t: float) -> SimulatorStatus | None:
+    def _advance(self, t: float, instant: float) -> SimulatorStatus | None:
         if t == 0.0:
             return None
         with _FailuresAsOutcomes():
-            status = self._simulator.AdvanceTo(self._s0.get_time() + t)
+            status = self._simulator.AdvanceTo(instant)
         self._refuse_nonfinite(t)
         return status
 
@@ -151,6 +152,11 @@ class RolloutRunner:
             x = plant.GetPositionsAndVelocities(plant.GetMyContextFromRoot(self._context))
         if not np.isfinite(x).all():
             raise SimulationError(f"the state is not finite at t = {t:g} s: the simulation diverged")
+
+    @property
+    def steps(self) -> int:
+        """How many steps the integrator took in the last rollout."""
+        return int(self._simulator.get_num_steps_taken())
 
     @property
     def context(self) -> Context:
@@ -205,25 +211,26 @@ class _Samples:
             self._record[address].append(value)
         for samples, sample in zip(self._samples, new, strict=True):
             samples.append(sample)
-        return task.quality is not None and bool(task.quality.quality(np.array(new[0])) > task.threshold)
+        return task.quality is not None and bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
 
     def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
         task, f = self._runner.task, self._runner.task.quality
         times = np.array(self._times)
-        quality = f.quality(np.array(self._samples[0])) if f is not None else np.array([])
+        samples = np.array(self._samples[0]) if f is not None else np.array([])
+        exceeded = exceeds(samples, task.threshold, minimize=task.minimize)
         t_star, h, value, state = np.nan, np.nan, np.nan, None
         measures: tuple[float, ...] = ()
-        if bool((quality > task.threshold).any()):
+        if exceeded.any():
             # t* = min G1 stands, whatever happens to a rollout that runs on.
             end = THRESHOLD
         if times.size and end != FAILED:
             if f is not None:
-                t_star, value = _t_star(f, times, np.array(self._samples[0]), quality, task.threshold)
+                t_star, value = _t_star(f, times, samples, task.threshold)
                 h = float(f.quality(np.array(value)))
                 if task.keep_state:
                     state = self._state(parameters, t_star)
             pairs = zip(task.measures, self._samples[len(self._samples) - len(task.measures) :], strict=True)
-            measures = tuple(measure.read(times, np.array(samples)) for measure, samples in pairs)
+            measures = tuple(measure.read(times, np.array(measured)) for measure, measured in pairs)
         return RolloutResult(
             parameters=parameters,
             end=end,
@@ -232,9 +239,10 @@ class _Samples:
             h=h,
             value=value,
             measures=measures,
-            threshold=task.threshold,
+            threshold=task.f_m,
+            exceedances=times[exceeded] if f is not None else np.array([]),
             times=times,
-            quality=quality,
+            quality=f.quality(samples) if f is not None else np.array([]),
             record={address: _stack(values) for address, values in self._record.items()},
             state=state,
             wall_time=time.perf_counter() - begin,
@@ -257,13 +265,11 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
         raise SimulationError(f"a quality variable is not finite: {error}") from error
 
 
-def _t_star(
-    f: Quality, times: np.ndarray, samples: np.ndarray, quality: np.ndarray, threshold: float
-) -> tuple[float, float]:
+def _t_star(f: Quality, times: np.ndarray, samples: np.ndarray, threshold: float | None) -> tuple[float, float]:
     """(t*, f or the cost there), equations (14) to (17); for another reading than ``best``, its time and number."""
     if f.reading != "best":
         return READINGS[f.reading](times, samples, not f.minimize)
-    index = best_sample(quality, threshold=threshold)
+    index = best_sample(samples, threshold=threshold, minimize=f.minimize)
     return float(times[index]), float(samples[index])
 
 

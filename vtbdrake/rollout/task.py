@@ -23,8 +23,8 @@ class RolloutTask:
         scenario: builds the testbed.
         horizon: t_m in seconds from t0.
         quality: f and its variables; None for a rollout that only records.
-        threshold: f_m: the first sample of f' above it, strictly, ends the rollout. Only for a quality that is read at
-            its best.
+        threshold: the first sample of f above it, strictly, ends the rollout; or, of a cost, the first one below it.
+            None: never. Only for a quality that is read at its best.
         sample_period: in seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
             error control is part of the trajectory.
         record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
@@ -37,7 +37,7 @@ class RolloutTask:
     scenario: Scenario
     horizon: float
     quality: Quality | None = None
-    threshold: float = inf
+    threshold: float | None = None
     sample_period: float = 0.05
     record: Sequence[str] = ()
     run_on: bool = False
@@ -53,8 +53,7 @@ class RolloutTask:
             )
         if not isinstance(self.start, Snapshot | None):
             raise ValueError(f"the start of rollouts is a snapshot, from Snapshot.load(file), say, not {self.start!r}")
-        numbers = {"horizon": "the horizon t_m", "sample_period": "the sample period", "threshold": "the threshold f_m"}
-        for name, what in numbers.items():
+        for name, what in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():
             object.__setattr__(self, name, as_number(what, getattr(self, name)))
         object.__setattr__(self, "record", as_addresses("what to record", self.record))
         object.__setattr__(self, "measures", tuple(self.measures))
@@ -67,16 +66,62 @@ class RolloutTask:
                 f"the sample period must be positive and at most the horizon of {self.horizon:g} s, not "
                 f"{self.sample_period} s"
             )
-        if isnan(self.threshold) or self.threshold < 0.0:
-            raise ValueError(f"the threshold f_m must not be negative, as f is not, but it is {self.threshold}")
-        if self.quality is not None and self.quality.reading != "best" and self.threshold < inf:
+        self._check_threshold()
+
+    def _check_threshold(self) -> None:
+        if self.threshold is None:
+            return
+        threshold, minimize = as_number("the threshold f_m", self.threshold), self.minimize
+        if isnan(threshold) or threshold < 0.0:
+            raise ValueError(f"the threshold f_m must not be negative, as f is not, but it is {threshold}")
+        if minimize and not 0.0 < threshold < inf:
+            raise ValueError(f"the cost below which a rollout ends is positive and finite, not {threshold}")
+        # No quality is above infinity.
+        object.__setattr__(self, "threshold", None if threshold == inf else threshold)
+        if self.quality is not None and self.quality.reading != "best" and self.threshold is not None:
             raise ValueError(
                 f"a threshold ends a rollout at its best so far, but {self.quality.name} is read as "
                 f"{self.quality.reading!r}: leave the threshold out, or read it as 'best'"
             )
+
+    @property
+    def minimize(self) -> bool:
+        """Whether f is a cost."""
+        return self.quality is not None and self.quality.minimize
+
+    @property
+    def f_m(self) -> float:
+        """The threshold of f', as equations (14) to (16) have it; infinite if there is none."""
+        if self.threshold is None:
+            return inf
+        return 1.0 / (1.0 + self.threshold) if self.minimize else self.threshold
 
     def sample_times(self) -> np.ndarray:
         """From 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
         times = np.arange(np.floor(self.horizon / self.sample_period * (1.0 + 1e-12)) + 1.0) * self.sample_period
         rest = self.horizon - times[-1]
         return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
+
+    def instants(self, t0: float, timings: Sequence[tuple[float, float]]) -> np.ndarray:
+        """The simulator's clock at the sample times: t0 + t or, where an event is meant to coincide, its instant.
+
+        Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
+        advanced to the one would take another step, of 1e-16 s, to the other.
+
+        Args:
+            t0: when rollouts begin, in seconds.
+            timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
+        """
+        times = t0 + self.sample_times()
+        snapped = times.copy()
+        # So many roundings of numbers of this size may lie between two ways to compute an instant.
+        close = 8.0 * np.spacing(np.maximum(np.abs(times), 1.0))
+        distance = np.full(times.shape, np.inf)
+        for period, offset in timings:
+            events = offset + np.maximum(np.round((times - offset) / period), 0.0) * period
+            away = np.abs(events - times)
+            nearer = (away <= close) & (away < distance)
+            snapped[nearer], distance[nearer] = events[nearer], away[nearer]
+        # It begins at t0 itself.
+        snapped[0] = t0
+        return snapped

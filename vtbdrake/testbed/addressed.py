@@ -71,6 +71,15 @@ class AddressedDiagram:
             simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return simulator
 
+    def event_timings(self) -> tuple[tuple[float, float], ...]:
+        """(period, offset) in seconds of the periodic discrete updates of its systems, each timing once.
+
+        The n-th update is at offset + n * period. Drake does not say so of a system with several such timings, nor of
+        unrestricted updates and publishing.
+        """
+        attributes = (system.GetUniquePeriodicDiscreteUpdateAttribute() for _, system in leaves(self.diagram))
+        return tuple(sorted({(a.period_sec(), a.offset_sec()) for a in attributes if a is not None}))
+
     # -- addresses
 
     def variables(self) -> Variables:

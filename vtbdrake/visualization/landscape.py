@@ -115,8 +115,8 @@ def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: 
 
 
 def _draw_best(axes: Axes, sweep: Sweep) -> None:
-    _, h = worst(sweep)
-    if not np.isfinite(h).any():
+    several = len(sweep.minimize) > 1
+    if several or sweep.risk is None or not any(evaluation.feasible for evaluation in sweep.evaluations):
         return
     point, best = sweep.best()
     text = ", ".join(f"{value:.4g}" for value in point.values())

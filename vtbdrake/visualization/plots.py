@@ -14,6 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.typing import ColorType
 
+from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.visualization.figure import Picture, finish, label
 from vtbdrake.visualization.landscape import draw_landscape
 from vtbdrake.visualization.trajectories import (
@@ -101,7 +102,7 @@ def _draw_qualities(
     for number, (rollout, color) in enumerate(zip(rollouts, colors, strict=True)):
         draw_trajectory(axes, rollout, color=color, style=number if few else 0, name=names[number])
         if rollout.exceedances.size:
-            heights = rollout.quality[rollout.quality > rollout.threshold]
+            heights = rollout.quality[np.isin(rollout.times[: rollout.quality.size], rollout.exceedances)]
             axes.plot(rollout.exceedances, heights, "o", color=color, ms=10, alpha=0.3, mew=0, gid="G1")
         if not rollout.failed:
             axes.axvline(rollout.t_star, color=color, linewidth=0.8, linestyle=":", gid="t_star_line", zorder=1)
@@ -128,19 +129,24 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
         color = _CONDITIONS(number % 10) if many else _SINGLE
         marker = MARKERS[number % len(MARKERS)]
         name = describe(condition) if many else "h(s⁰)"
-        (line,) = axes.plot(values[mine], h[mine], color=color, marker=marker, markersize=5, label=name, gid="h")
+        order = np.argsort(values[mine], kind="stable")
+        (line,) = axes.plot(
+            values[mine][order], h[mine][order], color=color, marker=marker, markersize=5, label=name, gid="h"
+        )
         # Between 0 and 1 of a quality that takes no other value there is nothing to be drawn.
         line.set_linestyle("none" if is_two_valued(sweep.rollouts) else STYLES[number % len(STYLES)])
         line.set_linewidth(1.2)
-        # An open marker: f' exceeded f_m.
+        # An open marker: f' exceeded f_m, or a constraint was violated.
         line.set_markerfacecolor("white")
-        held = mine & ~sweep.exceeded & ~sweep.failed
+        held = mine & ~sweep.unsafe
         axes.plot(values[held], h[held], marker, color=color, markersize=5, gid="not_exceeded")
     threshold = _threshold(sweep)
     draw_threshold(axes, threshold)
     handles = list(axes.get_legend_handles_labels()[0])
     if sweep.exceeded.any():
         handles += axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="f_m exceeded")
+    if (sweep.violated & ~sweep.exceeded).any():
+        handles += axes.plot([], [], "o", color="0.6", markerfacecolor="white", label="a constraint violated")
     if sweep.failed.any():
         failed = values[sweep.failed]
         handles += axes.plot(
@@ -166,8 +172,7 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
 
 def _draw_boundary(axes: Axes, sweep: Sweep, handles: list[Artist]) -> str:
     """Shades the boundary interval; returns what it says."""
-    examined = set(sweep.condition.tolist()) == set(range(len(sweep.conditions)))
-    if not (np.isfinite(_threshold(sweep)) and sweep.complete and examined):
+    if why_no_boundary(sweep):
         return ""
     boundary = sweep.boundary()
     lower = max(boundary.lower, float(sweep.points[:, 0].min()))
@@ -177,7 +182,8 @@ def _draw_boundary(axes: Axes, sweep: Sweep, handles: list[Artist]) -> str:
         # A narrow interval would be lost between two markers.
         axes.axvline((lower + upper) / 2, color=_BOUNDARY, linewidth=1.5, zorder=0)
         handles.append(span)
-    return str(boundary).partition(": ")[2].capitalize()
+    text = boundary.interval_text(boundary.lower, boundary.upper)
+    return text[:1].upper() + text[1:]
 
 
 def _draw_trajectories(axes: Axes, sweep: Sweep) -> None:
