@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.perception import BaseField, Fields, PointCloud
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from vtbdrake.state.codecs import codec_of
@@ -36,6 +37,31 @@ def test_a_pose_keeps_every_bit():
     assert np.array_equal(back(RigidTransform(), X_AB).GetAsMatrix34(), X_AB.GetAsMatrix34())
 
 
+def test_a_rotation_keeps_every_bit():
+    R_AB = RotationMatrix(RollPitchYaw(0.1, -1.2, 2.3))
+    assert np.array_equal(back(RotationMatrix(), R_AB).matrix(), R_AB.matrix())
+
+
+@pytest.mark.parametrize("value", ["", "ü\n\0", 7, -0.0, 1 / 3, True])
+def test_texts_and_numbers_keep_their_type(value):
+    found = back(value, value)
+    assert type(found) is type(value) and repr(found) == repr(value)
+
+
+@pytest.mark.parametrize("fields", [BaseField.kXYZs, BaseField.kXYZs | BaseField.kNormals | BaseField.kRGBs])
+def test_a_point_cloud_keeps_every_point_and_its_number_of_points_varies(fields):
+    cloud = PointCloud(5, Fields(fields))
+    cloud.mutable_xyzs()[:] = np.arange(15).reshape(3, 5) / 3
+    if cloud.has_rgbs():
+        cloud.mutable_rgbs()[:] = np.arange(15).reshape(3, 5)
+        cloud.mutable_normals()[:] = -np.arange(15).reshape(3, 5)
+    found = back(PointCloud(2, Fields(fields)), cloud)
+    assert found.fields() == cloud.fields()
+    assert np.array_equal(found.xyzs(), cloud.xyzs())
+    if cloud.has_rgbs():
+        assert np.array_equal(found.rgbs(), cloud.rgbs()) and np.array_equal(found.normals(), cloud.normals())
+
+
 @pytest.mark.parametrize("kind", [ImageRgba8U, ImageDepth32F])
 def test_an_image_keeps_every_pixel(kind):
     image = kind(7, 5)
@@ -59,7 +85,8 @@ class Named:
 @pytest.mark.parametrize(
     ("model", "told"),
     [
-        ("text", "there is no codec for a str"),
+        ([1.0], "there is no codec for a list"),
+        (np.array([None]), "there is no codec for a ndarray"),
         (Named("a"), "there is no codec for a Named: its field name is neither an array nor a number, but a str"),
         (Track, "there is no codec for a type"),
     ],
@@ -74,6 +101,14 @@ def test_a_type_without_a_codec_is_refused(model, told):
     ("model", "value", "told"),
     [
         (np.zeros(3), np.zeros(2), "an array of shape (3,) is expected here, not one of shape (2,)"),
+        (7, 1 << 70, "a number of type int and at most 64 bits is expected here"),
+        (7, 7.0, "a number of type int"),
+        ("a", 7, "a text is expected here, not 7"),
+        (
+            PointCloud(1),
+            PointCloud(1, Fields(BaseField.kXYZs | BaseField.kRGBs)),
+            "a point cloud with xyzs is expected",
+        ),
         (ImageRgba8U(4, 3), ImageRgba8U(3, 4), "an image of shape (3, 4, 4) is expected here, not one of shape"),
     ],
 )

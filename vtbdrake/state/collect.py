@@ -33,7 +33,7 @@ def collect(
     """
     plant_prefix = plant_prefix or (lambda path, instance: path)
     systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
-    scene_graph = next((system for _, system in systems if is_scene_graph(system)), None)
+    scene_graphs = [system for _, system in systems if is_scene_graph(system)]
     listed: list[Variable] = list(extra)
     by_demand: dict[str, Callable[[], Variable]] = {}
     for path, system in systems:
@@ -44,8 +44,10 @@ def collect(
 
             prefix = _prefix_of(plant_prefix, path)
             listed.extend(multibody_variables(system, prefix=prefix))
-            if scene_graph is not None and system.geometry_source_is_registered():
-                listed.extend(friction_variables(system, scene_graph, prefix=prefix))
+            source = system.get_source_id()
+            for scene_graph in scene_graphs:
+                if source is not None and scene_graph.model_inspector().SourceIsRegistered(source):
+                    listed.extend(friction_variables(system, scene_graph, prefix=prefix))
             by_demand |= pose_entries_by_demand(system, prefix=prefix)
         elif not is_scene_graph(system):
             listed.extend(leaf_variables(path, system))

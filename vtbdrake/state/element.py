@@ -7,7 +7,7 @@ A system of ours names the pieces of its numeric state x and parameters a in its
         discrete_state("phase", self.DeclareDiscreteState(1), unit="cycle"),
     )
 
-and, if it keeps abstract state, how that state becomes arrays and back::
+and, if it keeps abstract state for which `vtbdrake.state.codecs` knows no way, how that state becomes arrays and back::
 
     self.codecs = {0: Codec(encode=lambda landmarks: {"p_WL": landmarks.p_WL},
                             decode=lambda arrays: Landmarks(**arrays))}

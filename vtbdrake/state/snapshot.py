@@ -9,20 +9,18 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, Diagram
 
+from vtbdrake.state.abstract_state import SnapshotError, abstract_state
 from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
-from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Codec
-from vtbdrake.state.kinds import is_camera, is_plant, is_scene_graph
-from vtbdrake.state.systems import group_size, is_python, leaves, read_group, write_group
+from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER
+from vtbdrake.state.kinds import is_camera, is_scene_graph
+from vtbdrake.state.systems import group_size, leaves, read_group, write_group
+from vtbdrake.state.variable import VariableError
 from vtbdrake.state.variables import Variables
 
 KIND = "vtbdrake snapshot"
 VERSION = 1
-
-
-class SnapshotError(ValueError):
-    """A snapshot that cannot be taken or applied."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +31,11 @@ class Snapshot:
         time: t in seconds.
         scenario: plain data that identifies what the snapshot belongs to; empty for a bare Diagram.
         values: the addressed variables (derived ones left out), by address.
-        groups: every numeric group of every leaf system and, through its codec, every abstract state of our own
-            systems, under ``path/group/index`` and ``path/abstract/index/name``.
+        groups: every numeric group and, through its codec, every abstract state of every leaf system, under
+            ``path/group/index`` and ``path/abstract/index/name``.
 
-    Arrays are read only. What Drake hides from Python (the last step's contact results of a discrete plant, the
-    generator of a RandomSource) is not part of it.
+    Arrays are read only. What Drake hides from Python (the last step's contact results of a discrete plant) is not
+    part of it.
     """
 
     time: float
@@ -114,17 +112,15 @@ def take(
 
     Raises:
         SnapshotError: a system keeps something abstract that neither a codec nor a hidden variable carries.
+            (Of a testbed, it is refused when the testbed is built.)
     """
-    _refuse_lost(diagram, context, variables)
     groups: dict[str, np.ndarray] = {}
     for path, system in leaves(diagram):
         leaf_context = system.GetMyContextFromRoot(context)
         for group, index in numeric_groups(leaf_context):
             groups[f"{path}/{group}/{index}"] = read_group(leaf_context, group, index)
-        for index, codec in _codecs(path, system, leaf_context).items():
-            state = leaf_context.get_abstract_state(index).get_value()
-            for name, array in codec.encode(state).items():
-                groups[f"{path}/abstract/{index}/{name}"] = np.asarray(array)
+        for name, array in abstract_state(path, system, leaf_context).read(leaf_context).items():
+            groups[f"{path}/abstract/{name}"] = array
     values = {v.address: np.asarray(v.get(context)) for v in variables.values() if not v.derived}
     return Snapshot(context.get_time(), values, groups, scenario or {})
 
@@ -147,26 +143,33 @@ def apply(
             context is unchanged.
     """
     systems = [(path, system) for path, system in leaves(diagram) if only(path)]
-    expected = set()
+    left = {key for key in snapshot.groups if only(key.partition("/")[0])}
+    writers = {}
     for path, system in systems:
         leaf_context = system.GetMyContextFromRoot(context)
         for group, index in numeric_groups(leaf_context):
             key = f"{path}/{group}/{index}"
-            expected.add(key)
-            size = group_size(leaf_context, group, index)
-            if key not in snapshot.groups or snapshot.groups[key].size != size:
-                found = f"{snapshot.groups[key].size} entries" if key in snapshot.groups else "no such group"
-                raise SnapshotError(f"{key} has {size} entries in this testbed, but the snapshot has {found}")
-        expected |= {f"{path}/abstract/{index}" for index in _codecs(path, system, leaf_context)}
-    for key in snapshot.groups:
-        if not only(key.partition("/")[0]):
-            continue
-        if (key.rsplit("/", 1)[0] if "/abstract/" in key else key) not in expected:
-            raise SnapshotError(f"the snapshot has a group {key}, which this testbed does not have")
+            left.discard(key)
+            found = _as_entries(snapshot.groups[key]) if key in snapshot.groups else "no such group"
+            expected = f"{group_size(leaf_context, group, index)} entries"
+            if found != expected:
+                raise SnapshotError(f"{key} has {expected} in this testbed, but the snapshot has {found}")
+        state = abstract_state(path, system, leaf_context)
+        if state:
+            prefix = f"{path}/abstract/"
+            arrays = {key.removeprefix(prefix): snapshot.groups[key] for key in left if key.startswith(prefix)}
+            left -= {prefix + key for key in arrays}
+            writers[path] = state.writer(arrays)
+    if left:
+        raise SnapshotError(f"the snapshot has a group {min(left)}, which this testbed does not have")
     hidden = [v for v in variables.values() if v.hidden and not v.derived]
     for variable in hidden:
         if variable.address not in snapshot.values:
             raise SnapshotError(f"the snapshot has no value of {variable.address}, which this testbed has")
+        try:
+            variable.check(snapshot.values[variable.address])
+        except VariableError as error:
+            raise SnapshotError(f"the snapshot does not fit: {error}") from error
     context.SetTime(snapshot.time)
     for path, system in systems:
         leaf_context = system.GetMyMutableContextFromRoot(context)
@@ -175,14 +178,18 @@ def apply(
             system.SetDefaultContext(leaf_context)
         for group, index in numeric_groups(leaf_context):
             write_group(leaf_context, group, index, snapshot.groups[f"{path}/{group}/{index}"])
-        for index, codec in _codecs(path, system, leaf_context).items():
-            prefix = f"{path}/abstract/{index}/"
-            arrays = {k.removeprefix(prefix): v for k, v in snapshot.groups.items() if k.startswith(prefix)}
-            leaf_context.SetAbstractState(index, codec.decode(arrays))
+        if path in writers:
+            writers[path](leaf_context)
     for variable in hidden:
         # Writing makes SceneGraph and cameras compute anew: only what differs.
         if not np.array_equal(variable.get(context), snapshot.values[variable.address]):
             variable.set(context, snapshot.values[variable.address])
+
+
+def _as_entries(array: np.ndarray) -> str:
+    if array.ndim != 1 or array.dtype != float:
+        return f"an array of shape {array.shape} and type {array.dtype}"
+    return f"{array.size} entries"
 
 
 def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
@@ -193,31 +200,3 @@ def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
         yield DISCRETE, index
     for index in range(leaf_context.num_numeric_parameter_groups()):
         yield PARAMETER, index
-
-
-def _refuse_lost(diagram: Diagram, context: Context, variables: Variables) -> None:
-    """Plants, SceneGraph and cameras come back by address, and so do switches, whose address begins their path."""
-    carried = {variable.address for variable in variables.values() if variable.hidden}
-    for path, system in leaves(diagram):
-        leaf_context = system.GetMyContextFromRoot(context)
-        by_address = is_plant(system) or is_scene_graph(system) or is_camera(system)
-        if by_address or path.rpartition(".")[0] in carried:
-            continue
-        if leaf_context.num_abstract_parameters() or (leaf_context.num_abstract_states() and not is_python(system)):
-            raise SnapshotError(
-                f"{path} ({type(system).__name__}) keeps an abstract value that a snapshot cannot hold: keep it in "
-                "numeric state, or in abstract state of a system of yours with a codec"
-            )
-
-
-def _codecs(path: str, system: System, leaf_context: Context) -> dict[int, Codec]:
-    if not is_python(system):
-        return {}
-    codecs: dict[int, Codec] = dict(getattr(system, "codecs", {}))
-    for index in range(leaf_context.num_abstract_states()):
-        if index not in codecs:
-            raise SnapshotError(
-                f"{path} keeps abstract state {index} and declares no codec for it: give the system an attribute "
-                f"codecs = {{{index}: Codec(encode, decode)}}"
-            )
-    return codecs

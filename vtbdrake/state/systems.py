@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from pydrake.systems.sensors import RgbdSensor
 
 POSE_UNIT = "m, rad"
+# What Drake appends to the class of a system that was given no name: its address in memory.
+_UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
 
 def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
@@ -28,6 +32,29 @@ def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
             yield from leaves(system, path=below)
         else:
             yield below, system
+
+
+def class_name(system: System) -> str:
+    """The name of a system's class, without modules, namespaces and scalar types: ``ZeroOrderHold``."""
+    bare = re.sub(r"<.*>|\[.*\]", "", system.GetSystemType())
+    return re.split(r"::|\.", bare)[-1].rstrip("_")
+
+
+def name_systems(diagram: Diagram) -> None:
+    """Name every system below ``diagram`` that has no name by its class: ``ZeroOrderHold``, ``ZeroOrderHold_2``, ...
+
+    Those of one class are counted in the Diagram's order, so that two builds of one recipe get the same names. Drake
+    itself calls them by their addresses in memory.
+    """
+    systems = diagram.GetSystems()
+    taken = {system.get_name() for system in systems if not _UNNAMED.search(system.get_name())}
+    for system in systems:
+        if _UNNAMED.search(system.get_name()):
+            names = (class_name(system) + (f"_{count}" if count > 1 else "") for count in itertools.count(1))
+            system.set_name(next(name for name in names if name not in taken))
+            taken.add(system.get_name())
+        if hasattr(system, "GetSystems"):
+            name_systems(system)
 
 
 def pose_to_array(X_PF: RigidTransform) -> np.ndarray:

@@ -54,7 +54,11 @@ class AddressedDiagram:
 
     def default_context(self) -> Context:
         """A new context: s0 from defaults."""
-        return self.diagram.CreateDefaultContext()
+        context = self.diagram.CreateDefaultContext()
+        if self.simulator_fields.use_error_control:
+            # Drake looks here for how exactly an event that depends on the state (a foot that lands) is to be found.
+            context.SetAccuracy(self.simulator_fields.accuracy)
+        return context
 
     def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
         """A new Drake Simulator of the testbed with its own integrator settings.

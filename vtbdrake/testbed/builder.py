@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.primitives import RandomSource
 
 from vtbdrake.state import Variable
-from vtbdrake.state.systems import leaves
+from vtbdrake.state.abstract_state import abstract_state
+from vtbdrake.state.kinds import is_plant, is_scene_graph
+from vtbdrake.state.systems import class_name, leaves, name_systems
 from vtbdrake.testbed.belief import Belief
 from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
@@ -25,6 +26,21 @@ if TYPE_CHECKING:
 
 ROLES = ("sense", "sys", "act", "env")
 S = TypeVar("S", bound=System)
+
+
+# Systems of Drake that copies of a context cannot continue, and what to use instead.
+_LISTENS = "which listens to what is outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
+_REFUSED = {
+    "RandomSource": "whose generator no copy can continue: compute noise from (seed, stream, tick), as the sensors in "
+    "vtbdrake.components do",
+    "RgbdSensorAsync": "which renders in a thread that no copy can continue: use an RgbdSensorDiscrete, or an "
+    "RgbdSensor with a ZeroOrderHold behind it",
+    "SchunkWsgTrajectoryGenerator": "which keeps its trajectory in itself, where no copy can find it: use a "
+    "SchunkWsgPositionController",
+    "LcmSubscriberSystem": _LISTENS,
+    "JointSliders": _LISTENS,
+    "MeshcatPoseSliders": _LISTENS,
+}
 
 
 class VirtualTestbedBuilder:
@@ -192,23 +208,31 @@ class VirtualTestbedBuilder:
     def build_diagram(self, name: str) -> Diagram:
         """The Diagram of what has been added.
 
+        Systems without a name are named by their class, see `name_systems`.
+
         Raises:
-            ValueError: it has a system that copies of its state could not repeat.
+            ValueError: two systems have one name, or copies of the state could not continue a system.
         """
+        names = [system.get_name() for system in self.builder.GetSystems()]
+        for twin in sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two systems of the testbed are called {twin}: rename one of them with set_name")
         diagram = self.builder.Build()
         diagram.set_name(name)
+        name_systems(diagram)
+        paths: set[str] = set()
         for path, system in leaves(diagram):
-            if "@" in path:
-                raise ValueError(f"the system {path} has no name, by which copies could find it: use AddNamedSystem")
-            if isinstance(system, RandomSource):
-                raise ValueError(
-                    f"{path} is a RandomSource, whose generator no copy can continue; compute noise from (seed, "
-                    "stream, tick), as the sensors in vtbdrake.components do"
-                )
+            if path in paths:
+                raise ValueError(f"two systems of the testbed have the path {path}: rename one, or what it is part of")
+            paths.add(path)
+            kind = class_name(system)
+            if kind in _REFUSED:
+                raise ValueError(f"{path} is a {kind}, {_REFUSED[kind]}")
+            if not is_scene_graph(system):  # Its default context is costly, and it is known.
+                abstract_state(path, system, system.CreateDefaultContext())
         return diagram
 
     def finish_world(self) -> None:
-        """Finalizes the plant.
+        """Finalize the plant, which may also be one that was added by Drake's own means and is called ``plant``.
 
         Raises:
             SignalError: the simulated world lacks a signal of the interface.
@@ -221,6 +245,12 @@ class VirtualTestbedBuilder:
                 raise SignalError(
                     f"no simulated actuator takes {signal.name}: call sim_actuator({signal.name!r}, port)"
                 )
+        if self.plant is None:
+            systems = {system.get_name(): system for system in self.builder.GetSystems()}
+            plant, scene_graph = systems.get("plant"), systems.get("scene_graph")
+            if plant is not None and is_plant(plant):
+                self.plant = plant
+                self.scene_graph = scene_graph if scene_graph is not None and is_scene_graph(scene_graph) else None
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
 

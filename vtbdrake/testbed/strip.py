@@ -51,8 +51,7 @@ class DpsAlone(AddressedDiagram):
         if interface.act:
             active = builder.AddNamedSystem("T_act.active", ConstantVectorSource(np.ones(len(interface.act))))
             builder.ExportOutput(active.get_output_port(), "real.act.active")
-        diagram = builder.Build()
-        diagram.set_name("dps_alone")
+        diagram = parts.build_diagram("dps_alone")
         clock = Variable("time", X, (), "s", lambda context: context.get_time())
         super().__init__(
             diagram=diagram,

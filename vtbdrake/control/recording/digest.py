@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from hashlib import blake2b
 
-import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.recording.log_format import DIGEST_SIZE
+from vtbdrake.state.abstract_state import abstract_state
 from vtbdrake.state.snapshot import numeric_groups
-from vtbdrake.state.systems import is_python, leaves, read_group
+from vtbdrake.state.systems import leaves, read_group
 from vtbdrake.testbed.addressed import AddressedDiagram
 
 LARGEST = 1 << 14
@@ -29,20 +29,25 @@ class StateDigest:
                 continue
             leaf_context = system.GetMyContextFromRoot(context)
             groups = list(numeric_groups(leaf_context))
-            codecs = dict(getattr(system, "codecs", {})) if is_python(system) else {}
-            if groups or codecs:
-                self._parts.append((leaf_context, groups, codecs))
+            abstract = abstract_state(path, system, leaf_context)
+            if groups or abstract:
+                self._parts.append((leaf_context, groups, abstract))
 
     def __call__(self) -> bytes:
         """Of the state as it is now: 16 bytes."""
         digest = blake2b(digest_size=DIGEST_SIZE)
-        for leaf_context, groups, codecs in self._parts:
+        for leaf_context, groups, abstract in self._parts:
             for group, index in groups:
                 digest.update(read_group(leaf_context, group, index).tobytes())
-            for index, codec in codecs.items():
-                arrays = codec.encode(leaf_context.get_abstract_state(index).get_value())
-                for name, array in sorted(arrays.items()):
-                    digest.update(f"{name}{np.shape(array)}".encode())
-                    if np.asarray(array).nbytes <= LARGEST:
-                        digest.update(np.asarray(array).tobytes())
+            arrays = abstract.read(leaf_context)
+            for key in sorted(arrays, key=_number_and_name):
+                array = arrays[key]
+                digest.update(f"{_number_and_name(key)[1]}{array.shape}".encode())
+                if array.nbytes <= LARGEST:
+                    digest.update(array.tobytes())
         return digest.digest()
+
+
+def _number_and_name(key: str) -> tuple[int, str]:
+    index, _, name = key.partition("/")
+    return int(index), name
