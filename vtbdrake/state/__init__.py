@@ -1,9 +1,10 @@
 """s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
 
+from vtbdrake.state.abstract_state import SnapshotError
 from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.collect import collect
 from vtbdrake.state.element import Codec, Element, continuous_state, discrete_state, parameter
-from vtbdrake.state.snapshot import Snapshot, SnapshotError
+from vtbdrake.state.snapshot import Snapshot
 from vtbdrake.state.variable import Variable, VariableError
 from vtbdrake.state.variables import AddressError, Variables
 

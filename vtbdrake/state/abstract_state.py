@@ -73,7 +73,7 @@ class AbstractState:
         Raises:
             SnapshotError: the state has become something that its codec does not take.
         """
-        arrays = {}
+        arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
             arrays |= self._encode(index, context.get_abstract_state(index).get_value())
         return arrays
@@ -129,7 +129,7 @@ class DelayState(AbstractState):
         own = self._system.CreateDefaultContext()
         own.SetStateAndParametersFrom(context)
         self._feed(own, own.get_abstract_state(0).get_value())
-        arrays = {}
+        arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
             parts = self._encode(index, self._system.get_output_port().Eval(own))
             # The next step overwrites what is shown.
