@@ -418,7 +418,7 @@ def test_files_that_are_no_study_are_told_apart_and_left_alone(tmp_path):
     for path, message in [
         (text, "cannot be read .file is not a database."),
         (other, "SQLite file of another kind"),
-        (newer, "a study of version 7, but this vtbdrake reads version 1"),
+        (newer, "a study of version 7, but this vtbdrake reads version 2"),
         (truncated, "cannot be read"),
         (tmp_path / "none", "there is no study file"),
         (tmp_path / "no" / "folder", "there is no study file"),
@@ -525,7 +525,7 @@ def test_given_points_are_checked_at_once(tmp_path):
         study.add(2.0)
     with pytest.raises(ValueError, match="wrong about nonsense"):
         study.add({THETA: 0.0, RATE: 0.0, "nonsense": 1.0})
-    assert study._file.queue() == []
+    assert study._file.queue() == {}
 
 
 def test_a_study_says_what_it_is_about_and_what_happened(tmp_path):
@@ -592,3 +592,49 @@ def test_a_gradient_that_cannot_be_had_is_refused(tmp_path):
     field = pendulum_problem(parameters=[Parameter("scenario.stiffness", 0.0, 1.0)])
     with pytest.raises(ValueError, match="there is no derivative by scenario.stiffness"):
         field.study(solver="SNOPT", options={"gradient": "autodiff"}).run(rollouts=10, progress=False)
+
+
+def test_points_that_wait_can_be_changed_and_taken_back(tmp_path):
+    path = tmp_path / "a.db"
+    pendulum_problem().study(path, solver="sobol").close()
+    with Study.open(path) as study:
+        study.add([0.25, 0.0], [0.5, 0.0], [0.75, 0.0])
+        first, second, third = study.queue
+        assert study.queue[second] == {THETA: 0.5, RATE: 0.0}
+        study.edit(second, {THETA: -0.5, RATE: 1.0})
+        study.remove(first)
+        with pytest.raises(ValueError, match="outside its range"):
+            study.edit(third, [7.0, 0.0])
+        with pytest.raises(StudyError, match=f"no point {first} waits to be judged in .*; {second}, {third} do"):
+            study.remove(first)
+    with pendulum_problem().study(path) as study:
+        study.run(rollouts=6, executor="serial", progress=False)
+        given = [tuple(t.parameters.values()) for t in study.trials if t.origin == "user"]
+        assert given == [(-0.5, 1.0), (0.75, 0.0)] and study.queue == {}
+        with pytest.raises(StudyError, match="no point 2 waits to be judged in .*; none does"):
+            study.edit(second, [0.0, 0.0])
+
+
+def test_attributes_are_kept_and_come_with_the_table(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    path = tmp_path / "a.db"
+    limit = Constraint(abs, RATE, at_most=2.0)
+    with pendulum_problem(constraints=[limit]).study(path, solver="sobol") as study:
+        study.run(rollouts=4, executor="serial", progress=False)
+        study.set_attribute("operator", "A")
+        study.set_attribute("operator", "B")
+        study.set_attribute("marks", np.array([1, 2]), point=study.trials[2].parameters)
+    with Study.open(path) as study:
+        assert study.attributes == {"operator": "B"} and study.trials[2].attributes == {"marks": [1, 2]}
+        frame = study.to_dataframe()
+        expected = [[t.parameters[THETA], t.parameters[RATE], t.value, t.violations[0]] for t in study.trials]
+        np.testing.assert_array_equal(frame[[THETA, RATE, "gap", "violation of abs"]].to_numpy(dtype=float), expected)
+        assert frame["attribute marks"].tolist() == [None, None, [1, 2], None] and list(frame.index) == [0, 1, 2, 3]
+        assert isinstance(frame, pandas.DataFrame)
+        for key, value, point, message in [
+            ("", 1, None, "an attribute has a name"),
+            ("a", {1j}, None, "a study keeps attributes, which are numbers, words"),
+            ("a", 1, [9.0, 0.0], "outside its range"),
+        ]:
+            with pytest.raises(ValueError, match=message):
+                study.set_attribute(key, value, point=point)

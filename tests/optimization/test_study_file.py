@@ -1,9 +1,11 @@
 """The file of a study when it cannot be used: what is said, and that nothing is lost."""
 
+import random
+
 import pytest
 
 from tests.folders import open_folder, that_cannot_be_written
-from tests.optimization.studies import pendulum_problem
+from tests.optimization.studies import DAMPING, pendulum_problem
 from vtbdrake.optimization import Study, StudyError
 
 
@@ -11,7 +13,7 @@ def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
     path = tmp_path / "a.db"
     study = pendulum_problem().study(path, solver="random")
     # What a full disk looks like to SQLite.
-    study._file._db.execute("PRAGMA max_page_count = 12")
+    study._file._db.execute("PRAGMA max_page_count = 20")
     with pytest.raises(StudyError, match=r"a\.db cannot be used .database or disk is full.*what was recorded is kept"):
         study.run(rollouts=500, executor="serial", progress=False)
     finished = len(study)
@@ -49,3 +51,49 @@ def test_a_closed_study_says_that_it_is_closed(tmp_path):
     for use in (lambda: study.trials, lambda: study.add([0.0, 0.0]), lambda: study.run(rollouts=1, progress=False)):
         with pytest.raises(StudyError, match=r"a\.db is closed"):
             use()
+
+
+def everything(path):
+    """All that a study says of itself, in comparable form."""
+    with Study.open(path) as study:
+        about = (study.record, study.attributes, study.queue, [t.attributes for t in study.trials], study.finished)
+        file = study._file
+        return repr((about, study.trials, study.rollouts, file.sessions(), file.gradients(), study.best, len(study)))
+
+
+@pytest.fixture(scope="module")
+def whole_study(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "a.db"
+    with pendulum_problem(conditions=[{DAMPING: 0.0}, {DAMPING: 0.3}]).study(path, solver="cmaes") as study:
+        study.add([0.25, 0.0])
+        study.run(rollouts=60, executor="serial", progress=False)
+        study.add([0.5, 0.0], [0.0, 1.0])
+        study._file.add_gradient((0.25, 0.0), (1.0, 2.0))
+        study.set_attribute("operator", "somebody")
+        study.set_attribute("seen", True, point=[0.25, 0.0])
+    return path
+
+
+@pytest.mark.parametrize("kind", ["bit", "byte", "page", "end"])
+def test_a_damaged_file_is_refused_or_says_what_it_said(tmp_path, whole_study, kind):
+    before, content = everything(whole_study), whole_study.read_bytes()
+    chance, refused = random.Random(kind), 0
+    for _ in range(120):
+        changed, at = bytearray(content), chance.randrange(len(content))
+        if kind == "bit":
+            changed[at] ^= 1 << chance.randrange(8)
+        elif kind == "byte":
+            changed[at] = chance.randrange(256)
+        elif kind == "page":
+            page = at // 4096 * 4096
+            changed[page : page + 4096] = bytes(4096)
+        else:
+            del changed[at:]
+        path = tmp_path / "a.db"
+        path.write_bytes(changed)
+        try:
+            assert everything(path) == before
+        except StudyError:
+            refused += 1
+        assert path.read_bytes() == changed, "it is left as it is"
+    assert refused > 20

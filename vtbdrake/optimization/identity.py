@@ -55,13 +55,22 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     if not isinstance(options, Mapping):
         raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
+    return plain(options, "the options of its solver")
+
+
+def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """Values as they come back from a file.
+
+    Raises:
+        ValueError: one is neither a number, nor a word, nor made of these; the error says of ``what``.
+    """
     try:
-        plain: dict[str, Any] = json.loads(json.dumps(dict(options), default=lambda value: value.tolist()))
-    except (AttributeError, TypeError) as error:
+        found: dict[str, Any] = json.loads(json.dumps(dict(values), default=lambda value: value.tolist()))
+    except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
-            f"a study keeps the options of its solver, which are numbers, words, lists and dicts, not {dict(options)}"
+            f"a study keeps {what}, which are numbers, words, lists and dicts, not {dict(values)}"
         ) from error
-    return plain
+    return found
 
 
 def _dimension(dimension: Dimension) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isnan
 from typing import Any
 
@@ -82,6 +82,7 @@ class Trial(Judged):
         origin: who asked for it: ``solver`` or ``user``.
         method: what the solver worked with.
         batch: the number of the batch of points that were judged together.
+        attributes: what users noted of the point, see `Study.set_attribute`.
     """
 
     number: int
@@ -92,8 +93,9 @@ class Trial(Judged):
     origin: str
     method: str
     batch: int
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def value(self) -> float:
-        """Of the first quality."""
+        """The value of the first quality."""
         return self.values[0]

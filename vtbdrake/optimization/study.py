@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from concurrent.futures import Executor as FuturesExecutor
 from typing import TYPE_CHECKING, Any, Self
 
-from vtbdrake.optimization.identity import describe, differences, plain_options, revision, versions
+from vtbdrake.optimization.identity import describe, differences, plain, plain_options, revision, versions
 from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
-from vtbdrake.optimization.solvers.solver import Solver
+from vtbdrake.optimization.solvers.solver import Point, Solver
 from vtbdrake.optimization.study_error import StudyError
 from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.optimization.study_record import StudyRecord
@@ -168,7 +168,43 @@ class Study(StudyRecord):
         Raises:
             ValueError: a point has other entries than the study, or one lies outside its range.
         """
-        self._file.give([checked_point(self.parameters, point) for point in points])
+        self._file.give([self._checked(point) for point in points])
+
+    def edit(self, number: int, point: Any) -> None:
+        """Puts another point in the place of one of the `queue`.
+
+        Raises:
+            StudyError: no point of that number waits: it was judged, removed, or never given.
+            ValueError: as in `add`.
+        """
+        self._file.change_queue(as_whole("the number of a point in the queue", number), self._checked(point))
+
+    def remove(self, number: int) -> None:
+        """Takes a point out of the `queue`: it is not judged.
+
+        Raises:
+            StudyError: no point of that number waits: it was judged, removed, or never given.
+        """
+        self._file.change_queue(as_whole("the number of a point in the queue", number), None)
+
+    def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
+        """Notes something of the study, or of a point: who ran it, why the point looks odd. It changes no result.
+
+        Args:
+            key: a name; what was noted by that name before is replaced.
+            value: a number, a word, or lists and dicts of these.
+            point: as in `add`; None for the study itself.
+
+        Raises:
+            ValueError: the value cannot be kept, or the point is none of the study's space.
+        """
+        if not isinstance(key, str) or not key:
+            raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
+        (kept,) = plain({key: value}, "attributes").values()
+        self._file.note(None if point is None else self._checked(point), key, kept)
+
+    def _checked(self, point: Any) -> Point:
+        return checked_point(self.parameters, point)
 
     def import_optuna(self, storage: str | BaseStorage, name: str) -> int:
         """Gives the points of a study in Optuna's storage, as `add` does: evaluated by whomever, or only enqueued.

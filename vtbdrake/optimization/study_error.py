@@ -25,9 +25,12 @@ def explained(path: Path | None) -> Iterator[None]:
     except sqlite3.ProgrammingError as error:
         raise StudyError(f"the study {path} is closed ({error}): open it again") from error
     except sqlite3.OperationalError as error:
+        # What SQLite does not understand, or cannot decode, is not what was written.
+        if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) == sqlite3.SQLITE_ERROR:
+            raise damaged(path, error) from error
         raise StudyError(
             f"{path} cannot be used ({error}); what was recorded is kept: see to the space on its disk, and to the "
             "permissions of the file and its folder"
         ) from error
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         raise damaged(path, error) from error

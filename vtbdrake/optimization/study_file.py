@@ -1,4 +1,8 @@
-"""A study on disk: one SQLite file with a write-ahead log, into which every finished rollout goes at once."""
+"""A study on disk: one SQLite file with a write-ahead log, into which every finished rollout goes at once.
+
+Every row has a checksum. A file in which anything has changed that is not a study's own doing is damaged, and nothing
+is read from it.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,11 @@ import json
 import os
 import sqlite3
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import UTC, datetime
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +24,26 @@ from vtbdrake.optimization.study_error import StudyError, damaged, explained
 from vtbdrake.optimization.study_lock import claim
 from vtbdrake.optimization.study_name import sqlite_name
 
-VERSION = 1
+VERSION = 2
 _APPLICATION = 0x56544253  # "VTBS"
 
-_TABLES = (
-    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL)",
+# Each table also has a last column, ``checksum``.
+_TABLES = {
+    "meta": "key TEXT PRIMARY KEY, value TEXT",
     # A rollout is there once, whatever asked for it, and how often.
-    "CREATE TABLE rollouts (point TEXT, condition INTEGER, h REAL, value REAL, measures TEXT, t_star REAL, end TEXT, "
-    "message TEXT, wall_time REAL, finished TEXT DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ')), "
-    "PRIMARY KEY (point, condition))",
-    "CREATE TABLE trials (batch INTEGER, position INTEGER, point TEXT, trial_values TEXT, violations TEXT, "
-    "exact INTEGER, origin TEXT, method TEXT, PRIMARY KEY (batch, position))",
-    "CREATE TABLE gradients (point TEXT PRIMARY KEY, gradient TEXT)",
+    "rollouts": "point TEXT, condition INTEGER, h REAL, value REAL, measures TEXT, t_star REAL, end TEXT, "
+    "message TEXT, wall_time REAL, finished TEXT",
+    "trials": "batch INTEGER, position INTEGER, point TEXT, trial_values TEXT, violations TEXT, exact INTEGER, "
+    "origin TEXT, method TEXT",
+    "gradients": "point TEXT PRIMARY KEY, gradient TEXT",
     # Points given by hand; batch is that which they were judged with.
-    "CREATE TABLE given (number INTEGER PRIMARY KEY, point TEXT, batch INTEGER)",
-    "CREATE TABLE sessions (number INTEGER PRIMARY KEY, started TEXT DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ')), "
-    "ended TEXT, reason TEXT, versions TEXT, revision TEXT)",
-)
+    "given": "number INTEGER PRIMARY KEY, point TEXT, batch INTEGER",
+    "sessions": "number INTEGER PRIMARY KEY, started TEXT, ended TEXT, reason TEXT, versions TEXT, revision TEXT",
+    # What users note of a point; of the study, where the point is empty.
+    "notes": "point TEXT, key TEXT, value TEXT",
+}
+_KEYS = {"rollouts": "point, condition", "trials": "batch, position", "notes": "point, key"}
+_ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units"}
 
 
 # (batch, position, point, values, violations, exact, origin, method)
@@ -71,6 +80,8 @@ class StudyFile:
         try:
             with explained(self.path):
                 self._refuse_others(new=meta is not None)
+                if not self._is_empty():
+                    self._refuse_damage()
                 # A killed process loses nothing that was committed; a machine without power may lose the last rollouts.
                 self._db.execute("PRAGMA synchronous = NORMAL")
                 if meta is not None and self._is_empty():
@@ -106,19 +117,27 @@ class StudyFile:
                 f"{self.path} is a study of version {version}, but this vtbdrake reads version {VERSION}: open it with "
                 "the vtbdrake that wrote it"
             )
-        (verdict,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
+
+    def _refuse_damage(self) -> None:
+        (verdict,) = self._db.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise damaged(self.path, verdict)
+        for table in _TABLES:
+            for _ in self._rows(table):
+                pass
+        missing = sorted(_ABOUT - self.meta.keys())
+        if missing:
+            raise damaged(self.path, f"it does not say the {', '.join(missing)}")
 
     def _create(self, meta: Mapping[str, Any]) -> None:
         self._db.execute("PRAGMA journal_mode = WAL")
         with self._transaction():
             if not self._is_empty():
                 return  # Another process has made it meanwhile.
-            for table in _TABLES:
-                self._db.execute(table)
-            rows = [(key, json.dumps(value)) for key, value in meta.items()]
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", rows)
+            for table, columns in _TABLES.items():
+                key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
+                self._db.execute(f"CREATE TABLE {table} ({columns}, checksum INTEGER{key})")
+            self._insert("meta", [(key, json.dumps(value)) for key, value in meta.items()])
             self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {VERSION}")
 
@@ -129,13 +148,30 @@ class StudyFile:
             try:
                 yield
             except BaseException:
-                self._db.execute("ROLLBACK")
+                if self._db.in_transaction:  # On a full disk SQLite has ended it by itself.
+                    self._db.execute("ROLLBACK")
                 raise
             self._db.execute("COMMIT")
 
-    def _read(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
+    def _insert(self, table: str, rows: Iterable[tuple[Any, ...]], *, instead: str = "ABORT") -> None:
+        """Adds rows, sealed by their checksums; ``instead`` is what is done where there is one of the same key."""
+        sealed = [(*row, _checksum(table, row)) for row in rows]
+        if sealed:
+            marks = ", ".join("?" * len(sealed[0]))
+            self._db.executemany(f"INSERT OR {instead} INTO {table} VALUES ({marks})", sealed)
+
+    def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
+        """The rows of a table, without their checksums, which are right; ``more`` says which, and in which order."""
         with self._lock, explained(self.path):
-            return self._db.execute(query, values).fetchall()
+            found = self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall()
+        for *row, checksum in found:
+            if checksum != _checksum(table, row):
+                raise damaged(self.path, f"a row of {table} has changed")
+            yield tuple(row)
+
+    def _next_number(self, table: str) -> int:
+        (last,) = self._db.execute(f"SELECT coalesce(max(number), 0) FROM {table}").fetchone()
+        return int(last) + 1
 
     def close(self) -> None:
         with self._lock:
@@ -150,9 +186,9 @@ class StudyFile:
         """
         with claim(self.path):
             with self._transaction():
-                row = self._db.execute(
-                    "INSERT INTO sessions (versions, revision) VALUES (?, ?)", (json.dumps(dict(versions)), revision)
-                )
+                begun = (self._next_number("sessions"), _now())
+                about = (json.dumps(dict(versions)), revision)
+                self._insert("sessions", [(*begun, None, None, *about)])
             reason: list[str] = []
             try:
                 yield reason
@@ -160,61 +196,66 @@ class StudyFile:
                 reason.append(type(error).__name__)
                 raise
             finally:
-                self._write(
-                    "UPDATE sessions SET ended = strftime('%Y-%m-%dT%H:%M:%fZ'), reason = ? WHERE number = ?",
-                    ["; ".join(reason), row.lastrowid],
-                )
-
-    def _write(self, query: str, values: Sequence[Any]) -> None:
-        with self._transaction():
-            self._db.execute(query, values)
+                with self._transaction():
+                    self._insert("sessions", [(*begun, _now(), "; ".join(reason), *about)], instead="REPLACE")
 
     # -- what is in it
 
     @property
     def meta(self) -> dict[str, Any]:
         """What the study is about."""
-        return {key: json.loads(value) for key, value in self._read("SELECT key, value FROM meta")}
+        return {key: json.loads(value) for key, value in self._rows("meta")}
 
     def sessions(self) -> list[tuple[str, str | None, str | None, dict[str, str], str]]:
         """(started, ended, why, versions, git revision) of every run; one that was killed has no end."""
-        rows = self._read("SELECT started, ended, reason, versions, revision FROM sessions ORDER BY number")
-        return [(a, b, c, json.loads(d), e) for a, b, c, d, e in rows]
+        rows = self._rows("sessions", "ORDER BY number")
+        return [(a, b, c, json.loads(d), e) for _, a, b, c, d, e in rows]
 
     def add(self, point: Point, condition: int, outcome: Outcome) -> None:
         """Records a finished rollout, whole or not at all; one that is there already stays."""
-        columns = (outcome.h, outcome.value, json.dumps(outcome.measures), outcome.t_star, outcome.end)
+        row = (
+            encode(point),
+            condition,
+            _real(outcome.h),
+            _real(outcome.value),
+            json.dumps(outcome.measures),
+            _real(outcome.t_star),
+            outcome.end,
+            outcome.message,
+            _real(outcome.wall_time),
+            _now(),
+        )
         # One statement is a transaction by itself.
         with self._lock, explained(self.path):
-            self._db.execute(
-                "INSERT OR IGNORE INTO rollouts "
-                "(point, condition, h, value, measures, t_star, end, message, wall_time) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (encode(point), condition, *columns, outcome.message, outcome.wall_time),
-            )
+            self._insert("rollouts", [row], instead="IGNORE")
 
     def outcomes(self) -> dict[tuple[Point, int], Outcome]:
         """All finished rollouts."""
-        query = "SELECT point, condition, h, value, measures, t_star, end, message, wall_time FROM rollouts"
         return {
             (decode(point), condition): Outcome(
                 _number(h), _number(value), tuple(json.loads(measures)), _number(t), end, message, _number(wall)
             )
-            for point, condition, h, value, measures, t, end, message, wall in self._read(query + " ORDER BY rowid")
+            for point, condition, h, value, measures, t, end, message, wall, _ in self._rows(
+                "rollouts", "ORDER BY rowid"
+            )
         }
 
     def finished(self) -> dict[tuple[Point, int], datetime]:
         """When each rollout was finished, in UTC."""
-        rows = self._read("SELECT point, condition, finished FROM rollouts")
-        return {(decode(point), condition): datetime.fromisoformat(at) for point, condition, at in rows}
+        return {(decode(row[0]), row[1]): datetime.fromisoformat(row[-1]) for row in self._rows("rollouts")}
 
     def count(self) -> int:
         """How many rollouts there are."""
-        return int(self._read("SELECT count(*) FROM rollouts")[0][0])
+        with self._lock, explained(self.path):
+            return int(self._db.execute("SELECT count(*) FROM rollouts").fetchone()[0])
 
     def set(self, key: str, value: Any) -> None:
         """Adds to what the study is about."""
-        self._write("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
+        with self._transaction():
+            self._set({key: value})
+
+    def _set(self, values: Mapping[str, Any]) -> None:
+        self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
 
     def told(self) -> int:
         """How many batches the solver was told of."""
@@ -227,21 +268,28 @@ class StudyFile:
             for batch, position, point, values, violations, exact, origin, method in rows
         ]
         with self._transaction():
-            self._db.executemany("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?)", encoded)
+            self._insert("trials", encoded, instead="REPLACE")
             if told is not None:
-                self._db.execute("INSERT OR REPLACE INTO meta VALUES ('told', ?)", (json.dumps(told),))
+                self._set({"told": told})
 
     def begin_anew(self, *, budget: int | None, racing: bool) -> None:
         """The solver is told from the start, for another budget of rollouts, or with racing where there was none, say.
 
         Trials so far stay, at positions below 0.
         """
-        (first, last) = self._read("SELECT min(position), max(position) FROM trials")[0]
         with self._transaction():
-            if first is not None:
-                self._db.execute("UPDATE trials SET position = position - ?", (last - first + 1,))
-            rows = [(key, json.dumps(value)) for key, value in (("budget", budget), ("racing", racing), ("told", 0))]
-            self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows)
+            self._withdraw()
+            self._set({"budget": budget, "racing": racing})
+
+    def _withdraw(self) -> None:
+        """The solver was told nothing yet; the trials stay, at positions below 0."""
+        rows = list(self._rows("trials"))
+        if rows:
+            positions = [position for _, position, *_ in rows]
+            shift = max(positions) - min(positions) + 1
+            self._db.execute("DELETE FROM trials")
+            self._insert("trials", [(batch, position - shift, *rest) for batch, position, *rest in rows])
+        self._set({"told": 0})
 
     def trials(self) -> list[TrialRow]:
         """All judged points, in the order of the study."""
@@ -256,36 +304,80 @@ class StudyFile:
                 origin,
                 method,
             )
-            for batch, position, point, values, violations, exact, origin, method in self._read(
-                "SELECT * FROM trials ORDER BY batch, position"
+            for batch, position, point, values, violations, exact, origin, method in self._rows(
+                "trials", "ORDER BY batch, position"
             )
         ]
 
     def add_gradient(self, point: Point, gradient: Sequence[float]) -> None:
         """Records the gradient at a point."""
-        self._write("INSERT OR IGNORE INTO gradients VALUES (?, ?)", (encode(point), json.dumps(list(gradient))))
+        with self._transaction():
+            self._insert("gradients", [(encode(point), json.dumps(list(gradient)))], instead="IGNORE")
 
     def gradients(self) -> dict[Point, tuple[float, ...]]:
         """All gradients."""
-        rows = self._read("SELECT point, gradient FROM gradients")
-        return {decode(point): tuple(json.loads(gradient)) for point, gradient in rows}
+        return {decode(point): tuple(json.loads(gradient)) for point, gradient in self._rows("gradients")}
+
+    # -- points given by hand
 
     def give(self, points: Sequence[Point]) -> None:
         """Puts points into the queue, to be judged with the next batch."""
         with self._transaction():
-            self._db.executemany("INSERT INTO given (point) VALUES (?)", [(encode(point),) for point in points])
+            first = self._next_number("given")
+            self._insert("given", [(first + k, encode(point), None) for k, point in enumerate(points)])
 
     def take(self, batch: int, *, new: bool) -> list[Point]:
         """The points given by hand that belong to a batch; with ``new``, those that belong to none yet join it."""
-        if new:
-            self._write("UPDATE given SET batch = ? WHERE batch IS NULL", (batch,))
-        rows = self._read("SELECT point FROM given WHERE batch = ? ORDER BY number", (batch,))
-        return [decode(point) for (point,) in rows]
+        if new and self.queue():
+            with self._transaction():
+                waiting = [(number, point, batch) for number, point, _ in self._rows("given", "WHERE batch IS NULL")]
+                self._insert("given", waiting, instead="REPLACE")
+        rows = self._rows("given", "WHERE batch = ? ORDER BY number", (batch,))
+        return [decode(point) for _, point, _ in rows]
 
-    def queue(self) -> list[Point]:
-        """The points given by hand that wait to be judged."""
-        rows = self._read("SELECT point FROM given WHERE batch IS NULL ORDER BY number")
-        return [decode(point) for (point,) in rows]
+    def queue(self) -> dict[int, Point]:
+        """The points given by hand that wait to be judged, by their numbers."""
+        rows = self._rows("given", "WHERE batch IS NULL ORDER BY number")
+        return {number: decode(point) for number, point, _ in rows}
+
+    def change_queue(self, number: int, point: Point | None) -> None:
+        """Puts another point in the place of one that waits, or none.
+
+        Raises:
+            StudyError: none of that number waits.
+        """
+        with self._transaction():
+            if not list(self._rows("given", "WHERE number = ? AND batch IS NULL", (number,))):
+                waiting = [str(other) for other in self.queue()]
+                which = f"{', '.join(waiting)} do" if len(waiting) > 1 else f"{''.join(waiting) or 'none'} does"
+                raise StudyError(f"no point {number} waits to be judged in {self.path or 'the study'}; {which}")
+            if point is None:
+                self._db.execute("DELETE FROM given WHERE number = ?", (number,))
+            else:
+                self._insert("given", [(number, encode(point), None)], instead="REPLACE")
+
+    # -- notes of users
+
+    def note(self, point: Point | None, key: str, value: Any) -> None:
+        """Notes something of a point, or of the study."""
+        with self._transaction():
+            row = ("" if point is None else encode(point), key, json.dumps(value))
+            self._insert("notes", [row], instead="REPLACE")
+
+    def notes(self) -> dict[Point | None, dict[str, Any]]:
+        """All notes by point; those of the study by None."""
+        found: dict[Point | None, dict[str, Any]] = {}
+        for point, key, value in self._rows("notes", "ORDER BY rowid"):
+            found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
+        return found
+
+
+def _checksum(table: str, row: Sequence[Any]) -> int:
+    return zlib.crc32(repr((table, *row)).encode())
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def encode(point: Point) -> str:
@@ -298,6 +390,11 @@ def decode(text: str) -> Point:
     return tuple(json.loads(text))
 
 
+def _real(value: float) -> float | None:
+    # SQLite has no NaN.
+    return None if isnan(value) else float(value)
+
+
 def _number(value: float | None) -> float:
-    # SQLite has no NaN: it becomes NULL.
-    return float("nan") if value is None else float(value)
+    """The inverse of `_real`."""
+    return float("nan") if value is None else value

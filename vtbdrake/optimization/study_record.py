@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, Self
 from vtbdrake.optimization.identity import dimensions
 from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Dimension
-from vtbdrake.optimization.study_file import StudyFile
+from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study_file import StudyFile, TrialRow
 
 if TYPE_CHECKING:
     import optuna
+    import pandas
     from matplotlib.figure import Figure
     from optuna.storages import BaseStorage
 
@@ -96,11 +98,26 @@ class StudyRecord:
     @property
     def trials(self) -> tuple[Trial, ...]:
         """All judged points, as they are in the file now."""
-        addresses = [dimension.address for dimension in self.parameters]
-        return tuple(
-            Trial(number, dict(zip(addresses, point, strict=True)), values, violations, exact, origin, method, batch)
-            for number, (batch, _, point, values, violations, exact, origin, method) in enumerate(self._file.trials())
-        )
+        notes = self._file.notes()
+        return tuple(self._trial(number, row, notes) for number, row in enumerate(self._file.trials()))
+
+    def _trial(self, number: int, row: TrialRow, notes: Mapping[Point | None, Mapping[str, Any]]) -> Trial:
+        batch, _, point, values, violations, exact, origin, method = row
+        noted = dict(notes.get(point, {}))
+        return Trial(number, self._by_address(point), values, violations, exact, origin, method, batch, noted)
+
+    def _by_address(self, point: Point) -> dict[str, Any]:
+        return {parameter.address: value for parameter, value in zip(self.parameters, point, strict=True)}
+
+    @property
+    def queue(self) -> dict[int, dict[str, Any]]:
+        """The points given by hand that are not judged yet: number -> the point, address -> value."""
+        return {number: self._by_address(point) for number, point in self._file.queue().items()}
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What users noted of the study, see `Study.set_attribute`; `Trial.attributes` is what they noted of points."""
+        return self._file.notes().get(None, {})
 
     @property
     def rollouts(self) -> dict[Row, Outcome]:
@@ -148,14 +165,35 @@ class StudyRecord:
         return "".join(f"; {count} rollouts failed: {message}" for message, count in messages.most_common(1))
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Columns by name, one entry per trial."""
+        """Columns by name, one entry per trial.
+
+        The parameters by address, the qualities, the violations of the constraints, how the trial came about, and what
+        users noted of it (None where they noted nothing).
+        """
         trials = self.trials
         columns: dict[str, list[Any]] = {d.address: [t.parameters[d.address] for t in trials] for d in self.parameters}
         for k, name in enumerate(self.names):
             columns[name if name not in columns else f"{name} {k}"] = [t.values[k] for t in trials]
+        for k, constraint in enumerate(self._meta["problem"]["constraints"]):
+            name = f"violation of {constraint['name']}"
+            columns[name if name not in columns else f"{name} {k}"] = [t.violations[k] for t in trials]
         for name in ("feasible", "exact", "origin", "method", "batch"):
             columns[name] = [getattr(trial, name) for trial in trials]
+        for key in dict.fromkeys(key for trial in trials for key in trial.attributes):
+            columns[f"attribute {key}"] = [trial.attributes.get(key) for trial in trials]
         return columns
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The columns of `to_dict` as a DataFrame, one row per trial; its index is `Trial.number`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("a DataFrame needs pandas: pip install 'vtbdrake[dataframe]'") from error
+        return pandas.DataFrame(self.to_dict(), index=pandas.RangeIndex(len(self.trials), name="number"))
 
     def summary(self) -> str:
         """What was done, what came out, and what went wrong, to be read."""

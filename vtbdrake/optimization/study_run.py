@@ -126,7 +126,7 @@ class StudyRun:
         It is told of them where the study goes on. Until then it would ask for what is known and, in the same batch,
         for more than the budget allows.
         """
-        points = self._file.queue()
+        points = list(self._file.queue().values())
         rows = [(point, condition) for point in points for condition in range(len(self._problem.conditions))]
         try:
             self._roll_out([row for row in dict.fromkeys(rows) if row not in self._known])
