@@ -115,7 +115,7 @@ def test_numbers_are_taken_in_as_struct_reads_them(code: str, data: st.DataObjec
     raw = data.draw(st.binary(min_size=3 * struct.calcsize(f">{code}"), max_size=3 * struct.calcsize(f">{code}")))
     expected = np.array(struct.unpack(f">3{code}", raw), dtype=float)
     take, (first, others) = intake(code, 3)
-    sent = take.take(HEAD + struct.pack(">q", 1_500_000) + raw, 1.0, 7.0)
+    sent = take.take(HEAD + struct.pack(">q", 1_500_000) + raw, 1.0, math.inf, 7.0)
     if not (np.abs(expected) <= np.inf).all():  # a NaN
         assert sent is None and first.count == 0
         return
@@ -139,22 +139,22 @@ def test_numbers_are_taken_in_as_struct_reads_them(code: str, data: st.DataObjec
 )
 def test_of_other_messages_nothing_is_taken_in(data: bytes, last: float) -> None:
     take, receptions = intake("d", 3, limit=8.0)
-    assert take.take(data, last, 1.0) is None
+    assert take.take(data, last, math.inf, 1.0) is None
     assert [(reception.count, reception.value) for reception in receptions] == [(0, None)] * 2
 
 
 def test_values_of_earlier_messages_stay_as_they_are() -> None:
     take, (_, others) = intake("d", 3)
-    take.take(message("d", [1.0, 2.0, 3.0], 1), 0.0, 1.0)
+    take.take(message("d", [1.0, 2.0, 3.0], 1), 0.0, math.inf, 1.0)
     before = others.value
-    take.take(message("d", [4.0, 5.0, 6.0], 2), 0.0, 1.0)
+    take.take(message("d", [4.0, 5.0, 6.0], 2), 0.0, math.inf, 1.0)
     np.testing.assert_array_equal(before, [2.0, 3.0])
     np.testing.assert_array_equal(others.value, [5.0, 6.0])
 
 
 def test_without_a_time_all_messages_are_new() -> None:
     take, (first, _) = intake("d", 3, stamp=False)
-    assert math.isnan(take.take(message("d", [1.0, 2.0, 3.0]), math.inf, 1.0) or 0.0)
+    assert math.isnan(take.take(message("d", [1.0, 2.0, 3.0]), math.inf, math.inf, 1.0) or 0.0)
     assert math.isnan(first.sent) and first.count == 1
 
 
@@ -233,7 +233,7 @@ def test_a_form_knows_the_vectors_of_all_its_places(places: Any, sizes: list[int
 def test_what_is_no_message_is_refused() -> None:
     nothing: Any = None
     with pytest.raises(TypeError, match="expected bytes"):
-        intake("d", 3)[0].take(nothing, 0.0, 1.0)
+        intake("d", 3)[0].take(nothing, 0.0, math.inf, 1.0)
 
 
 class Made(dict[str, np.ndarray]):

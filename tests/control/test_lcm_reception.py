@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -82,6 +83,35 @@ def test_sender_whose_clock_went_back_is_believed_after_the_window() -> None:
     arm = Arm(reorder_window=0.0).take(status(1000), status(1, position=0.5), status(2, position=0.6))
     assert (arm.position.value.tolist(), arm.inlet.clock_jumps) == ([0.6] * 7, 1)
     assert arm.take(status(3)).inlet.clock_jumps == 1
+
+
+FAR = 10**15
+
+
+def test_one_time_stamp_far_in_the_future_costs_its_own_message_only() -> None:
+    arm = Arm().take(status(1), status(FAR, position=0.9), *(status(utime) for utime in range(2, 50)))
+    assert (arm.position.count, arm.position.rejected) == (49, {"ahead of time": 1})
+    assert arm.position.value.tolist() == [0.1] * 7
+
+
+@pytest.mark.parametrize("before", [1, 2], ids=["field by field", "in one go"])
+def test_sender_whose_clock_was_set_ahead_is_believed_after_the_window(before: int) -> None:
+    arm = Arm(reorder_window=0.0).take(*(status(utime) for utime in range(1, before + 1)))
+    arm.take(status(FAR), status(FAR + 1, position=0.5), status(FAR + 2, position=0.6))
+    assert arm.position.rejected == {"ahead of time": 1}
+    assert (arm.position.value.tolist(), arm.inlet.clock_jumps) == ([0.6] * 7, 1)
+
+
+def test_first_time_stamp_far_in_the_future_is_overcome_after_the_window() -> None:
+    arm = Arm(reorder_window=0.0).take(status(FAR), status(1), status(2, position=0.5), status(3, position=0.6))
+    assert (arm.position.value.tolist(), arm.inlet.clock_jumps) == ([0.6] * 7, 1)
+
+
+def test_time_that_passed_here_may_have_passed_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = Arm().take(status(1_000_000))
+    later = time.monotonic() + 3600.0
+    monkeypatch.setattr("vtbdrake.control.lcm_routes.time.monotonic", lambda: later)
+    assert arm.take(status(3_601_000_000)).position.count == 2
 
 
 def test_late_messages_among_others_never_count_as_a_clock_that_went_back() -> None:

@@ -144,7 +144,7 @@ cdef class Reception:
         sent: the sender's own time of it, in seconds, if the message tells; NaN if not.
         count: how many were accepted.
         rejected: how many were not, by the reason: ``fingerprint``, ``truncated``, ``trailing``, ``size``, ``not
-            finite``, ``limits``, ``out of order``, ...
+            finite``, ``limits``, ``out of order``, ``ahead of time``, ...
         range: the `Range` that the bridge checks every value against before it accepts it; None if it leaves that to
             others.
     """
@@ -430,12 +430,12 @@ cdef class Intake:
         PyMem_Free(self.sizes)
         PyMem_Free(self.numbers)
 
-    def take(self, bytes data not None, double last, double now):
+    def take(self, bytes data not None, double last, double most, double now):
         """Tells the receptions of a message that came at the time ``now``.
 
         Returns:
             The sender's time in seconds, NaN if there is none. None if nothing was done: the message is laid out in
-            another way, its time is not above ``last``, or an entry is not within its limits.
+            another way, its time is not above ``last`` or above ``most``, or an entry is not within its limits.
         """
         cdef const char* message = PyBytes_AS_STRING(data)
         cdef const char* example = PyBytes_AS_STRING(self.example)
@@ -454,7 +454,7 @@ cdef class Intake:
                 return None
         if self.stamp is not NULL:
             sent = _read(message + self.stamp.offset, self.stamp.code) * 1e-6
-            if not sent > last:
+            if not last < sent <= most:
                 return None
         for i in range(self.run_count):
             run = &self.runs[i]

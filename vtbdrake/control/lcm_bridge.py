@@ -28,8 +28,9 @@ class LcmBridge(Bridge):
     raised. Each signal of a message stands for itself: one that is out of its limits does not take the others along.
 
     A late message (its time is below the last accepted one's) is ``out of order``, one with the same time a
-    ``duplicate``. A sender that was restarted, or whose clock was set back, is believed once all its messages for
-    ``reorder_window`` seconds have been late.
+    ``duplicate``, one whose time is 1.5 s further on than the time that has passed here ``ahead of time``.
+    A sender that was restarted, or whose clock was set, is believed once none of its messages has fitted to its old time
+    for ``reorder_window`` seconds.
 
     Commands are the guards' business, but what is not finite or not within a signal's limits does not leave here
     either: the whole message is withheld and counted, as is one that lacks a signal which it cannot do without.
@@ -38,7 +39,7 @@ class LcmBridge(Bridge):
         url: the bus.
         sent: by actuator signal, how many commands left, and why others did not.
         alarms: by command channel, how many messages came there that are not ours (where ``watch`` is on).
-        clock_jumps: by channel, how often a sender's time went back and was believed.
+        clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was believed.
         losses, reconnections: how often the bus was lost and found again.
     """
 

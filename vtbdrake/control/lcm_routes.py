@@ -22,12 +22,21 @@ _log = logging.getLogger(__name__)
 _LAYOUTS = 4  # that an inlet remembers: messages of a channel are laid out alike, or change between a few ways
 
 
+AHEAD = 1.5
+"""Seconds by which a sender's time may get ahead of ours from one message to the next: how much quicker the second may
+have come, or how much faster than real time a sender runs that simulates."""
+
+
 class Inlet:
     """Takes in the messages of one channel.
 
+    By the sender's time, a message is late (``out of order``), a ``duplicate``, or ``ahead of time``: further on from the
+    last one than `AHEAD` beyond the time that has passed here. A sender whose clock was set, or which was restarted, is
+    believed once no message has fitted to its old time for the reorder window.
+
     Attributes:
         channel: its name.
-        clock_jumps: how often the sender's time went back and was believed.
+        clock_jumps: how often the sender's time jumped, back or ahead, and was believed.
     """
 
     def __init__(
@@ -49,20 +58,22 @@ class Inlet:
         self._intakes: dict[int, Intake | None] = {}
         self._reorder_window = reorder_window
         self._last = -inf
-        self._late_since = inf
+        self._last_arrived = -inf
+        # Since when no message has fitted to the sender's time.
+        self._unfit_since = inf
 
     def take(self, channel: str, data: bytes) -> None:
         """Handles one message."""
         now = time.monotonic()
         intake = self._intakes.get(len(data))
-        if intake is not None and (taken := intake.take(data, self._last, now)) is not None:
-            self._late_since = inf
-            if isfinite(taken):
-                self._last = taken
+        # Before the first message, that is infinite.
+        most = self._last + (now - self._last_arrived) + AHEAD if self._last > -inf else inf
+        if intake is not None and (taken := intake.take(data, self._last, most, now)) is not None:
+            self._believe(taken, now)
             return
         try:
             sent, values = self._read(data)
-            reason = "" if sent > self._last else self._order(sent, now)
+            reason = "" if self._last < sent <= most else self._order(sent, now)
         except MalformedError as error:
             reason = error.reason
         except (Exception, SystemExit):  # a failed assertion in Drake's C++ is a SystemExit
@@ -77,11 +88,15 @@ class Inlet:
         if len(accepted) == len(self._receptions):
             self._learn(data)
         if accepted:
-            if sent < self._last:
+            if isfinite(sent) and not self._last < sent <= most:
                 self.clock_jumps += 1
-            self._late_since = inf
-            if isfinite(sent):
-                self._last = sent
+            self._believe(sent, now)
+
+    def _believe(self, sent: float, now: float) -> None:
+        """Goes on from a message that was accepted."""
+        self._unfit_since = inf
+        if isfinite(sent):
+            self._last, self._last_arrived = sent, now
 
     def _learn(self, data: bytes) -> None:
         """Takes in messages like an accepted one quickly from now on, if there is a way."""
@@ -101,13 +116,15 @@ class Inlet:
         return accepted
 
     def _order(self, sent: float, now: float) -> str:
-        """Why a message that is no newer than the last one is not to be believed; empty if it is."""
+        """Why a message that does not fit to the last one is not to be believed; empty if it is."""
         if not isfinite(sent):
             return ""
         if sent == self._last:
             return "duplicate"
-        self._late_since = min(self._late_since, now)
-        return "" if now - self._late_since > self._reorder_window else "out of order"
+        self._unfit_since = min(self._unfit_since, now)
+        if now - self._unfit_since > self._reorder_window:
+            return ""
+        return "out of order" if sent < self._last else "ahead of time"
 
 
 @dataclass
