@@ -153,9 +153,11 @@ class ManipulatorScenario(Scenario):
         )
 
     def operation(self) -> Operation:
-        """How the DPS is run on the arm: after a fault, the arm floats in place."""
+        """How the DPS is run on the arm: it answers each state as soon as it comes; after a fault, the arm floats in
+        place."""
         guards = {"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE}
-        return Operation(period=self.period, guards=guards, continuity=CONTINUITY)
+        # The wrench is in the last message of the arm's cycle.
+        return Operation(period=self.period, guards=guards, continuity=CONTINUITY, pace="wrench")
 
     def residuals(self) -> ResidualConfig:
         """The machine's samples are compared with those of an arm whose sensors do nothing by chance."""

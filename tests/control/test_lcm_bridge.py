@@ -28,6 +28,7 @@ from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.lcm_connections import TcpqConnection
 from vtbdrake.control.lcm_maps import LcmMap
 from vtbdrake.control.lcm_ownership import Ownership
+from vtbdrake.control.lcm_routes import CommandWatch
 from vtbdrake.control.lcm_vectors import vector_map
 from vtbdrake.testbed import Interface, Signal
 
@@ -342,6 +343,43 @@ def test_foreign_publisher_on_a_command_channel_raises_an_alarm(hub: Hub) -> Non
         assert told == ["IIWA_COMMAND"]
 
 
+def test_second_publisher_of_commands_is_heard_on_a_hub_and_speaks_against_commanding_for_a_while(hub: Hub) -> None:
+    peer = Peer(hub.url)
+    with closing(bridge(hub.url)) as arm:
+        arm.open()
+        in_step(arm, peer)
+        arm.publish({"position": np.zeros(7)})
+        peer.hear(2)
+        arm.poll(0.1)
+        assert (arm.foreign, arm.contention) == (0, None)
+        peer.lcm.publish("IIWA_COMMAND", b"foreign")
+        assert wait(arm, lambda: arm.foreign == 1)
+        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.contention or "")
+        assert wait(arm, lambda: arm.contention is None)
+        assert arm.foreign == 1
+
+
+def test_own_commands_that_come_back_late_all_at_once_or_not_in_order_are_no_alarm() -> None:
+    watch = CommandWatch(None)
+    own = [str(number).encode() for number in range(3000)]
+    for data in (*own, own[7]):
+        watch.expect(data)
+    for data in (own[7], *reversed(own)):
+        watch.take("IIWA_COMMAND", data)
+    assert watch.alarms == 0
+    for data in (own[7], b"foreign"):
+        watch.take("IIWA_COMMAND", data)
+    assert watch.alarms == 2
+
+
+def test_own_commands_that_never_come_back_make_room(caplog: pytest.LogCaptureFixture) -> None:
+    watch = CommandWatch(None)
+    for number in range(20_000):
+        watch.expect(str(number).encode())
+    watch.take("IIWA_COMMAND", b"0")
+    assert watch.alarms == 1
+
+
 def test_callback_that_raises_does_not_end_the_loop(hub: Hub) -> None:
     def refuse(channel: str, data: bytes) -> None:
         raise RuntimeError
@@ -355,7 +393,7 @@ def test_callback_that_raises_does_not_end_the_loop(hub: Hub) -> None:
         assert wait(arm, lambda: arm.alarms == {"IIWA_COMMAND": 2})
 
 
-def test_foreign_publisher_is_watched_for_on_udpm_by_default() -> None:
+def test_foreign_publisher_is_heard_on_udpm() -> None:
     url = f"udpm://239.255.76.67:{free_port()}?ttl=0"
     with closing(bridge(url)) as arm:
         try:

@@ -71,8 +71,8 @@ class Oracle:
     """What of a message is to be believed, by lcm-gen's decoder and nothing of the bridge.
 
     All of an `lcmt_iiwa_status` is numbers, so that encoding it again gives the same bytes, and no others. The reorder
-    window is zero: the second message in a row that is late or ahead is believed. Ahead is by 1.5 s, or 2**21 us where a
-    bit of the time has flipped; hardly any time passes here.
+    window is zero: the second message in a row that is late or ahead is believed. What is ahead is so by at least
+    2**21 us, where a bit of the time has flipped; hardly any time passes here.
     """
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.clock import SimulatedClock, WallClock
+from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.testbed import DpsAlone
@@ -66,8 +66,14 @@ def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
 
 
 def test_what_has_come_by_shortly_before_a_cycle_is_taken_in_before_it():
-    clock, dps = WallClock(spin=0.02), DpsAlone(ServoScenario())
-    runtime = Runtime(dps, ScriptedBridge(dps.interface, clock, still), period=0.05, clock=clock)
+    class Early(SimulatedClock):
+        def wait_until(self, t, meanwhile=None):
+            if meanwhile is not None:
+                meanwhile()
+            return super().wait_until(t)
+
+    clock, dps = Early(), DpsAlone(ServoScenario())
+    runtime = Runtime(dps, ScriptedBridge(dps.interface, clock, still), period=PERIOD, clock=clock)
     counts = []
     runtime.watch(lambda cycle: counts.append(runtime.bridge.sensed["position"].count))
     runtime.run(cycles=4)
@@ -335,6 +341,31 @@ def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
     runtime.run(cycles=2)
     assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True, True, False, False, False]
     assert runtime.guards.latched[0].kind == "not ready"
+
+
+def test_a_second_publisher_of_commands_is_an_alarm_and_blocks_the_switch_to_real_but_not_the_way_on(caplog):
+    class Contended(ScriptedBridge):
+        foreign, contention = 0, None
+
+    scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
+    bridge = Contended(scenario.interface(), clock, still)
+    runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
+    runtime.cycle()
+    bridge.foreign, bridge.contention = 3, "somebody else commands"
+    runtime.run(cycles=5)
+    assert refusal(runtime) == "somebody else commands"
+    assert runtime.prepare("shadow").reasons == ()
+    bridge.contention = None
+    runtime.switch("real")
+    runtime.run(cycles=5)
+    bridge.foreign, bridge.contention = 4, "somebody else commands"
+    runtime.run(cycles=5)
+    assert runtime.guards.latched == () and len(bridge.sent) == 10
+    assert runtime.prepare("real").reasons == ()
+    assert runtime.statistics.foreign == 4
+    assert "ALARM: somebody else published 4 commands" in str(runtime.statistics)
+    [record] = [record for record in caplog.records if "ALARM" in record.message]
+    assert "somebody else commands (3 messages so far)" in record.message
 
 
 def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():

@@ -175,6 +175,7 @@ def recorded(seed: int) -> LoopStatistics:
     for a, b in zip(samples(seed, 300).tolist(), samples(seed + 1, 300).tolist(), strict=True):
         statistics.record(lateness=a, step=b, cycle=a + b)
         statistics.miss(int((a + b) / 1e-3))
+    statistics.foreign = seed
     return statistics
 
 
@@ -183,7 +184,7 @@ def test_merged_statistics_add_up() -> None:
     longest, misses = max(a.longest_run, b.longest_run), a.misses + b.misses
     warnings = a.thresholds["cycle"].warnings + b.thresholds["cycle"].warnings
     a.merge(b)
-    assert (a.cycles, a.misses, a.longest_run) == (600, misses, longest)
+    assert (a.cycles, a.misses, a.longest_run, a.foreign) == (600, misses, longest, 30)
     assert a.thresholds["cycle"].warnings == warnings > 0
 
 

@@ -75,6 +75,16 @@ class Bridge(ABC):
         """Why commands that leave do not reach the machine, as far as is known; None if nothing is."""
         return None
 
+    @property
+    def foreign(self) -> int:
+        """How many commands of somebody else have been heard on the own command channels, by a bridge that listens."""
+        return 0
+
+    @property
+    def contention(self) -> str | None:
+        """Who else commands the machine at present, as far as is heard; None if nobody does."""
+        return None
+
     @abstractmethod
     def close(self) -> None:
         """Gives the connection back; it may be opened again."""

@@ -17,7 +17,10 @@ from vtbdrake.control.reported import reported_signals
 from vtbdrake.testbed import Interface, Signal
 
 _HUB = "tcpq://"
-_OPEN_TO_ALL = ("udpm://", "mpudpm://")
+_PRIVATE = ("memq://", "file://")
+
+CONTENTION = 1.0
+"""Seconds for which a command of somebody else speaks against commanding as well."""
 
 
 class LcmBridge(Bridge):
@@ -28,9 +31,9 @@ class LcmBridge(Bridge):
     raised. Each signal of a message stands for itself: one that is out of its limits does not take the others along.
 
     A late message (its time is below the last accepted one's) is ``out of order``, one with the same time a
-    ``duplicate``, one whose time is 1.5 s further on than the time that has passed here ``ahead of time``.
-    A sender that was restarted, or whose clock was set, is believed once none of its messages has fitted to its old time
-    for ``reorder_window`` seconds.
+    ``duplicate``, one whose time is 1.5 s further on than the time that has passed here ``ahead of time``. A sender
+    that was restarted, or whose clock was set, is believed once none of its messages has fitted to its old time for
+    ``reorder_window`` seconds.
 
     Commands are the guards' business, but what is not finite or not within a signal's limits does not leave here
     either: the whole message is withheld and counted, as is one that lacks a signal which it cannot do without.
@@ -38,7 +41,7 @@ class LcmBridge(Bridge):
     Attributes:
         url: the bus.
         sent: by actuator signal, how many commands left, and why others did not.
-        alarms: by command channel, how many messages came there that are not ours (where ``watch`` is on).
+        alarms: by command channel, how many messages came there that are not ours (empty if ``watch`` is off).
         clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was believed.
         losses, reconnections: how often the bus was lost and found again.
     """
@@ -68,8 +71,8 @@ class LcmBridge(Bridge):
             commands: maps of those commands u that come over LCM.
             reported: by actuator signal, the name under which a map of ``sense`` carries the command that the machine
                 says acts on it; such a value is no sensor signal.
-            watch: whether to listen to the own command channels for foreign publishers. Left out: on udpm, where nobody
-                can keep them out. A hub does it by protected channels.
+            watch: whether to listen to the own command channels for foreign publishers. Left out: on every bus that
+                others can be on.
             on_alarm: called, in `poll`, with channel and bytes of a foreign message.
             reorder_window: in seconds, see above.
             connect_timeout: seconds that `open` waits for a hub.
@@ -107,7 +110,7 @@ class LcmBridge(Bridge):
             self._inlets.append(Inlet(map, signals, self.commanded, reorder_window))
         self._outlets = [Outlet(map, _signals(interface.act, map, "actuator"), self.sent) for map in act]
         if watch is None:
-            watch = url.startswith(_OPEN_TO_ALL)
+            watch = not url.startswith(_PRIVATE)
         self._watches = {map.channel: CommandWatch(on_alarm) for map in act} if watch else {}
         handlers: dict[str, Handler] = {inlet.channel: self._tapped(inlet) for inlet in self._inlets}
         handlers |= {channel: watch.take for channel, watch in self._watches.items()}
@@ -141,6 +144,18 @@ class LcmBridge(Bridge):
         if not self._ownership.foreign:
             return None
         return f"the hub protects {', '.join(sorted(self._ownership.foreign))} for somebody else"
+
+    @property
+    def foreign(self) -> int:
+        return sum(watch.alarms for watch in self._watches.values())
+
+    @property
+    def contention(self) -> str | None:
+        since = time.monotonic() - CONTENTION
+        found = [channel for channel, watch in self._watches.items() if watch.last > since]
+        if not found:
+            return None
+        return f"somebody else publishes commands on {', '.join(sorted(found))}: only one may command a machine"
 
     def open(self) -> None:
         self._link.open()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
@@ -30,9 +29,9 @@ have come, or how much faster than real time a sender runs that simulates."""
 class Inlet:
     """Takes in the messages of one channel.
 
-    By the sender's time, a message is late (``out of order``), a ``duplicate``, or ``ahead of time``: further on from the
-    last one than `AHEAD` beyond the time that has passed here. A sender whose clock was set, or which was restarted, is
-    believed once no message has fitted to its old time for the reorder window.
+    By the sender's time, a message can be late (``out of order``), a ``duplicate``, or ``ahead of time``: further on
+    from the last one than the time that has passed here and `AHEAD`. A sender whose clock was set, or which was
+    restarted, is believed once no message has fitted to its old time for the reorder window.
 
     Attributes:
         channel: its name.
@@ -204,28 +203,37 @@ class Outlet:
 class CommandWatch:
     """Tells messages on an own command channel that somebody else has sent.
 
+    Our own come back, too, in any order and number of those that we sent: they are known by their bytes, in which our
+    time stamp makes each different. A copy of one of ours is somebody else's.
+
     Attributes:
         alarms: how many there were.
+        last: when the last one came, by `time.monotonic`; -inf before the first.
     """
 
-    _MEMORY = 256  # own messages that may be on their way at a time; what is lost on the way makes room for new ones
+    _MEMORY = 4096  # own messages that may be on their way at a time: some seconds of a hub that stands still
 
     def __init__(self, on_alarm: Callable[[str, bytes], None] | None) -> None:
         self.alarms = 0
+        self.last = -inf
         self._on_alarm = on_alarm
-        self._own: deque[bytes] = deque(maxlen=self._MEMORY)
+        # How often each was sent and has not come back; the oldest first.
+        self._own: dict[bytes, int] = {}
 
     def expect(self, data: bytes) -> None:
-        """Remembers a message that is about to be sent."""
-        self._own.append(data)
+        """Remember a message that is about to be sent."""
+        self._own[data] = self._own.pop(data, 0) + 1
+        if len(self._own) > self._MEMORY:
+            del self._own[next(iter(self._own))]
 
     def take(self, channel: str, data: bytes) -> None:
-        """Handles one message that came."""
-        if data in self._own:
-            while self._own.popleft() != data:
-                pass
+        """Handle one message that came."""
+        if (left := self._own.pop(data, 0)) > 0:
+            if left > 1:
+                self._own[data] = left - 1
             return
         self.alarms += 1
+        self.last = time.monotonic()
         if self._on_alarm is None:
             return
         try:

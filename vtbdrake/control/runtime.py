@@ -25,6 +25,8 @@ from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
 
+_TELL_EVERY = 1.0  # s, of what could be told in every cycle
+
 
 class Runtime(Stepped):
     """Steps a testbed, or the DPS alone, once per period, with the machine on the other side of a bridge.
@@ -58,6 +60,9 @@ class Runtime(Stepped):
         ready: says why the machine is not ready to be commanded, or None.
         statistics: of the loop's timing.
         watchers: called with every `Cycle`; one that raises is left out from then on, and the loop goes on.
+
+    Somebody else who commands the same machine is an alarm: it is logged and counted in the statistics, and no signal
+    is switched to real meanwhile. Guards cannot keep him from it; a hub can, by protected channels.
 
     Attributes:
         cycles: how many there were.
@@ -97,6 +102,8 @@ class Runtime(Stepped):
         self._watchers = list(watchers)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
+        self._foreign = bridge.foreign
+        self._told_foreign = -inf
         self.slow_parts = SlowParts(
             slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.changed
         )
@@ -228,6 +235,8 @@ class Runtime(Stepped):
         )
         self.guards.withheld(self.bridge.publish(verdict.commands) if verdict.commands else ())
         self.slow_parts.send()
+        if self.bridge.foreign != self._foreign:
+            self._tell_foreign()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         changes, new = self.news()
         done = Cycle(self.cycles, self.time, now, changes, new, commands, verdict)
@@ -239,6 +248,16 @@ class Runtime(Stepped):
                 _log.exception("a watcher of the loop raised, and is left out from now on")
                 self._watchers.remove(watcher)
         return done
+
+    def _tell_foreign(self) -> None:
+        """Counts commands of somebody else, and logs them once per second at most."""
+        foreign, now = self.bridge.foreign, self.clock.now()
+        self.statistics.foreign += foreign - self._foreign
+        self._foreign = foreign
+        if now - self._told_foreign >= _TELL_EVERY:
+            self._told_foreign = now
+            who = self.bridge.contention or "somebody else publishes commands"
+            _log.error("ALARM: %s (%d messages so far)", who, self.statistics.foreign)
 
     def send_fallback(self, reason: str) -> None:
         """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""

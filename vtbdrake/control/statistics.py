@@ -145,6 +145,7 @@ class LoopStatistics:
         misses: deadlines that passed while the loop was at work on an earlier cycle.
         run: how many of them in a row, up to now.
         longest_run: the longest such run.
+        foreign: commands of somebody else that were heard.
     """
 
     def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
@@ -161,6 +162,7 @@ class LoopStatistics:
         self.misses = 0
         self.run = 0
         self.longest_run = 0
+        self.foreign = 0
         self._missed = False
         self._recorders = tuple((self.histograms[name].record, self.thresholds[name]) for name in QUANTITIES)
 
@@ -213,6 +215,7 @@ class LoopStatistics:
         self.misses += other.misses
         self.run = other.run
         self.longest_run = max(self.longest_run, other.longest_run)
+        self.foreign += other.foreign
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, fit for JSON."""
@@ -223,6 +226,7 @@ class LoopStatistics:
             "misses": self.misses,
             "run": self.run,
             "longest_run": self.longest_run,
+            "foreign": self.foreign,
         }
 
     @classmethod
@@ -233,7 +237,7 @@ class LoopStatistics:
         for name in QUANTITIES:
             statistics.histograms[name].merge(Histogram.from_dict(data["histograms"][name]))
         statistics.misses, statistics.run = data["misses"], data["run"]
-        statistics.longest_run = data["longest_run"]
+        statistics.longest_run, statistics.foreign = data["longest_run"], data["foreign"]
         return statistics
 
     def __str__(self) -> str:
@@ -246,7 +250,10 @@ class LoopStatistics:
             cells = [f"{1e6 * seconds:.0f}" for seconds in durations]
             lines.append(form.format(name, *cells, threshold.warnings, threshold.errors))
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
-        return "\n".join([*lines, f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}"])
+        lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}")
+        if self.foreign:
+            lines.append(f"ALARM: somebody else published {self.foreign} commands to the machine")
+        return "\n".join(lines)
 
     def _shape(self) -> tuple[Any, ...]:
         return self.period, *((t.warning, t.error) for t in self.thresholds.values())

@@ -51,7 +51,7 @@ def prepare(
 
     A sensor signal that becomes real has to be fresh and plausible; if an actuator signal is to be on real, all sensor
     signals on real have to be, and what its command departs from. One that becomes real has to continue what is
-    measured, and the machine has to be ready and within reach.
+    measured, and the machine has to be ready and within reach, and nobody else may command it.
 
     Raises:
         ValueError: the mode, a signal or a position is unknown, or there are a mode and positions.
@@ -84,6 +84,9 @@ def prepare(
         not_ready = runtime.not_ready()
         if not_ready is not None:
             reasons.append(f"the machine is not ready: {not_ready}")
+        contention = runtime.bridge.contention
+        if becoming and contention is not None:
+            reasons.append(contention)
         reasons += _jumps(runtime, becoming)
 
     def perform() -> None:
