@@ -119,6 +119,22 @@ def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:
     assert "stiffnes" in error_of(["variables", str(path)])
 
 
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("{file}", "names the scenario never.imported:Scenario, and to import its module runs its code"),
+        (PENDULUM + "@{file}", f"is of the scenario never.imported:Scenario, not of {PENDULUM}"),
+        (PENDULUM + "@{folder}", "after package.module:Class@ comes the name of a .yaml file"),
+        (PENDULUM + "@none.yaml", "there is no scenario file none.yaml"),
+        (PENDULUM + "@/dev/null/a.yaml", "there is no scenario file /dev/null/a.yaml"),
+    ],
+)
+def test_a_file_has_no_module_imported(tmp_path: Path, source: str, expected: str) -> None:
+    (tmp_path / "s.yaml").write_text("never.imported:Scenario:\n  a: 1\n")
+    given = source.format(file=tmp_path / "s.yaml", folder=tmp_path)
+    assert expected in error_of(["variables", given])
+
+
 def test_scenario_file_that_names_no_class_is_named(tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
     path.write_text("a: 1\n")

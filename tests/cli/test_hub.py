@@ -11,6 +11,7 @@ import lcm
 import pytest
 
 from tests.cli.program import ROOT, run
+from vtbdrake.control.hub import Statistics
 
 
 @contextlib.contextmanager
@@ -64,6 +65,41 @@ def test_it_runs_on_the_processors_that_it_is_told() -> None:
         assert os.sched_getaffinity(program.pid) == {cpu}
 
 
+def protected(url: str) -> set[str]:
+    """The channels that the hub says it protects."""
+    bus, found = lcm.LCM(url), []
+    bus.subscribe("VTB_HUB", lambda _, data: found.append(set(Statistics.from_json(data).protected)))
+    while not found:
+        assert bus.handle_timeout(30_000)
+    return found[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "channels", "warns"),
+    [
+        ((), {"VTB_SET", "VTB_RESET"}, True),
+        (("tests.control.servo_machine:ServoMachineScenario",), {"IIWA_COMMAND", "VTB_SET", "VTB_RESET"}, False),
+        (("--protect", "A"), {"A", "VTB_SET", "VTB_RESET"}, False),
+        (("--protect", "A", "--unprotected"), {"A"}, False),
+        (("--unprotected",), set(), False),
+    ],
+)
+def test_what_is_protected_by_default(arguments: tuple[str, ...], channels: set[str], warns: bool) -> None:
+    with running("--port", 0, *arguments) as (program, url):
+        assert protected(url) == channels
+        program.send_signal(signal.SIGINT)
+        _, stderr = program.communicate(timeout=30)
+    assert ("no command channel is protected: name the SCENARIO" in stderr) == warns
+    for channel in channels:
+        assert channel in stderr
+
+
+def test_a_hub_without_a_scenario_needs_nothing_of_drake() -> None:
+    code = "import sys, vtbdrake.cli.hub; print([name for name in sys.modules if 'pydrake' in name])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout == "[]\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -73,6 +109,11 @@ def test_it_runs_on_the_processors_that_it_is_told() -> None:
         (("--port", 0, "--max-queue", "inf"), "'inf' is not a valid integer"),
         (("--port", 0, "--protect", "VTB_HUB"), "'VTB_HUB' is the hub's own"),
         (("--port", 0, "--lease", 0), "lease is a positive time"),
+        (("--port", 0, "--user", "no such user"), "there is no user 'no such user'"),
+        (("--port", 0, "--max-memory", 1), "max_memory lies between"),
+        (("--port", 0, "--max-clients", 0), "max-clients"),
+        (("--port", 0, "nowhere.at_all:Scenario"), "cannot import nowhere.at_all"),
+        (("--port", 0, "tests.testbeds:PendulumScenario"), "does not say what its machine speaks"),
         (("--port", 0, "--cpu", -1), "processors have the numbers"),
     ],
 )

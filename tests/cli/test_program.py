@@ -43,7 +43,7 @@ def test_rollout_from_a_file_prints_and_saves_what_the_library_computes(tmp_path
     result = RolloutRunner(RolloutTask(scenario, 1.0, record=(ANGLE, "plant.state"))).run({ANGLE: 0.5})
 
     command = ["--horizon", 1, "--set", f"{ANGLE}=0.5", "--record", ANGLE, "--record", "plant.state"]
-    program = run("rollout", tmp_path / "stiff.yaml", *command, "--save", tmp_path / "a.csv")
+    program = run("rollout", f"{PENDULUM}@{tmp_path}/stiff.yaml", *command, "--save", tmp_path / "a.csv")
 
     assert (program.returncode, program.stderr) == (0, "")
     assert "end               horizon" in program.stdout
@@ -197,3 +197,17 @@ def test_scenarios_are_found_from_the_current_directory(tmp_path: Path) -> None:
         text=True,
     )
     assert DAMPING in result.stdout, result.stderr
+
+
+def test_a_module_of_the_current_directory_does_not_take_the_place_of_another(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text("print('has run')\nfrom tests.testbeds import PendulumScenario as Mine\n")
+    for command in (["-m", "vtbdrake.cli"], ["-c", "from vtbdrake.cli import main; main()"]):
+        result = subprocess.run(
+            [sys.executable, *command, "variables", "wave:Mine"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert (result.returncode, result.stdout) == (2, "")
+        assert "wave has no scenario 'Mine'" in result.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,15 @@ import pytest
 
 from tests.cli.program import run
 from tests.control.recording.servo import Servo
+from vtbdrake.control.lcm_wire import decode
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
+from vtbdrake.control.recording.log_events import LogEvents
+from vtbdrake.control.recording.log_format import LOG, LogError, event
+from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.recorder import Recorder
+from vtbdrake.control.recording.replay import replay
+
+SCENARIO = ("--scenario", "tests.control.scripted:ServoScenario")
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +33,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "velocity.csv"
-    program = run("replay", path, "--record", "dps.velocity", "--out", out)
+    program = run("replay", path, *SCENARIO, "--record", "dps.velocity", "--out", out)
     assert program.returncode == 0, program.stderr
     assert "20 cycles replayed, 0 digests of the state: identical" in program.stdout
     table = pandas.read_csv(out)
@@ -33,17 +42,38 @@ def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path
 
 
 def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
-    assert "identical" in run("replay", path, "--on", "testbed").stdout
-    program = run("replay", path, "--set", "dps.gain=1.5")
+    assert "identical" in run("replay", path, *SCENARIO, "--on", "testbed").stdout
+    program = run("replay", path, *SCENARIO, "--set", "dps.gain=1.5")
     assert program.returncode == 0 and "not compared" in program.stdout
 
 
 def test_a_damaged_log_is_replayed_up_to_the_damage_and_told(path: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.lcm"
     damaged.write_bytes(path.read_bytes()[:-300])
-    program = run("replay", damaged)
+    program = run("replay", damaged, *SCENARIO)
     assert program.returncode == 0 and "identical" in program.stdout
     assert "the file ends in the middle of an event" in program.stderr
+
+
+def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "foreign.py").write_text(f"open({str(tmp_path / 'has_run')!r}, 'w')\n")
+    header = read_log(path).header
+    events = LogEvents(path)
+    message = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
+    message.header = header.to_json().replace("tests.control.scripted:ServoScenario", "foreign:Scenario")
+    crc = zlib.crc32(message.header.encode())
+    message.crc = crc - (1 << 32) if crc >> 31 else crc
+    first_end = events.on(LOG)[0][3]
+    log = tmp_path / "foreign.lcm"
+    log.write_bytes(event(0, 0, LOG.encode(), message.encode()) + path.read_bytes()[first_end:])
+    assert read_log(log).header.scenario_name == "foreign:Scenario"
+    with pytest.raises(LogError, match="runs its code: if you trust it, import it first"):
+        replay(log)
+    for command in (("replay", log), ("export", log, tmp_path / "a.csv"), ("replay", log, *SCENARIO)):
+        program = run(*command, cwd=tmp_path)
+        assert "Traceback" not in program.stderr and not (tmp_path / "has_run").exists()
+    assert run("replay", log, "--scenario", "foreign:Scenario", cwd=tmp_path).returncode == 2
+    assert (tmp_path / "has_run").exists()
 
 
 def test_export_writes_every_format(path: Path, tmp_path: Path) -> None:
@@ -60,6 +90,11 @@ def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
         (("replay", tmp_path / "no.lcm"), "is no log of a control loop"),
         (("replay", tmp_path / "nowhere.lcm"), "No such file"),
         (("replay", path, "--record", "dps.gain"), "give both or neither"),
+        (("replay", path), f"if you trust it, say {' '.join(SCENARIO)}"),
+        (
+            ("replay", path, "--scenario", "tests.testbeds:PendulumScenario"),
+            "is of the scenario tests.control.scripted",
+        ),
         (("export", path, tmp_path / "run.xls"), "ends in .csv or .mcap or .parquet"),
     ]:
         program = run(*arguments)

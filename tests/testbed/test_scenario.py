@@ -1,5 +1,6 @@
 """Scenarios travel as plain data; a file that does not fit is refused with the reason."""
 
+import os
 import pickle
 
 import numpy as np
@@ -10,6 +11,8 @@ from vtbdrake.state import AddressError
 from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
 
 NAME = "tests.testbeds:AcrobotScenario"
+# Ten lines that stand for ten thousand million entries.
+LAUGHS = "  x0: &x0 1\n" + "".join(f"  x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 10)}]\n" for i in range(1, 11))
 
 
 def test_a_scenario_survives_file_and_pickle(tmp_path):
@@ -38,7 +41,10 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
         (f"{NAME}:\n  simulator:\n    integration_scheme: magic\n", "is one of bogacki_shampine3, cenic"),
         (f"{NAME}:\n  simulator:\n    accuracy: 0.0\n", "positive max_step_size and accuracy"),
         ("tests.testbeds:Nothing:\n  period: 0.1\n", "no scenario 'Nothing'; it has: .*AcrobotScenario"),
-        ("nowhere.at.all:Nothing:\n  period: 0.1\n", "cannot import nowhere.at.all"),
+        ("nowhere.at.all:Nothing:\n  period: 0.1\n", "to import its module runs its code: .* nowhere.at.all:Nothing@"),
+        ("a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n", "named package.module:Class"),
+        ("a:\n" + LAUGHS, "more than 100000 entries"),
+        ("[" * 5000, "is not YAML"),
         ("period: 0.1\nother: 1\n", "must have one key"),
         ("[1, 2", "is not YAML"),
         ("", "must have one key"),
@@ -47,6 +53,26 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
 def test_a_bad_file_is_refused(tmp_path, text, message):
     (tmp_path / "s.yaml").write_text(text)
     with pytest.raises(ScenarioError, match=message):
+        load_scenario(tmp_path / "s.yaml")
+
+
+def test_the_user_may_name_the_class_of_a_file(tmp_path):
+    AcrobotScenario(period=0.05).save(tmp_path / "s.yaml")
+    assert load_scenario(f"{NAME}@{tmp_path / 's.yaml'}") == AcrobotScenario(period=0.05)
+    with pytest.raises(ScenarioError, match="not of tests.testbeds:PendulumScenario"):
+        load_scenario(f"tests.testbeds:PendulumScenario@{tmp_path / 's.yaml'}")
+
+
+def test_a_module_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
+    (tmp_path / "broken_module.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ScenarioError, match="cannot import broken_module, .*ZeroDivisionError"):
+        load_scenario("broken_module:Scenario")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "s.yaml")
+    with pytest.raises(ScenarioError, match="no file of YAML"):
         load_scenario(tmp_path / "s.yaml")
 
 

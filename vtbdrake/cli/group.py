@@ -101,14 +101,22 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 def main(traceback: bool) -> None:
     """Virtual testbeds on Drake: look at one, simulate it, ask it questions.
 
-    A SCENARIO is package.module:Class, found from the current directory, or a YAML file that names one.
+    A SCENARIO is package.module:Class, or package.module:Class@FILE with its fields in a YAML file. Its module is
+    looked for in the current directory last.
 
     \b
     Example:
       vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match mass
     """
     logging.getLogger("drake").setLevel(logging.WARNING)
-    # As `python -m` does, and the installed program does not.
+    _look_here_last()
+
+
+def _look_here_last() -> None:
+    """Lets modules be found in the current directory, if they are nowhere else: what lies there by chance, or came with
+    somebody's log, must not take the place of an installed module."""
     here = os.getcwd()
-    if here not in sys.path and "" not in sys.path:
-        sys.path.insert(0, here)
+    if not sys.flags.safe_path and sys.path[:1] in ([""], [here]):
+        del sys.path[0]  # Put there by `python -m`.
+    if here not in sys.path:
+        sys.path.append(here)

@@ -14,10 +14,16 @@ from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.replay import replay
 from vtbdrake.control.recording.replay_report import DIFFERENT
 from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed.scenario import scenario_class
 
 
 @click.command("replay")
 @click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--scenario",
+    metavar="MODULE:CLASS",
+    help="The scenario that the log is of. Its code runs, so it is you who names it; the log has its fields.",
+)
 @click.option(
     "--on",
     type=click.Choice(["recorded", "dps", "testbed"]),
@@ -30,18 +36,35 @@ from vtbdrake.testbed import DpsAlone
 @click.option(
     "--out", callback=output(*WRITERS), metavar="FILE", help="Where to write what was recorded (.csv or .npz)."
 )
-def replay_log(log: Path, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None) -> None:
+def replay_log(
+    log: Path,
+    scenario: str | None,
+    on: str,
+    values: tuple[Setting, ...],
+    record: tuple[str, ...],
+    out: Path | None,
+) -> None:
     """Replay a LOG and compare: the DPS commands the same, to the last bit, or it fails.
 
     With --set, a variable has another value throughout, and nothing is compared.
 
     \b
     Example:
-      vtbdrake replay run.lcm --record dps.impl.torque --out torque.csv
+      vtbdrake replay run.lcm --scenario diagrams.manipulator:ManipulatorScenario
     """
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS says what to read, --out FILE where to write it: give both or neither")
     found = read_log(log)
+    recorded = found.header.scenario_name
+    if scenario is None and recorded:
+        raise click.UsageError(
+            f"{log} is of the scenario {recorded}, and to import it runs its code: if you trust it, say "
+            f"--scenario {recorded}"
+        )
+    if scenario is not None:
+        if scenario != recorded:
+            raise click.UsageError(f"{log} is of the scenario {recorded or 'that nobody knows'}, not of {scenario}")
+        scenario_class(scenario)
     target = None if on == "recorded" else DpsAlone(found.scenario) if on == "dps" else found.scenario.build()
     report = replay(found, target, values=settings(values), record=record)
     if out is not None:

@@ -6,6 +6,7 @@ import copy
 import importlib
 import math
 import os
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 # Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
 _DRAKE = version("drake")
 _CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
+
+_LARGEST_FILE = 1 << 22  # bytes
+_MOST_NODES = 100_000
 
 
 class ScenarioError(ValueError):
@@ -144,23 +148,39 @@ class Scenario(ABC):
 
 
 def load_scenario(source: str | os.PathLike[str]) -> Scenario:
-    """The scenario that ``source`` names: ``package.module:Class``, or a YAML file that looks like ::
+    """Return the scenario that ``source`` names.
 
-        diagrams.space_climber:SpaceClimberScenario:
-          gravity: 3.71
+    Args:
+        source: ``package.module:Class``; ``package.module:Class@FILE``, where FILE is a YAML file with its fields; or
+            the file alone, if the class that it names is imported already. The file looks like ::
+
+                diagrams.space_climber:SpaceClimberScenario:
+                  gravity: 3.71
+
+            To import a module runs its code. So no module is imported because a file names it.
 
     Raises:
         ScenarioError: the class or file does not exist, a key of the file is unknown or occurs twice, or a value has
             the wrong type or is refused by the scenario.
     """
     text = os.fspath(source)
-    is_file = text.endswith((".yaml", ".yml"))
-    scenario = _load_yaml(Path(text)) if is_file else _scenario_class(text)()
+    name, at, file = text.partition("@")
+    if not (at and ":" in name):  # A file may have any name.
+        name, file = "", text
+    is_file = file.endswith((".yaml", ".yml"))
+    if name and not is_file:
+        raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
+    scenario = _load_yaml(Path(file), name) if is_file else scenario_class(text)()
     scenario.validate()
     return scenario
 
 
-def _scenario_class(name: str) -> type[Scenario]:
+def scenario_class(name: str) -> type[Scenario]:
+    """Return the scenario ``package.module:Class``; its module is imported, which runs its code.
+
+    Raises:
+        ScenarioError: there is no such, or its module cannot be imported.
+    """
     module_name, _, class_name = name.partition(":")
     if not module_name or not class_name:
         raise ScenarioError(f"a scenario is named package.module:Class, or by a .yaml file, not {name!r}")
@@ -170,6 +190,8 @@ def _scenario_class(name: str) -> type[Scenario]:
         raise ScenarioError(
             f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
         ) from error
+    except Exception as error:
+        raise ScenarioError(f"cannot import {module_name}, of the scenario {name}: {error!r}") from error
     found = getattr(module, class_name, None)
     if isinstance(found, type) and issubclass(found, Scenario) and isabstract(found):
         raise ScenarioError(f"{name} is no whole scenario: it lacks {', '.join(sorted(found.__abstractmethods__))}")
@@ -181,19 +203,38 @@ def _scenario_class(name: str) -> type[Scenario]:
     return found
 
 
-def _load_yaml(path: Path) -> Scenario:
+def is_imported(name: str) -> bool:
+    """Return whether the module of the scenario ``package.module:Class`` is imported in this process."""
+    return name.partition(":")[0] in sys.modules
+
+
+def _load_yaml(path: Path, named: str) -> Scenario:
+    """
+    Args:
+        path: the file.
+        named: the scenario that the user says it is of; empty if that is left to the file.
+    """
+    if not path.exists():
+        raise ScenarioError(f"there is no scenario file {path}")
+    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
+        raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
     try:
         document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
-    except FileNotFoundError as error:
-        raise ScenarioError(f"there is no scenario file {path}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path} is not YAML: {error}") from error
     if not isinstance(document, yaml.MappingNode) or len(document.value) != 1:
         raise ScenarioError(f"{path} must have one key, package.module:Class, with the scenario's fields below it")
-    _refuse_twins(document, path)
+    _check_nodes(document, path)
     name = document.value[0][0].value
+    if named and name != named:
+        raise ScenarioError(f"{path} is of the scenario {name}, not of {named}")
+    if not named and ":" in name and not is_imported(name):
+        raise ScenarioError(
+            f"{path} names the scenario {name}, and to import its module runs its code: if that is what you want, "
+            f"name it as {name}@{path}, or import it first"
+        )
     try:
-        schema = _scenario_class(name)
+        schema = scenario_class(name)
         _resolve_types(schema)
         return yaml_load_typed(schema=schema, filename=path, child_name=name)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
@@ -219,18 +260,26 @@ def _parts(hint: Any) -> Iterator[Any]:
         yield from _parts(argument)
 
 
-def _refuse_twins(node: yaml.Node, path: Path) -> None:
-    # Of two equal keys, YAML readers silently keep the last.
-    if isinstance(node, yaml.MappingNode):
-        keys = [key.value for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise ScenarioError(f"{path} has the key {key!r} twice, near line {node.start_mark.line + 1}")
-        for _, value in node.value:
-            _refuse_twins(value, path)
-    elif isinstance(node, yaml.SequenceNode):
-        for value in node.value:
-            _refuse_twins(value, path)
+def _check_nodes(document: yaml.Node, path: Path) -> None:
+    """
+    Raises:
+        ScenarioError: a key occurs twice, or a few aliases stand for very much.
+    """
+    waiting, count = [document], 0
+    while waiting:
+        node = waiting.pop()
+        count += 1
+        if count > _MOST_NODES:
+            raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, those by aliases included")
+        if isinstance(node, yaml.MappingNode):
+            # Of two equal keys, YAML readers silently keep the last.
+            keys = [str(key.value) for key, _ in node.value]
+            if len(set(keys)) < len(keys):
+                twice = next(key for key in keys if keys.count(key) > 1)
+                raise ScenarioError(f"{path} has the key {twice!r} twice, near line {node.start_mark.line + 1}")
+            waiting += [value for _, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.control.live.rig import PATIENCE, Rig, served
 from tests.control.scripted import PERIOD
-from vtbdrake.control.hub import Hub
+from vtbdrake.control.hub import Hub, client_name
 from vtbdrake.control.live.client import LiveClient, LiveError, SilenceError, watch
 from vtbdrake.control.live.desk import MAX_WAITING
 from vtbdrake.control.live.live_watch import LiveWatch
@@ -46,6 +46,38 @@ def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[
 
 
 # -- set and get
+
+
+def test_who_sets_next_on_a_protected_channel_gets_it() -> None:
+    with Hub(port=0, protect=["VTB_SET"], lease=0.1) as bus, served(bus.url) as (rig, _):
+        with LiveClient(bus.url, timeout=PATIENCE) as first, LiveClient(bus.url, timeout=PATIENCE) as second:
+            rig.during(first.set, {"dps.gain": 3.0})
+            rig.during(second.set, {"dps.gain": 4.0})
+            rig.during(first.set, {"dps.gain": 5.0})
+        rig.during(asked, bus.url, "set", {"dps.gain": 6.0})
+        assert rig.during(asked, bus.url, "get", ["dps.gain"]) == {"dps.gain": 6.0}
+        assert bus.statistics().protected["VTB_SET"].taken >= 2
+
+
+def test_who_is_not_let_to_set_is_told_by_whom(hub: Hub) -> None:
+    with Hub(port=0, protect=["VTB_SET"], lease=300.0) as bus:
+        owner = lcm.LCM(bus.url)
+        owner.publish("VTB_SET", b"")
+        told = f"lets {client_name(owner.fileno())} alone publish on VTB_SET"
+        with LiveClient(bus.url, timeout=0.5) as client, pytest.raises(SilenceError, match=told):
+            client.set({"dps.gain": 3.0})
+
+
+@pytest.mark.parametrize("noise", [b"", b"[1]", b"no", b"\xff", b"[" * 5000, b'{"id": 3}'])
+def test_what_is_no_answer_is_not_taken_for_one(hub: Hub, noise: bytes) -> None:
+    bus = lcm.LCM(hub.url)
+    with served(hub.url) as (rig, _), LiveClient(hub.url, timeout=PATIENCE) as client:
+        for channel in ("VTB_GET_ANSWER", "VTB_WATCH_ANSWER", "VTB_GET", "VTB_SET", "VTB_WATCH"):
+            bus.publish(channel, noise)
+        assert list(rig.during(client.get, ["dps.gain"])) == ["dps.gain"]
+        with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
+            bus.publish("VTB_WATCH_ANSWER", noise)
+            rig.during(live.wait, 3, timeout=PATIENCE)
 
 
 def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:

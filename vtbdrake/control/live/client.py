@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 import uuid
@@ -13,6 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.control.hub.statistics import Statistics
+from vtbdrake.control.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
+from vtbdrake.control.json_object import json_object
 from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
 
@@ -20,6 +22,7 @@ _CONNECT_TIMEOUT = 2.0  # s
 _BURST = 1000  # messages to take in at a time
 _SLICE = 0.05  # s; longest wait for a message before looking at the clock
 _REPEAT = 0.5  # s after which a request is said again
+_TAKE_AGAIN = 0.05  # s after which a channel that belongs to somebody else is asked for again
 
 Values = dict[str, float | NDArray[np.float64]]
 
@@ -52,11 +55,10 @@ class LiveClient:
         self._timeout = timeout
         self._answers: dict[str, dict[str, Any]] = {}
         self._waiting = ""
-        self._link = LcmLink(
-            url,
-            dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._hear),
-            connect_timeout=_CONNECT_TIMEOUT,
-        )
+        self._asked = -np.inf
+        self._owners: dict[str, str] = {}  # of the channels that a hub protects, and that others own
+        handlers = dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._hear)
+        self._link = LcmLink(url, {**handlers, STATUS_CHANNEL: self._hear_status}, connect_timeout=_CONNECT_TIMEOUT)
         self._link.open()
 
     def set(self, values: Mapping[str, ArrayLike]) -> None:
@@ -90,15 +92,20 @@ class LiveClient:
     def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
         self._waiting = _new_id()
         message = {"id": self._waiting, **request}
-        limit, asked = time.monotonic() + self._timeout, -np.inf
+        limit, self._asked = time.monotonic() + self._timeout, -np.inf
         while self._waiting not in self._answers:
             now = time.monotonic()
             if now >= limit:
-                raise _silence(self._link, self._timeout)
-            if now >= asked + _REPEAT:
+                raise _silence(self._link, self._timeout, channel, self._owners.get(channel))
+            if channel in self._owners and now >= self._asked + _TAKE_AGAIN:
+                # The hub refuses as long as the other one goes on publishing.
+                self._link.publish((TAKE_PREFIX + channel, b""))
+                self._asked = -np.inf
+                del self._owners[channel]
+            if now >= self._asked + _REPEAT:
                 # Who begins to serve just now has not heard it; who has, knows it by its id.
                 _publish(self._link, channel, message)
-                asked = now
+                self._asked = now
             self._link.take(_SLICE, _BURST)
         answer = self._answers.pop(self._waiting)
         if "error" in answer:
@@ -106,9 +113,18 @@ class LiveClient:
         return answer
 
     def _hear(self, channel: str, data: bytes) -> None:
-        answer = json.loads(data)
+        answer = _answer(data)
         if answer.get("id") == self._waiting:
             self._answers[self._waiting] = answer
+
+    def _hear_status(self, channel: str, data: bytes) -> None:
+        try:
+            protected = Statistics.from_json(data).protected
+        except (ValueError, TypeError, KeyError, AttributeError):
+            return  # Not of a hub; on other buses anybody may say it.
+        self._owners = {
+            name: state.owner for name, state in protected.items() if state.owner not in (None, self._link.name)
+        }
 
     def close(self) -> None:
         """Gives the connection back."""
@@ -161,7 +177,7 @@ def samples(
     received: deque[dict[str, Any]] = deque()
 
     def hear(channel: str, data: bytes) -> None:
-        message = json.loads(data)
+        message = _answer(data)
         if channel != WATCH + ANSWER or message.get("id") == request["id"]:
             received.append(message)
 
@@ -211,8 +227,18 @@ def _publish(link: LcmLink, channel: str, message: dict[str, Any]) -> None:
     link.publish((channel, data))
 
 
-def _silence(link: LcmLink, seconds: float) -> SilenceError:
+def _answer(data: bytes) -> dict[str, Any]:
+    """Return what is said on a channel of answers; empty if it is no JSON object, as whoever is on the bus may say."""
+    try:
+        return json_object(data, ValueError)
+    except ValueError:
+        return {}
+
+
+def _silence(link: LcmLink, seconds: float, channel: str = "", owner: str | None = None) -> SilenceError:
     what = "does a DPS run there (vtbdrake run)?" if link.connected else "the bus is lost"
+    if owner is not None:
+        what = f"the hub lets {owner} alone publish on {channel}, which goes on doing so"
     return SilenceError(f"nobody has answered on {link.url} for {seconds:g} s: {what}")
 
 

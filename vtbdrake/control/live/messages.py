@@ -16,8 +16,8 @@ all of them in one cycle. What is not finite is there as Python's ``json`` write
 watches nothing (an empty list) has ended. ``{"id": ID, "ended": true}`` tells that the DPS has. A reset releases the
 latch of the guards, unless a cause persists; what it had latched for is told.
 
-Whoever is on the bus may say these things, but for the channels that a hub protects: ``vtbdrake hub --protect
-VTB_RESET``.
+Whoever is on the bus may say these things. ``vtbdrake hub`` protects VTB_SET and VTB_RESET: one client at a time uses
+them, the next one half a second later.
 """
 
 from __future__ import annotations
@@ -101,6 +101,13 @@ def parse(channel: str, data: bytes) -> Request:
     Raises:
         RequestError: it is none.
     """
+    try:
+        return _request(channel, data)
+    except RecursionError:
+        raise RequestError("a request is nested too deep: a value is a number, or a list of such") from None
+
+
+def _request(channel: str, data: bytes) -> Request:
     message = _parsed(data)
     id = message.get("id")
     if not isinstance(id, str) or not _ID.fullmatch(id):

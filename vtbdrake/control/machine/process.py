@@ -99,7 +99,7 @@ class MachineProcess:
             with theirs, tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "scenario.yaml"
                 self.scenario.save(file)
-                order = {"scenario": str(file), "config": _plain(self.config), **self._run}
+                order = {"scenario": f"{self.scenario.name()}@{file}", "config": _plain(self.config), **self._run}
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", program, str(theirs.fileno()), json.dumps(order)],
                     pass_fds=[theirs.fileno()],

@@ -15,6 +15,7 @@ from typing import Any
 from vtbdrake.control.recording.log_format import VERSION, LogError, LoggedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, Signal, VirtualTestbed, load_scenario
+from vtbdrake.testbed.scenario import is_imported
 
 _log = logging.getLogger(__name__)
 
@@ -102,23 +103,32 @@ class LogHeader:
         except (ValueError, TypeError, KeyError) as error:
             raise LogError(f"the log's header cannot be read: {error!r}") from error
 
+    @property
+    def scenario_name(self) -> str:
+        """Return ``package.module:Class`` of the scenario; empty if the log does not tell how to build one."""
+        return str(self.record.get("scenario", "")) if self.scenario else ""
+
     def make_scenario(self) -> Scenario:
-        """The scenario that was recorded.
+        """Return the scenario that was recorded. Its module must be imported already.
 
         Raises:
-            LogError: it cannot be found or loaded, or is another one by now.
+            LogError: it is not imported, cannot be loaded, or is another one by now.
         """
         if not self.scenario:
             raise LogError("the log does not tell how its scenario is built: give what it is to be replayed with")
+        name = self.scenario_name
+        if not is_imported(name):
+            raise LogError(
+                f"the log is of the scenario {name}, and to import its module runs its code: if you trust it, import "
+                f"it first, or name it on the command line (vtbdrake replay FILE --scenario {name})"
+            )
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scenario.yaml"
             path.write_text(self.scenario)
             try:
-                scenario = load_scenario(path)
+                scenario = load_scenario(f"{name}@{path}")
             except ScenarioError as error:
-                raise LogError(
-                    f"the scenario of the log, {self.record['scenario']}, is not to be had in this version: {error}"
-                ) from error
+                raise LogError(f"the scenario of the log, {name}, is not to be had in this version: {error}") from error
         self.check(scenario)
         return scenario
 
