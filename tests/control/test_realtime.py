@@ -15,13 +15,14 @@ from typing import Any
 import pytest
 
 from vtbdrake.control.realtime import RealTime
+from vtbdrake.control.runaway import EXIT_CODE
 
 ROOT = Path(__file__).resolve().parents[2]
 
 LATENCY = "/dev/cpu_dma_latency"  # us that a processor may take to wake up
 
 STATE = """
-import ctypes, gc, json, os, re, sys
+import ctypes, gc, json, os, re, resource, signal, sys
 from vtbdrake.control.realtime import RealTime, RealTimeError
 
 def state():
@@ -35,6 +36,8 @@ def state():
         "frozen": gc.get_freeze_count() > 0,
         "switch": sys.getswitchinterval(),
         "slack": ctypes.CDLL(None).prctl(30, 0, 0, 0, 0),
+        "rttime": list(resource.getrlimit(resource.RLIMIT_RTTIME)),
+        "xcpu": str(signal.getsignal(signal.SIGXCPU)),
     }
 
 def tell(**values):
@@ -75,7 +78,7 @@ def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
         "with RealTime(priority=42, cpus={before['cpus'][0]}, awake=False) as r: inside = state()\n"
         "tell(before=before, inside=inside, after=state(), granted=[g.granted for g in r.grants])"
     )
-    assert states["granted"] == [True] * 6
+    assert states["granted"] == [True] * 7
     assert states["after"] == states["before"]
     inside = states["inside"]
     assert inside["policy"] & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
@@ -134,6 +137,79 @@ def test_what_was_set_before_stays_set_after_an_inner_one() -> None:
     )
     assert states["after"] == states["before"]
     assert states["inside"]["priority"] == 20
+
+
+RUNAWAY = """
+import collections, itertools
+import numpy as np
+import vtbdrake.control.realtime
+from tests.control.scripted import PERIOD, ScriptedBridge, Servo, ServoScenario
+from vtbdrake.control.clock import WallClock
+from vtbdrake.control.realtime import RealTime, RunawayError
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import DpsAlone
+
+class EndlessServo(Servo):
+    def _update(self, context, discrete):
+        super()._update(context, discrete)
+        if context.get_discrete_state(1).value() == 20.0:
+            END
+
+class EndlessScenario(ServoScenario):
+    def make_dps(self):
+        return EndlessServo()
+
+scenario, clock = EndlessScenario(rate=0.0), WallClock()
+bridge = ScriptedBridge(scenario.interface(), clock, lambda t: {"position": [0.0, 0.0], "speed": [0.0, 0.0]})
+runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock)
+runtime.write({"u.target": [0.2, 0.2]})
+runtime.cycle()
+runtime.switch("real")
+"""
+
+
+@privileged
+def test_step_in_python_that_never_ends_is_ended_and_the_fallback_goes_out() -> None:
+    found = told(
+        RUNAWAY.replace("END", "while True: pass") + "before = state()\n"
+        "try:\n"
+        "    with RealTime(longest_step=0.3, awake=False) as r: runtime.run(cycles=1000)\n"
+        "except RunawayError as error: reason = str(error)\n"
+        "tell(before=before, after=state(), reason=reason, sent=bridge.sent[-1][1]['velocity'].tolist(),\n"
+        "     latched=str(runtime.guards.latched[0]), commanded=bridge.sent[-2][1]['velocity'].tolist())"
+    )
+    assert "computed for 0.3 s without waiting once" in found["reason"]
+    assert found["latched"] == "the loop ended"
+    assert found["commanded"] == [1.0, 1.0] and found["sent"] == [0.0, 0.0]
+    assert found["after"] == found["before"]
+
+
+@privileged
+@pytest.mark.parametrize("main", [True, False])
+def test_step_in_native_code_that_never_ends_is_told_and_ended_with_its_process(main: bool) -> None:
+    run = "    with RealTime(longest_step=0.2, awake=False) as r: runtime.run(cycles=1000)\n"
+    code = "import threading\ndef work():\n" + run + ("work()" if main else "threading.Thread(target=work).start()")
+    native = RUNAWAY.replace("END", "collections.deque(itertools.repeat(0), maxlen=0)")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", STATE + native + code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert result.returncode == EXIT_CODE
+    assert "in _update" in result.stderr
+    assert "computes without end" in result.stderr
+
+
+@privileged
+def test_limit_that_is_there_already_is_refused_or_kept_and_others_come_back() -> None:
+    states = told(
+        "resource.setrlimit(resource.RLIMIT_RTTIME, (3_000_000, 4_000_000))\n"
+        "before = state()\n"
+        "with RealTime(longest_step=5.0, awake=False) as r: refused = [str(g) for g in r.grants if not g.granted]\n"
+        "with RealTime(longest_step=2.5, awake=False): inside = state()\n"
+        "tell(before=before, refused=refused, inside=inside, after=state())"
+    )
+    assert states["refused"][0].startswith("steps of 5 s at most: refused (EINVAL, only 4 s are allowed): ")
+    assert states["inside"]["rttime"] == [2_500_000, 4_000_000]
+    assert states["after"] == states["before"]
 
 
 @as_root
@@ -214,6 +290,7 @@ def test_what_is_not_asked_for_is_left_alone() -> None:
         ({"priority": 100}, "1 to 99, not at 100"),
         ({"cpus": set()}, "at least one processor"),
         ({"switch_interval": 0.0}, "positive time"),
+        ({"longest_step": 0.0}, "above 0 and below 1000 s, not at 0.0 s"),
     ],
 )
 def test_request_that_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:

@@ -32,7 +32,7 @@ from vtbdrake.control.guard import Guards
 from vtbdrake.control.live.service import LiveService
 from vtbdrake.control.operation import operation_of, take_over
 from vtbdrake.control.protocol import protocol_of
-from vtbdrake.control.realtime import RealTime
+from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.state import Snapshot
@@ -182,6 +182,8 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
         _log.info("the DPS commands; its time is %s s", number(runtime.time))
         runtime.run(seconds=seconds)
         runtime.send_fallback("the time is up")
+    except RunawayError as error:
+        raise FailedError(one_line(error)) from error
     except SwitchRefusedError as error:
         raise FailedError(f"not switched to the machine {one_line(error)}") from error
     except KeyboardInterrupt:

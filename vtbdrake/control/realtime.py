@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import faulthandler
 import gc
 import os
 import re
+import resource
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from types import FrameType, TracebackType
+from typing import NoReturn, Self
+
+from vtbdrake.control import runaway
 
 
 class RealTimeError(RuntimeError):
     """Something that was required was refused."""
+
+
+class RunawayError(BaseException):
+    """A thread under SCHED_FIFO has computed for longer than it may without waiting once: it is in an endless loop.
+
+    It is no `Exception`, so that it ends the loop (which says farewell) and is not taken for a fault of one step, which
+    would be tried again.
+    """
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,10 @@ class RealTime:
             It costs power.
         collect_garbage: whether Python's garbage collector goes on. What refers to itself is not freed while it rests.
         switch_interval: after how many seconds a thread that waits for the GIL asks for it; None leaves it alone.
+        longest_step: processor time in seconds that a thread under SCHED_FIFO may take without waiting; None sets no
+            limit. Beyond it, the stacks of all threads are written to stderr, and `RunawayError` is raised in the main
+            thread. Where that does not help within a second, because the thread is stuck in C++, or at once where the
+            thread is not the main one, the process ends: else nothing else would run on its processor, for ever.
         require: whether a refusal is an error.
 
     Attributes:
@@ -78,6 +96,7 @@ class RealTime:
         awake: bool = True,
         collect_garbage: bool = False,
         switch_interval: float | None = 5e-5,
+        longest_step: float | None = 2.0,
         require: bool = False,
     ) -> None:
         if priority is not None and not 1 <= priority <= 99:
@@ -86,6 +105,8 @@ class RealTime:
             raise ValueError("a thread needs at least one processor to run on: give cpus={0}, for example, or None")
         if switch_interval is not None and not switch_interval > 0.0:
             raise ValueError(f"the switch interval is a positive time, not {switch_interval} s")
+        if longest_step is not None and not 0.0 < longest_step < _LONGEST_STEP:
+            raise ValueError(f"the longest step lies above 0 and below {_LONGEST_STEP:g} s, not at {longest_step} s")
         self.grants: tuple[Grant, ...] = ()
         self._require = require
         self._requests: list[tuple[str, Callable[[], AbstractContextManager[None]], str]] = []
@@ -103,6 +124,9 @@ class RealTime:
         self._requests.append(("timer slack 1 ns", _timer_slack, _SLACK))
         if priority is not None:
             self._requests.append((f"SCHED_FIFO {priority}", partial(_fifo, priority), _FIFO))
+        if priority is not None and longest_step is not None:
+            text = f"steps of {longest_step:g} s at most"
+            self._requests.append((text, partial(_limited_steps, longest_step), _STEPS))
         self._undo = ExitStack()
 
     def __enter__(self) -> Self:
@@ -129,6 +153,8 @@ class RealTime:
 
 
 _LATENCY = "/dev/cpu_dma_latency"
+_STDERR = 2
+_LONGEST_STEP = 1000.0
 
 _FIFO = (
     "run as root, or give the user rtprio in /etc/security/limits.conf, or the container --cap-add SYS_NICE "
@@ -140,6 +166,7 @@ _MEMORY = (
 )
 _CPUS = "choose from those that the process may use (os.sched_getaffinity(0)), or widen the container's cpuset"
 _AWAKE = f"run as root, or let the user write to {_LATENCY}; in a container, --device {_LATENCY}"
+_STEPS = "get SCHED_FIFO first; give the user a higher rttime in /etc/security/limits.conf (see ulimit -R), or set longest_step below it"
 _SLACK = "use a kernel that has PR_SET_TIMERSLACK"
 
 
@@ -232,6 +259,37 @@ def _timer_slack() -> Iterator[None]:
     finally:
         # Under SCHED_FIFO a thread has none, and cannot be given any: the kernel answers 0.
         libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(before), 0, 0, 0)
+
+
+@contextmanager
+def _limited_steps(seconds: float) -> Iterator[None]:
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        raise OSError(errno.EINVAL, "without SCHED_FIFO there is nothing to limit")
+    before, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+    limit = round(1e6 * seconds)
+    if most != resource.RLIM_INFINITY and limit > most:
+        raise OSError(errno.EINVAL, f"only {1e-6 * most:g} s are allowed")
+    main = threading.current_thread() is threading.main_thread()
+    # In another thread, Python could raise nothing that ends the step.
+    handler = signal.signal(signal.SIGXCPU, partial(_raise_runaway, seconds)) if main else None
+    runaway.install(1 if main else 0)
+    faulthandler.register(signal.SIGXCPU, file=_STDERR, chain=True)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (limit, most))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_RTTIME, (before, most))
+        faulthandler.unregister(signal.SIGXCPU)
+        runaway.uninstall()
+        if main:
+            signal.signal(signal.SIGXCPU, handler)
+
+
+def _raise_runaway(seconds: float, number: int, frame: FrameType | None) -> NoReturn:
+    raise RunawayError(
+        f"a real-time thread has computed for {seconds:g} s without waiting once: its step does not end, or needs a "
+        "larger RealTime(longest_step=...)"
+    )
 
 
 @contextmanager
