@@ -166,7 +166,10 @@ _MEMORY = (
 )
 _CPUS = "choose from those that the process may use (os.sched_getaffinity(0)), or widen the container's cpuset"
 _AWAKE = f"run as root, or let the user write to {_LATENCY}; in a container, --device {_LATENCY}"
-_STEPS = "get SCHED_FIFO first; give the user a higher rttime in /etc/security/limits.conf (see ulimit -R), or set longest_step below it"
+_STEPS = (
+    "get SCHED_FIFO first; then give the user a higher rttime in /etc/security/limits.conf, or choose longest_step "
+    "below it (ulimit -R tells, in us)"
+)
 _SLACK = "use a kernel that has PR_SET_TIMERSLACK"
 
 
