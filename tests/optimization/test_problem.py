@@ -8,6 +8,7 @@ import pytest
 import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import ArchiveError
+from vtbdrake.state.archive import write_archive
 
 THETA = "sim.sys.Pendulum.theta.position"
 OMEGA = "sim.sys.Pendulum.theta.velocity"
@@ -106,6 +107,9 @@ def test_a_sweep_survives_its_file(tmp_path):
     (tmp_path / "half.vtb").write_bytes((tmp_path / "sweep.vtb").read_bytes()[:1000])
     with pytest.raises(ArchiveError, match="damaged"):
         vtb.Sweep.load(tmp_path / "half.vtb")
+    write_archive(tmp_path / "other.vtb", kind="vtbdrake sweep", version=3, header={"parameters": []}, arrays={})
+    with pytest.raises(ArchiveError, match="it has no 'conditions'"):
+        vtb.Sweep.load(tmp_path / "other.vtb")
 
 
 def test_a_sweep_is_a_table():

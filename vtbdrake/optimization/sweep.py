@@ -232,7 +232,10 @@ class Sweep:
         Raises:
             ArchiveError: the file is not a sweep, is damaged, or was written by another version.
         """
-        header, arrays = read_archive(path, kind=KIND, version=VERSION)
+        return read_archive(path, kind=KIND, version=VERSION, make=cls._from_parts)
+
+    @classmethod
+    def _from_parts(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Sweep:
         parameters = tuple(Parameter(**parameter) for parameter in header["parameters"])
         conditions = tuple(header["conditions"])
         points, condition = arrays["points"], arrays["condition"]

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import zipfile
-import zlib
-from collections.abc import Mapping
-from pathlib import Path
-from typing import IO, Any
+from collections.abc import Callable, Mapping
+from typing import IO, Any, TypeVar
 
 import numpy as np
 
 from vtbdrake.state.files import whole_file
 
 _HEADER = "header.json"
+_ARRAY = ".npy"
+# What any file may unpack to, in bytes.
+LARGEST = 1 << 30
+T = TypeVar("T")
 
 
 class ArchiveError(ValueError):
@@ -30,50 +33,114 @@ def write_archive(
     header: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
-    """Writes ``arrays`` and ``header`` (plain data) as a file of ``kind``."""
-    with whole_file(path) as partial:
-        _write(partial, kind, version, header, arrays)
+    """Write ``arrays`` and ``header`` (plain data) as a file of ``kind``.
+
+    Raises:
+        ValueError: they would not be read again, see `read_archive`.
+    """
+    with whole_file(path) as partial, partial.open("wb") as file:
+        _write(file, kind, version, header, arrays)
 
 
 def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """What `write_archive` would write."""
+    """Return what `write_archive` would write."""
     buffer = io.BytesIO()
     _write(buffer, kind, version, header, arrays)
     return buffer.getvalue()
 
 
 def _write(
-    file: Path | IO[bytes], kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    file: IO[bytes], kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, **header}))
+        archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, "arrays": len(arrays), **header}))
         for key, value in arrays.items():
-            with archive.open(f"{key}.npy", "w") as entry:
+            with archive.open(f"{key}{_ARRAY}", "w") as entry:
                 np.lib.format.write_array(entry, value, allow_pickle=False)
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > _most(file.tell()):
+        raise ValueError(
+            f"{size} bytes that can be packed into {file.tell()} would not be read again, for fear of a compression "
+            "bomb: save less at once"
+        )
+
+
+def _most(packed: int) -> int:
+    """Return what a file of ``packed`` bytes may unpack to; deflate can pack a thousand equal bytes into one."""
+    return max(LARGEST, 100 * packed)
 
 
 def read_archive(
-    source: str | os.PathLike[str] | bytes, *, kind: str, version: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, arrays) of what `write_archive` wrote, or of the bytes of it.
+    source: str | os.PathLike[str] | bytes,
+    *,
+    kind: str,
+    version: int,
+    make: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
+) -> T:
+    """Return what ``make(header, arrays)`` makes of what `write_archive` wrote, or of the bytes of it.
+
+    Args:
+        make: may assume that the file is as it should be: what it raises says that it is not.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ArchiveError: it is damaged, of another kind, or of another version.
+        ArchiveError: the file is damaged, of another kind, or of another version, or it would take a lot more memory
+            than it has bytes (more than 1 GiB and than a hundred times as much).
     """
     path = f"an archive of {len(source)} bytes" if isinstance(source, bytes) else source
     try:
         with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
+            _check_entries(archive)
             header = json.loads(archive.read(_HEADER))
-            if not isinstance(header, dict) or (header.get("kind"), header.get("version")) != (kind, version):
-                raise ArchiveError(f"{path} is not a {kind} of version {version}, but says of itself: {header}")
-            arrays = {}
-            for name in archive.namelist():
-                if name != _HEADER:
-                    with archive.open(name) as entry:
-                        arrays[name.removesuffix(".npy")] = np.lib.format.read_array(entry, allow_pickle=False)
-            return header, arrays
+            found = header.pop("kind"), header.pop("version")
+            if found != (kind, version):
+                raise ArchiveError(
+                    f"{path} is not a {kind} of version {version}, but a {found[0]} of version {found[1]}"
+                )
+            names = [name for name in archive.namelist() if name != _HEADER]
+            # A zip does not say how many entries it has; older files do not, either.
+            if header.pop("arrays", len(names)) != len(names):
+                raise ValueError(f"only {len(names)} of its arrays are left")
+            return make(header, {name.removesuffix(_ARRAY): _array(archive.read(name)) for name in names})
     except (FileNotFoundError, ArchiveError):
         raise
-    except (zipfile.BadZipFile, zlib.error, LookupError, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise ArchiveError(f"{path} is not a {kind}, or it is damaged: {error}") from error
+    except Exception as error:  # A damaged file can cause any.
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        raise ArchiveError(f"{path} is not a {kind}, or it is damaged: {reason}") from error
+
+
+def _check_entries(archive: zipfile.ZipFile) -> None:
+    """
+    Raises:
+        ValueError: there is an entry that `write_archive` has not written, or all would take too much memory.
+    """
+    entries = archive.infolist()
+    for entry in entries:
+        if entry.compress_type not in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
+            raise ValueError(f"the entry {entry.filename} is not packed by deflate")
+        if entry.filename != _HEADER and not entry.filename.endswith(_ARRAY):
+            raise ValueError(f"the entry {entry.filename} is no array")
+    if len({entry.filename for entry in entries}) < len(entries):
+        raise ValueError("two entries have one name")
+    assert archive.fp is not None
+    size, packed = sum(entry.file_size for entry in entries), archive.fp.seek(0, os.SEEK_END)
+    if size > _most(packed):
+        raise ValueError(f"its {packed} bytes unpack to {size}, more than the {_most(packed)} that are read")
+
+
+def _array(data: bytes) -> np.ndarray:
+    """
+    Raises:
+        ValueError: the data are not the array that their header declares.
+    """
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"an array of format {version}")
+    shape, fortran_order, dtype = readers[version](file)
+    expected = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or min(shape, default=0) < 0 or len(data) - file.tell() != expected:
+        raise ValueError(f"an array of shape {shape} and type {dtype} is not in {len(data) - file.tell()} bytes")
+    # The array must be writable, and not keep the bytes.
+    return np.frombuffer(data, dtype, offset=file.tell()).reshape(shape, order="F" if fortran_order else "C").copy()

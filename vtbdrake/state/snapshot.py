@@ -23,7 +23,7 @@ KIND = "vtbdrake snapshot"
 VERSION = 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """The state s(t) = [x, a] of a whole Diagram at one time.
 
@@ -34,8 +34,8 @@ class Snapshot:
         groups: every numeric group and, through its codec, every abstract state of every leaf system, under
             ``path/group/index`` and ``path/abstract/index/name``.
 
-    Arrays are read only. What Drake hides from Python (the last step's contact results of a discrete plant) is not
-    part of it.
+    Two snapshots are equal if all of that is, where NaN equals NaN. Arrays are read only. What Drake hides from
+    Python (the last step's contact results of a discrete plant) is not part of it.
     """
 
     time: float
@@ -53,6 +53,14 @@ class Snapshot:
     def __reduce__(self) -> tuple[Any, ...]:
         return Snapshot, (self.time, dict(self.values), dict(self.groups), dict(self.scenario))
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Snapshot):
+            return NotImplemented
+        return self.scenario == other.scenario and not self.compare(other)
+
+    # It is made of arrays, which have no hash.
+    __hash__ = None  # type: ignore[assignment]
+
     def __getitem__(self, address: str) -> np.ndarray:
         """The value of an addressed variable."""
         return self.values[address]
@@ -60,15 +68,15 @@ class Snapshot:
     def compare(self, other: Snapshot) -> dict[str, float]:
         """Where two snapshots differ: the largest absolute difference by address or group.
 
-        ``inf`` stands where only one of them has the entry, or it has another shape; equal entries (NaN equals
-        NaN) are left out, so that ``not a.compare(b)`` says that they are identical.
+        ``inf`` stands where only one of them has the entry, it has another shape, or it is not of real numbers. Equal
+        entries (NaN equals NaN) are left out, so that ``not a.compare(b)`` says that they are identical.
         """
         differences = {} if self.time == other.time else {"time": abs(self.time - other.time)}
         for mine, theirs in ((self.values, other.values), (self.groups, other.groups)):
             for key in [*mine, *(key for key in theirs if key not in mine)]:
                 if key not in mine or key not in theirs or mine[key].shape != theirs[key].shape:
                     differences[key] = np.inf
-                elif not np.array_equal(mine[key], theirs[key], equal_nan=mine[key].dtype.kind == "f"):
+                elif not np.array_equal(mine[key], theirs[key], equal_nan=mine[key].dtype.kind in "fc"):
                     differences[key] = _largest_difference(mine[key], theirs[key])
         return differences
 
@@ -92,15 +100,22 @@ class Snapshot:
         Raises:
             ArchiveError: it is not a snapshot, is damaged, or was written by another version.
         """
-        header, arrays = read_archive(source, kind=KIND, version=VERSION)
+        return read_archive(source, kind=KIND, version=VERSION, make=cls._from_parts)
+
+    @classmethod
+    def _from_parts(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Snapshot:
         parts: dict[str, dict[str, np.ndarray]] = {"values": {}, "groups": {}}
         for name, array in arrays.items():
             part, key = name.split("/", 1)
             parts[part][key] = array
-        return cls(header["time"], parts["values"], parts["groups"], header["scenario"])
+        if not isinstance(header["scenario"], dict):
+            raise ValueError(f"its scenario is {header['scenario']!r}")
+        return cls(float(header["time"]), parts["values"], parts["groups"], header["scenario"])
 
 
 def _largest_difference(a: np.ndarray, b: np.ndarray) -> float:
+    if a.dtype.kind not in "biuf" or b.dtype.kind not in "biuf":
+        return np.inf
     difference = np.abs(a.astype(float) - b.astype(float))
     return float(np.where(np.isnan(difference), np.inf, difference).max())
 
