@@ -6,13 +6,16 @@ from math import isfinite
 
 from diagrams.answers import Answer
 from diagrams.space_climber.payload import (
+    EARTH,
     ENVIRONMENTS,
     MOON,
     PAPER,
     PHASES,
+    find_limit,
     locked_problem,
     payload_problem,
     static_limit,
+    statics,
 )
 from vtbdrake.optimization import Boundary
 
@@ -29,14 +32,14 @@ def payload(full: bool) -> Answer:
     boundaries = {}
     for name, fields in ENVIRONMENTS.items():
         phases = PHASES if full or name == MOON else PHASES[::2]
-        problem = payload_problem(phases=phases, **fields)
-        boundaries[name] = problem.boundary(resolution=0.5 if full else 1.0, coarse=5.0)
+        boundaries[name] = find_limit(payload_problem(phases=phases, **fields), resolution=0.5 if full else 1.0)
     moon = boundaries[MOON]
     locked = locked_problem()
-    statics = static_limit(locked.testbed)
+    static = static_limit(locked.testbed)
     simulated = locked.boundary(resolution=LOCKED_STEP, coarse=10.0)
-    agrees = simulated.lower - LOCKED_STEP <= statics <= simulated.upper + LOCKED_STEP
+    agrees = simulated.lower - LOCKED_STEP <= static <= simulated.upper + LOCKED_STEP
     environments = "; ".join(f"{name} {_range(boundary)}" for name, boundary in boundaries.items())
+    feet = "; ".join(f"{name} {limit:.1f} kg" for name, limit in statics(payload_problem().testbed).items())
     return Answer(
         id="O4",
         question="How heavy may a component attached to the SpaceClimber's front be before it is no longer stable?",
@@ -44,18 +47,23 @@ def payload(full: bool) -> Answer:
         unit="kg",
         interval=(moon.lower, moon.upper),
         paper=PAPER,
-        holds=agrees and all(isfinite(boundary.lower) for boundary in boundaries.values()),
+        holds=agrees and all(isfinite(b.lower) and isfinite(b.upper) for b in boundaries.values()),
         note=(
-            f"{environments}. Least of {len(moon.by_condition)} start phases on the moon, of "
-            f"{len(boundaries['earth'].by_condition)} elsewhere. With locked legs {_range(simulated)}, by statics "
-            f"{statics:.1f} kg."
+            "Stable in every rollout up to the first mass, and in none from some start phase at the second; undecided "
+            f"between: {environments}. {len(moon.by_condition)} start phases on the moon, "
+            f"{len(boundaries[EARTH].by_condition)} elsewhere. With locked legs {_range(simulated)}, by statics "
+            f"{static:.1f} kg. Statics while it walks: {feet}."
         ),
     )
 
 
 def _range(boundary: Boundary) -> str:
-    """The interval of the worst start phase, and how far the best one gets."""
-    best = boundary.by_condition[:, 0].max()
-    spread = f" (best phase {best:g})" if best > boundary.lower else ""
+    """The interval, how often what lies in it was unsafe, and the same interval of the best start phase."""
     upper = f"{boundary.upper:g}" if isfinite(boundary.upper) else "more"
-    return f"{boundary.lower:g} to {upper} kg{spread}"
+    between = [c for c in boundary.worst_chances if boundary.lower < c.value < boundary.upper]
+    counts = ", ".join(f"{c.unsafe} of {c.rollouts} at {c.value:g}" for c in between)
+    parts = [counts] if counts else []
+    best = boundary.by_condition[boundary.by_condition[:, 0].argmax()]
+    if best[0] > boundary.lower:
+        parts.append(f"best phase {best[0]:g} to {best[1]:g}")
+    return f"{boundary.lower:g} to {upper} kg" + (f" ({'; '.join(parts)})" if parts else "")

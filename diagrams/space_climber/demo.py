@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, static_limit
+from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, find_limit, payload_problem, statics
 from vtbdrake.visualization import make_meshcat, save_html, show_motions
 
 OUT = Path("out")
@@ -15,18 +15,20 @@ def main() -> None:
     begin = time.perf_counter()
     print("How heavy may a component attached to the front of the SpaceClimber be before it is no longer stable?")
     problem = payload_problem()
-    boundary = problem.boundary(resolution=1.0, coarse=5.0)
-    sweep = boundary.sweep
+    boundary = find_limit(problem)
+    sweep, repeated = boundary.sweep, boundary.repeated
     assert sweep is not None
-    stroke = problem.testbed.read(problem.testbed.default_context(), "dps.impl.gait.stroke")
-    print(f"\nLunar gravity, {HORIZON:g} s of walking from each of {len(PHASES)} start phases, {len(sweep)} rollouts:")
+    assert repeated is not None
+    rollouts = len(sweep) + len(repeated)
+    print(f"\nLunar gravity, {HORIZON:g} s of walking from each of {len(PHASES)} start phases, {rollouts} rollouts:")
     print(f"  ours      stable up to {boundary.lower:g} kg, tips over at {boundary.upper:g} kg")
+    print("            masses around it, repeated with some milligrams more or less, under the worst start phase:")
+    for chance in boundary.worst_chances:
+        print(f"            {chance.value:g} kg: {chance}")
     for phase, (lower, upper) in zip(PHASES, boundary.by_condition, strict=True):
         print(f"            start phase {phase:5.3f}: {lower:g} to {upper:g} kg")
-    print(
-        f"  statics   {static_limit(problem.testbed, stroke=stroke):.1f} kg (centre of mass over the front feet at the"
-    )
-    print(f"            end of their stance; {static_limit(problem.testbed):.1f} kg over feet that do not move)")
+    for name, limit in statics(problem.testbed).items():
+        print(f"  statics   {limit:.1f} kg ({name})")
     print(f"  paper     {PAPER} (its robot's dimensions and the lever of the mass are not published)")
 
     OUT.mkdir(exist_ok=True)

@@ -13,34 +13,46 @@ rest on its attachment.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 import vtbdrake as vtb
-from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES
+from diagrams.space_climber.gait import TRIPOD
+from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, LEGS
 from diagrams.space_climber.scenario import SpaceClimberScenario
 
 MASS = "sim.sys.payload.mass"
 PITCH = "sim.sys.climber.base.pitch"
 PHASE = "dps.impl.gait.phase"
+PERIOD = "dps.impl.gait.period"
+STROKE = "dps.impl.gait.stroke"
 
 PHASES = (0.0, 1 / 8, 2 / 8, 3 / 8)
 HORIZON = 15.0
+# Period of the gait in seconds.
+STRIDE = 2.0
+# Rollouts with jitter, per start phase, of each mass around the boundary.
+REPEATS = 5
 # A multiple of the DPS's period, so that the simulation does not pause more often than it has to.
 SAMPLE_PERIOD = 0.1
 PAPER = "about 45 kg"
 
-# Name -> fields of the scenario.
+# Name -> fields of the scenario, or the stride.
 MOON = "moon"
+EARTH = "earth"
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     MOON: {},
     "Mars": {"gravity": 3.71},
-    "earth": {"gravity": 9.81},
+    EARTH: {"gravity": 9.81},
     "moon, 10 deg downhill": {"slope_deg": 10.0},
     "moon, friction 0.5": {"friction": 0.5},
     "moon, friction 1.1": {"friction": 1.1},
+    # How fast it walks for its gravity, by the Froude number v^2 / (g l), decides which of two worlds carries more.
+    "moon, a stride in 8 s": {"stride": 8.0},
+    "earth, a stride in 8 s": {"gravity": 9.81, "stride": 8.0},
 }
 
 
@@ -49,38 +61,79 @@ def tipped_over(pitch: float) -> float:
     return 0.0 if abs(pitch) < np.pi / 4 else 1.0
 
 
-def payload_problem(*, phases: Sequence[float] = PHASES, **environment: Any) -> vtb.Problem:
-    """The paper's five steps, in an environment given by fields of the scenario."""
+def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE, **environment: Any) -> vtb.Problem:
+    """The paper's five steps.
+
+    Args:
+        phases: start phases of the gait, in cycles.
+        stride: period of the gait in seconds; the robot walks for as many strides, whatever it is.
+        environment: fields of the scenario.
+    """
     return vtb.Problem(
         scenario=SpaceClimberScenario(**environment),
         parameters=[vtb.Parameter(MASS, 0.0, 60.0)],
         quality=vtb.Quality(tipped_over, of=PITCH),
-        horizon=HORIZON,
+        horizon=HORIZON * stride / STRIDE,
         threshold=0.9,
         sample_period=SAMPLE_PERIOD,
-        conditions=[{PHASE: phase} for phase in phases],
+        conditions=[{PHASE: phase, PERIOD: stride} for phase in phases],
     )
 
 
-def static_limit(testbed: vtb.VirtualTestbed, *, stroke: float = 0.0) -> float:
-    """The attached mass in kg at which the centre of mass lies over the front feet, on level ground.
+def find_limit(problem: vtb.Problem, *, resolution: float = 1.0) -> vtb.Boundary:
+    """The interval in which the heaviest stable attachment lies; what is uncertain is repeated with jitter."""
+    return problem.boundary(resolution=resolution, coarse=5.0, repeats=REPEATS)
 
-    ``stroke`` is the gait's, in m: at the end of a stance the front feet are half of it behind their nominal place.
-    The robot is in its default posture; the rest is the balance of moments m (x_a - x_f) = M (x_f - x_c).
+
+def static_limit(testbed: vtb.VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: float = 0.0) -> float:
+    """The attached mass in kg at which the centre of mass lies over the front edge of the support polygon.
+
+    The robot is in its default posture on level ground; the rest is the balance of moments
+    m (x_a - x_e) = M (x_e - x_c) about the point x_e of the edge that lies straight ahead of the centre of mass.
+
+    Args:
+        testbed: of the space climber, with its attachment.
+        legs: whose feet stand.
+        ahead: how far their feet stand ahead of their nominal place, in m.
     """
     plant = testbed.plant
     assert plant is not None
+    assert testbed.scene_graph is not None
     context = plant.CreateDefaultContext()
     climber = plant.GetModelInstanceByName("climber")
     M = plant.CalcTotalMass(context, [climber])
-    x_c = plant.CalcCenterOfMassPositionInWorld(context, [climber])[0]
-    foot = plant.GetBodyByName(FOOT_LINKS[0])
-    sphere = plant.GetCollisionGeometriesForBody(foot)[0]
-    assert testbed.scene_graph is not None
-    p_BS = testbed.scene_graph.model_inspector().GetPoseInFrame(sphere).translation()
-    x_f = (foot.EvalPoseInWorld(context) @ p_BS)[0] - stroke / 2.0
+    x_c, y_c, _ = plant.CalcCenterOfMassPositionInWorld(context, [climber])
+    feet = []
+    for leg in legs:
+        foot = plant.GetBodyByName(FOOT_LINKS[LEGS.index(leg)])
+        sphere = plant.GetCollisionGeometriesForBody(foot)[0]
+        p_BS = testbed.scene_graph.model_inspector().GetPoseInFrame(sphere).translation()
+        feet.append((foot.EvalPoseInWorld(context) @ p_BS)[:2] + np.array([ahead, 0.0]))
+    x_e = _front_edge(np.array(feet), y_c)
     x_a = plant.GetBodyByName("payload").EvalPoseInWorld(context).translation()[0]
-    return float(M * (x_f - x_c) / (x_a - x_f))
+    return float(M * (x_e - x_c) / (x_a - x_e))
+
+
+def _front_edge(feet: np.ndarray, y: float) -> float:
+    """The largest x at ``y`` in the convex hull of the feet, shape (n, 2)."""
+    found = [
+        a[0] + (y - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
+        for a, b in itertools.permutations(feet, 2)
+        if a[1] <= y <= b[1] and a[1] < b[1]
+    ]
+    return float(max(found))
+
+
+def statics(testbed: vtb.VirtualTestbed) -> dict[str, float]:
+    """The static limit in kg for each way in which the feet stand during a tripod gait, and for six feet that rest."""
+    half = testbed.read(testbed.default_context(), STROKE) / 2.0
+    tripod = [leg for leg, delay in zip(LEGS, TRIPOD.delays, strict=True) if delay == 0.0]
+    return {
+        "three feet, begin of their stance": static_limit(testbed, legs=tripod, ahead=half),
+        "three feet, middle of their stance": static_limit(testbed, legs=tripod),
+        "three feet, end of their stance": static_limit(testbed, legs=tripod, ahead=-half),
+        "both front feet down, at rest": static_limit(testbed),
+    }
 
 
 def locked_problem(*, lower: float = 70.0, upper: float = 120.0) -> vtb.Problem:

@@ -44,7 +44,9 @@ class Problem:
             (common random numbers).
         risk: how the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
         constraints: what every rollout has to keep, under every condition.
-        start: s0 from a snapshot instead of the defaults.
+        start: s0 from a snapshot instead of the defaults. Of a running simulation with error control take it by
+            ``testbed.fork(simulator)``: after a plain ``testbed.snapshot(context)``, the forecast differs a little from
+            what follows, as the integrator's memory of its last step is no part of s.
 
     Raises:
         ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets what is varied,

@@ -29,7 +29,8 @@ class RolloutTask:
             error control is part of the trajectory.
         record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
         run_on: simulate to t_m although the threshold was exceeded.
-        start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults.
+        start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults. Of a running
+            simulation with error control take it by `AddressedDiagram.fork`, or its future will differ a little.
         keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
         measures: what else is sampled and read as one number each: further objectives, constraints.
     """

@@ -68,12 +68,41 @@ class AddressedDiagram:
                 happened before.
         """
         simulator = Simulator(self.diagram, context if context is not None else self.default_context())
-        time = simulator.get_context().get_time()
-        ApplySimulatorConfig(self.simulator_fields.config(), simulator)
-        simulator.get_mutable_context().SetTime(time)
+        self._give_integrator(simulator)
         if restored:
             simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return simulator
+
+    def _give_integrator(self, simulator: Simulator) -> None:
+        """A new integrator, without memory of its last step, at the time of the context."""
+        time = simulator.get_context().get_time()
+        # It sets the time to that of a start.
+        ApplySimulatorConfig(self.simulator_fields.config(), simulator)
+        simulator.get_mutable_context().SetTime(time)
+
+    def fork(self, simulator: Simulator) -> Snapshot:
+        """Return s(t) of a running simulation so that what is simulated from it is exactly what follows.
+
+        An integrator with error control remembers its last step, which no snapshot can hold: rollouts from a plain
+        `snapshot` begin with a first step of another size, and differ by about the accuracy asked for, more where
+        contact amplifies it. Here the running simulation continues with a new integrator, too. Its future is then
+        equal, to the last bit, to a rollout from the snapshot (``Problem(start=...)``), or to a simulation by
+        ``simulator(context, restored=True)`` of a restored context, if it is advanced to the same instants: where a
+        call of AdvanceTo ends, a step ends. For a rollout these are `RolloutTask.instants`. With a discrete plant or
+        fixed steps, a plain snapshot gives the same, but costs nothing.
+
+        Args:
+            simulator: one of this testbed; between two calls of its AdvanceTo.
+
+        Raises:
+            ValueError: the simulator is of another Diagram.
+        """
+        if simulator.get_system() is not self.diagram:
+            raise ValueError("the simulator to be forked is one of another Diagram: make it by testbed.simulator()")
+        snapshot = self.snapshot(simulator.get_context())
+        self._give_integrator(simulator)
+        simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        return snapshot
 
     def event_timings(self) -> tuple[tuple[float, float], ...]:
         """(period, offset) in seconds of the periodic discrete updates of its systems, each timing once.

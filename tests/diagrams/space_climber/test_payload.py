@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.morphology import JOINT_NAMES, Morphology
-from diagrams.space_climber.payload import MASS, locked_problem, payload_problem, static_limit, tipped_over
+from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
+from diagrams.space_climber.payload import MASS, locked_problem, payload_problem, static_limit, statics, tipped_over
 from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
 
 
@@ -14,15 +15,35 @@ def test_f_is_that_of_the_paper() -> None:
     assert [tipped_over(angle) for angle in angles] == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
 
 
-def test_static_limit_balances_the_moments_about_the_front_feet() -> None:
+@pytest.mark.parametrize(
+    "legs",
+    [LEGS, ("front_left", "middle_right", "rear_left"), ("front_right", "middle_left", "rear_left", "rear_right")],
+)
+@pytest.mark.parametrize("ahead", [-0.1, 0.0, 0.1])
+def test_at_the_static_limit_the_centre_of_mass_lies_on_the_edge_of_support(legs, ahead) -> None:
     testbed = SpaceClimberScenario().build()
     context = testbed.default_context()
-    for stroke in (0.0, 0.2):
-        limit = static_limit(testbed, stroke=stroke)
-        testbed.write(context, {MASS: limit})
-        plant = testbed.plant
-        x_cm = plant.CalcCenterOfMassPositionInWorld(plant.GetMyContextFromRoot(context))[0]
-        assert x_cm == pytest.approx(Morphology().stance_x - stroke / 2, abs=1e-6)
+    limit = static_limit(testbed, legs=legs, ahead=ahead)
+    testbed.write(context, {MASS: limit})
+    plant = testbed.plant
+    x_cm, y_cm, _ = plant.CalcCenterOfMassPositionInWorld(plant.GetMyContextFromRoot(context))
+    # The point furthest ahead that is a convex combination of the feet and lies straight ahead of the centre of mass.
+    feet = Morphology().stance[[LEGS.index(leg) for leg in legs], :2] + [ahead, 0.0]
+    edge = linprog(-feet[:, 0], A_eq=[feet[:, 1], np.ones(len(legs))], b_eq=[y_cm, 1.0])
+    assert x_cm == pytest.approx(-edge.fun, abs=1e-6)
+
+
+def test_statics_names_every_way_to_stand() -> None:
+    limits = statics(SpaceClimberScenario().build())
+    begin, middle, end, rest = limits.values()
+    assert end < middle < begin < rest
+
+
+def test_a_slower_robot_walks_as_many_strides() -> None:
+    problem = payload_problem(phases=[0.25], stride=8.0, gravity=9.81)
+    assert problem.task.horizon / 8.0 == payload_problem().task.horizon / 2.0
+    assert problem.conditions == ({"dps.impl.gait.phase": 0.25, "dps.impl.gait.period": 8.0},)
+    assert problem.scenario.gravity == 9.81
 
 
 def test_with_locked_legs_it_tips_where_statics_says() -> None:
