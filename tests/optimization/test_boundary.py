@@ -1,5 +1,6 @@
 """The boundary: refined where it must be, and not fooled by an outcome that is not monotonic."""
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -320,3 +321,18 @@ def test_a_boundary_beyond_the_range_is_told_with_repeats_too():
 def test_repeats_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         _swing().boundary(resolution=1.0, coarse=2.0, progress=False, **options)
+
+
+def test_a_boundary_that_is_none_is_told():
+    # Unsafe where it is small: the question was asked the wrong way round.
+    outcomes, _ = _examine(_refinement(), lambda m, _: m < 20.0)
+    assert "not safe at 0 kg, the smallest value examined" in str(_sweep(outcomes).boundary())
+    assert "not monotonic: safe again at 20, 25, 30 kg and 6 more values" in str(_sweep(outcomes).boundary())
+
+
+def test_rollouts_that_the_testbed_ended_are_told():
+    sweep = _sweep({(0.0, 0): False, (5.0, 0): False, (10.0, 0): True})
+    rollouts = (sweep.rollouts[0], replace(sweep.rollouts[1], end="terminated"), sweep.rollouts[2])
+    boundary = replace(sweep, rollouts=rollouts).boundary()
+    assert (boundary.lower, boundary.ended_at) == (5.0, (5.0,))
+    assert "ended early by the testbed at 5 kg" in str(boundary)

@@ -168,6 +168,17 @@ class Best(Risk):
         return float(max(h))
 
 
+def test_the_table_of_a_sweep_has_what_decides():
+    problem = _problem(
+        quality=[vtb.Quality(_angle, THETA), vtb.Quality(_speed, OMEGA)],
+        constraints=[vtb.Constraint(_speed, OMEGA, at_most=1.5)],
+        horizon=0.1,
+    )
+    table = problem.sweep(values=[1.0, 2.0], executor="serial", progress=False).to_dict()
+    assert table["quality 1"] == [1.0, 2.0]
+    assert table["violation 0"] == [-0.5, 0.5]
+
+
 def test_a_risk_that_a_file_cannot_hold_is_asked_for(tmp_path):
     problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}], risk=Best(), horizon=0.5)
     sweep = problem.sweep(values=[1.0, 2.0], executor="serial", progress=False)

@@ -1,5 +1,8 @@
 """Qualities under several conditions: each risk against its definition."""
 
+from fractions import Fraction
+from math import ceil
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -52,3 +55,11 @@ def test_no_risk_falls_when_a_quality_rises(h, risk, data):
 def test_a_level_beyond_its_range_is_refused(make):
     with pytest.raises(ValueError, match=r"lies in \(0, 1\], unlike"):
         make()
+
+
+def test_the_rank_of_a_quantile_is_that_of_exact_arithmetic():
+    # 0.28 * 25 is above 7 in floating point.
+    for percent in range(1, 101):
+        for count in (1, 7, 25, 50, 100):
+            rank = ceil(Fraction(percent, 100) * count)
+            assert Quantile(percent / 100)(np.arange(1.0, count + 1.0)) == rank

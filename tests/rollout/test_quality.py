@@ -132,6 +132,7 @@ def test_a_quality_is_a_function_of_something():
         ({"horizon": inf}, "horizon t_m must be positive and finite"),
         ({"horizon": 1.0, "sample_period": 0.0}, "sample period must be positive"),
         ({"horizon": 1.0, "sample_period": 2.0}, "at most the horizon of 1 s, not 2.0 s"),
+        ({"horizon": 1e9, "sample_period": 1e-3}, r"1e\+12 samples, one every 0.001 s, but at most 1e\+08"),
         ({"horizon": 1.0, "threshold": nan}, "threshold f_m"),
         ({"horizon": 1.0, "threshold": -1.0}, "threshold f_m"),
     ],

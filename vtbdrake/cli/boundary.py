@@ -94,8 +94,6 @@ def _report(found: Boundary, sweep: Sweep) -> str:
     for chance in found.worst_chances:
         which = f" under condition {chance.condition}" if len(sweep.conditions) > 1 else ""
         lines.append(f"  {number(chance.value)} {unit}: {chance}{which}")
-    if found.safe_beyond:
-        lines.append(f"not monotonic: safe all the same at {_values(found.safe_beyond)} {unit}")
     if found.failed_at:
         lines.append(f"counted as unsafe: the simulation failed at {_values(found.failed_at)} {unit}")
     rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]

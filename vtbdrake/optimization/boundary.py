@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp, inf, isinf, log
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from scipy.stats import binomtest
 
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout.arguments import as_number, as_whole
+from vtbdrake.rollout.result import TERMINATED
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.sweep import Sweep
@@ -72,6 +73,8 @@ class Boundary:
         chances: one for each value and condition that was repeated, by value and condition.
         safe_beyond: values above a condition's first unsafe one that were safe all the same: where there are any, the
             outcome is not monotonic, and a bisection could have ended there.
+        ended_at: values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
+            so up to there.
         failed_at: values at which a simulation failed.
         failure: the reason of the first of them.
         sweep: the rollouts without jitter that it rests on.
@@ -88,6 +91,7 @@ class Boundary:
     step: float = inf
     chances: tuple[Chance, ...] = ()
     safe_beyond: tuple[float, ...] = ()
+    ended_at: tuple[float, ...] = ()
     failed_at: tuple[float, ...] = ()
     failure: str = ""
     sweep: Sweep | None = field(default=None, repr=False, compare=False)
@@ -107,8 +111,12 @@ class Boundary:
         # Where all steps are alike, the interval itself says how fine they are.
         if self.gap > (0.0 if isinf(self.upper) else self.step * (1.0 + 1e-9)):
             missed = f"; an unsafe range below that is narrower than {self.gap:.3g} {self.unit} may have been missed"
+        again = [v for v in self.safe_beyond if v > self.upper]
+        beyond = f"; not monotonic: safe again at {_listed(again, self.unit)}" if again else ""
+        ended = f"; ended early by the testbed at {_listed(self.ended_at, self.unit)}" if self.ended_at else ""
         failed = f" ({len(self.failed_at)} values with failed simulations: {self.failure})" if self.failed_at else ""
-        return f"{self.address}: {self.interval_text(self.lower, self.upper)}{self._undecided()}{missed}{failed}"
+        interval = self.interval_text(self.lower, self.upper)
+        return f"{self.address}: {interval}{self._undecided()}{missed}{beyond}{ended}{failed}"
 
     def interval_text(self, lower: float, upper: float) -> str:
         """An interval of this boundary, in words."""
@@ -127,6 +135,11 @@ class Boundary:
             return ""
         counts = ", ".join(f"{c.unsafe} of {c.rollouts} unsafe at {c.value:g} {self.unit}" for c in between)
         return f", undecided between ({counts})"
+
+
+def _listed(values: Sequence[float], unit: str) -> str:
+    shown = ", ".join(f"{value:g}" for value in values[:3])
+    return f"{shown} {unit}" + (f" and {len(values) - 3} more values" if len(values) > 3 else "")
 
 
 def why_no_boundary(sweep: Sweep) -> str:
@@ -183,8 +196,9 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
         gap=max(_widest_gap([value for value, _ in outcomes if value <= lower]) for outcomes in own),
         step=float(np.diff(np.unique(values)).min(initial=inf)),
         chances=tuple(sorted(chances, key=lambda chance: (chance.value, chance.condition))),
-        safe_beyond=tuple(sorted(beyond)),
-        failed_at=tuple(sorted({float(value) for value in values[sweep.failed]})),
+        safe_beyond=_distinct(beyond),
+        ended_at=_distinct(v for v, r in zip(values, sweep.rollouts, strict=True) if r.end == TERMINATED),
+        failed_at=_distinct(values[sweep.failed]),
         failure=next((rollout.message for rollout in sweep.rollouts if rollout.failed), ""),
         sweep=sweep,
         repeated=repeated,
@@ -199,6 +213,10 @@ def _interval(outcomes: Sequence[tuple[float, float]]) -> tuple[float, float]:
             break
         lower = value
     return lower, min((value for value, share in outcomes if share == 1.0), default=inf)
+
+
+def _distinct(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(sorted({float(value) for value in values}))
 
 
 def _widest_gap(values: Sequence[float]) -> float:

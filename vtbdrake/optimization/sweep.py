@@ -167,13 +167,22 @@ class Sweep:
         return f"; the first failure: {messages[0]}" if messages else ""
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Columns by name, one entry per row: the parameters, the condition, h, t*, end, message, wall time."""
+        """Columns by name, one entry per row.
+
+        They are the parameters, the condition, h, t*, end, message and wall time; and, where the problem has them, its
+        further qualities (``quality 1``, ...) and the violations of its constraints (``violation 0``, ...), which are
+        NaN where the rollout failed.
+        """
         columns: dict[str, list[Any]] = {
             parameter.address: self.points[:, i].tolist() for i, parameter in enumerate(self.parameters)
         }
         columns["condition"] = self.condition.tolist()
         for name in ("h", "t_star", "end", "message", "wall_time"):
             columns[name] = [getattr(rollout, name) for rollout in self.rollouts]
+        further = len(self.minimize) - 1
+        names = [f"quality {k + 1}" for k in range(further)] + [f"violation {k}" for k in range(len(self.constraints))]
+        for k, name in enumerate(names):
+            columns[name] = [rollout.measures[k] if rollout.measures else nan for rollout in self.rollouts]
         return columns
 
     def to_dataframe(self) -> DataFrame:

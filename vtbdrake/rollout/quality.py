@@ -27,7 +27,8 @@ class Measure:
         of: sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
             DPS's or the simulation's; ``time`` is the simulation's clock.
         reading: how the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
-            time, by the trapezoidal rule, up to where the rollout ends).
+            time, by the trapezoidal rule). All mean the samples up to where the rollout ends: at t_m, or earlier where
+            a threshold is exceeded or a system of the testbed asks for the end; an integral is then one over less time.
     """
 
     f: Callable[..., float]
@@ -128,7 +129,7 @@ class Constraint(Measure):
 
     Attributes:
         at_most, at_least: the limits, in the unit of f; one of them or both.
-        reading: as of `Measure`; ``worst`` means at every sample time, ``best`` at one.
+        reading: see `Measure`; ``worst`` means at every sample time up to where the rollout ends, ``best`` at one.
     """
 
     reading: str = field(default="worst", kw_only=True)

@@ -14,6 +14,8 @@ from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
+_MOST_SAMPLES = 1e8
+
 
 @dataclass(frozen=True)
 class RolloutTask:
@@ -66,6 +68,11 @@ class RolloutTask:
             raise ValueError(
                 f"the sample period must be positive and at most the horizon of {self.horizon:g} s, not "
                 f"{self.sample_period} s"
+            )
+        if self.horizon / self.sample_period > _MOST_SAMPLES:
+            raise ValueError(
+                f"a horizon of {self.horizon:g} s has {self.horizon / self.sample_period:.3g} samples, one every "
+                f"{self.sample_period:g} s, but at most {_MOST_SAMPLES:g} fit into memory: take a longer sample period"
             )
         self._check_threshold()
 
