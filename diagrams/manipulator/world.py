@@ -15,6 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericP
 from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from diagrams.manipulator.model import ARM_SDF
 from vtbdrake.state import parameter
+from vtbdrake.state.weakly import weakly
 
 BALL_STIFFNESS = 1e8
 """Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""
@@ -74,6 +75,8 @@ class Push(LeafSystem):
     The parameter ``wrench``, [torque (N m); force (N)] in the world, acts at the origin of the frame.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, plant: MultibodyPlant, frame: str) -> None:
         super().__init__()
         pushed = plant.GetFrameByName(frame)
@@ -84,7 +87,7 @@ class Push(LeafSystem):
         self.DeclareAbstractOutputPort(
             "spatial_force",
             lambda: Value([ExternallyAppliedSpatialForce()]),
-            self._calc,
+            weakly(self, Push._calc),
             prerequisites_of_calc={self.numeric_parameter_ticket(NumericParameterIndex(wrench))},
         )
 

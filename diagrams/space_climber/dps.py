@@ -77,6 +77,8 @@ class Calibration(LeafSystem):
     ``y += (1 - exp(-T / tau)) (u - y)``. The output is the state of the last sample.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._period = period
@@ -122,6 +124,8 @@ class CommandLimiter(LeafSystem):
     The output is the state of the last sample: the input, no further than ``rate * T`` from the command before, and
     between ``lower`` and ``upper``. The first command is the nominal stance.
     """
+
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()

@@ -43,6 +43,8 @@ class PerceivedEnvironment(LeafSystem):
     displacement. The height is that of the torso's centre over the ground under the feet, on average.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._period = period

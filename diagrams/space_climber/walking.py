@@ -36,6 +36,8 @@ class GaitGenerator(LeafSystem):
     ``joint_position`` is a state: the inverse kinematics of the feet, as of the last sample.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, gait: Gait, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._gait = gait

@@ -23,6 +23,18 @@ class RecordedScenario(PendulumScenario):
         return super().make_dps()
 
 
+_KEPT = []
+
+
+@dataclass
+class GreedyScenario(RecordedScenario):
+    """Every testbed that is built takes 50 MB, for ever."""
+
+    def make_dps(self):
+        _KEPT.append(b"x" * 50_000_000)
+        return super().make_dps()
+
+
 class Treacherous(SampledFeedback):
     """Kills, stops or hangs its process when its gain says so, but only as long as a file is there."""
 

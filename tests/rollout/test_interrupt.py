@@ -60,13 +60,7 @@ class InterruptedScenario(AcrobotScenario):
         return Interrupted(self.how)
 
 
-WAYS = [
-    "conversion",
-    "plainly",
-    pytest.param("finalizer", marks=pytest.mark.filterwarnings("ignore:Exception ignored")),
-]
-
-
+@pytest.mark.filterwarnings("ignore:Exception ignored")
 @pytest.mark.parametrize("how", ["conversion", "finalizer", "plainly"])
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2)])
 def test_ctrl_c_in_a_simulation_ends_the_sweep_at_once(make, how, caplog):

@@ -1,15 +1,28 @@
 """An executor outlives its tasks, the errors in them, and its workers."""
 
 import gc
+import os
+import select
+import subprocess
+import sys
 import threading
 import time
+from textwrap import dedent
 
 import numpy as np
 import pytest
 
-from tests.rollout.scenarios import RecordedScenario
+from tests.rollout.scenarios import GreedyScenario, RecordedScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
-from vtbdrake.rollout import ProcessExecutor, Quality, QualityError, RolloutTask, SerialExecutor, ThreadExecutor
+from vtbdrake.rollout import (
+    ProcessExecutor,
+    Quality,
+    QualityError,
+    RolloutTask,
+    SerialExecutor,
+    ThreadExecutor,
+    WorkerError,
+)
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 ELBOW = "sim.sys.Acrobot.elbow.position"
@@ -128,6 +141,58 @@ def test_a_testbed_is_built_once_for_all_calls(make, tmp_path):
             _assert_right(executor, task, [{THETA: 0.1 * i} for i in range(count)])
         # The other times, one after another, to be compared with.
         assert len(file.read_text().split()) == 1 + 4
+
+
+def test_a_worker_that_has_grown_is_replaced(tmp_path):
+    file = tmp_path / "built"
+    task = RolloutTask(GreedyScenario(file=str(file)), 0.1, Quality(_angle, THETA))
+    points = [{"scenario.stiffness": 0.1 * i, THETA: 0.1} for i in range(12)]
+    with ProcessExecutor(1, growth=120e6) as executor:
+        results = dict(executor.run(task, points))
+    assert sorted(results) == list(range(12)) and not any(result.failed for result in results.values())
+    builders = file.read_text().split()
+    # One more than fits, and one that was given ahead.
+    assert all(3 <= builders.count(process) <= 5 for process in set(builders[:-5]))
+    assert len(builders) == 12
+
+
+@pytest.mark.parametrize("growth", [0.0, -1.0, "much"])
+def test_a_growth_that_is_no_size_is_refused(growth):
+    with pytest.raises(ValueError, match="the growth of a worker's memory"):
+        ProcessExecutor(1, growth=growth)
+
+
+def test_two_calls_at_a_time_of_processes_are_refused():
+    with ProcessExecutor(1) as executor:
+        first = executor.run(ANGLE, POINTS)
+        next(first)
+        with pytest.raises(WorkerError, match="finish or close what that call returned"):
+            next(executor.run(OTHER, POINTS))
+        first.close()
+        _assert_right(executor, OTHER, POINTS)
+
+
+def test_workers_end_with_a_main_process_that_is_killed(tmp_path):
+    """Also one whose rollout hangs, and so never looks whether there is anyone left to answer to."""
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    script = f"""
+        from tests.rollout.scenarios import HANG, TreacherousScenario
+        from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask
+        executor = ProcessExecutor(1)
+        task = RolloutTask(TreacherousScenario(fuse={str(fuse)!r}), 0.5, Quality(abs, {SHOULDER!r}))
+        list(executor.run(task, [{{}}]))
+        print(executor._workers[0].process.pid, flush=True)
+        list(executor.run(task, [{{"dps.gain[0]": HANG}}]))
+    """
+    with subprocess.Popen([sys.executable, "-c", dedent(script)], stdout=subprocess.PIPE, text=True) as main:
+        worker = int(main.stdout.readline())
+        while fuse.exists():
+            assert main.poll() is None
+        ended = os.pidfd_open(worker)
+        main.kill()
+        assert select.select([ended], [], [], 60.0)[0], "the worker goes on"
+        os.close(ended)
 
 
 def test_threads_are_kept_between_calls():

@@ -20,6 +20,7 @@ from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import KEPT, Testbeds, failed
+from vtbdrake.rollout.worker import BEGUN, GROWN
 
 _log = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ _SMALL = 1 << 16
 class _Worker:
     """A fresh interpreter at the other end of a socket. It does not import the main module again."""
 
-    def __init__(self, kept: int) -> None:
+    def __init__(self, kept: int, growth: float) -> None:
         # Ctrl-C reaches the whole group of processes; the main one decides what it means.
         program = (
             "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -42,7 +43,7 @@ class _Worker:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", program, str(theirs.fileno()), str(kept)],
+                [sys.executable, "-c", program, str(theirs.fileno()), str(kept), str(growth)],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
@@ -53,6 +54,8 @@ class _Worker:
         self.jobs: deque[int] = deque()
         self.deadline = inf
         self.brief = False
+        # Whether its memory has grown so much that another one is to take its place.
+        self.grown = False
 
     def give(self, task: bytes, index: int, message: bytes) -> None:
         # Before anything is sent: a worker that was interrupted in here must not pass for an idle one.
@@ -97,33 +100,53 @@ class ProcessExecutor(Executor):
 
     A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
     more by another worker, and is then a failed result. Where rollouts are short, a worker is given the next one before
-    it has finished the last.
+    it has finished the last. A worker whose memory has grown by ``growth`` is replaced between two rollouts: every
+    testbed that is built, for another value of a scenario's field, leaves memory behind.
 
     Args:
         workers: how many; the number of cores if left out.
         time_limit: in seconds of wall time for one rollout.
         kept: how many testbeds each process keeps, for points with different scenario fields.
+        growth: by how many bytes the memory of a process may grow after its first rollout.
     """
 
-    def __init__(self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT) -> None:
+    def __init__(
+        self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT, growth: float = 1e9
+    ) -> None:
         self._count = checked_workers(workers)
         self._time_limit = checked_time_limit(time_limit)
+        self._growth = as_number("the growth of a worker's memory", growth)
+        if not self._growth > 0.0:
+            raise ValueError(f"the growth of a worker's memory must be positive, not {growth} bytes")
         self._kept = Testbeds(kept=kept).kept
         self._blobs = Blobs()
         self._workers: list[_Worker] = []
+        self._running = False
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
         """See `Executor.run`.
 
         Raises:
-            WorkerError: the task cannot be sent to another process, or cannot be built there.
+            WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
         """
         blob = self._blobs.get(task).content
+        if self._running:
+            raise WorkerError(
+                "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
+                "second executor"
+            )
+        self._running = True
+        try:
+            yield from self._run(blob, points)
+        finally:
+            self._running = False
+
+    def _run(self, blob: bytes, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
         error: BaseException | None = None
         while len(self._workers) < min(self._count, len(points)):
-            self._workers.append(_Worker(self._kept))
+            self._workers.append(_Worker(self._kept, self._growth))
         try:
             self._hand_out(blob, waiting, points)
             while waiting or any(worker.jobs for worker in self._workers):
@@ -157,11 +180,12 @@ class ProcessExecutor(Executor):
 
     def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
         """A rollout for every worker that is idle; then, as long as there are enough for all, the next ones ahead."""
-        for worker in list(self._workers):
-            if waiting and not worker.jobs and not self._give(worker, task, waiting, points):
+        for idle in [worker for worker in self._workers if not worker.jobs]:
+            worker = self._replace(idle) if waiting and idle.grown else idle
+            if waiting and not self._give(worker, task, waiting, points):
                 self._replace(worker)  # It died while it was idle.
         for worker in self._workers:
-            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief:
+            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # One that has died is found by its reply.
                 self._give(worker, task, waiting, points)
 
@@ -193,10 +217,13 @@ class ProcessExecutor(Executor):
             index = worker.jobs[0]
             if connection in ready:
                 try:
-                    reply = pickle.loads(connection.recv_bytes())
-                    if reply is None:
+                    message = connection.recv_bytes()
+                    if message == BEGUN:
                         worker.begin(self._time_limit)
+                    elif message == GROWN:
+                        worker.grown = True
                     else:
+                        reply = pickle.loads(message)
                         worker.finish(*reply)
                         replies.append((worker, index, reply[1]))
                 except (EOFError, OSError):
@@ -206,9 +233,10 @@ class ProcessExecutor(Executor):
                 replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))
         return replies
 
-    def _replace(self, worker: _Worker) -> None:
+    def _replace(self, worker: _Worker) -> _Worker:
         worker.kill()
-        self._workers[self._workers.index(worker)] = _Worker(self._kept)
+        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth)
+        return new
 
     def close(self) -> None:
         for worker in self._workers:

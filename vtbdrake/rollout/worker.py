@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import resource
+import select
 import sys
+import threading
 from collections.abc import Callable
 from functools import cache, partial
+from math import inf
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -15,14 +20,21 @@ from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import Runners, Testbeds
 
+# What a worker says besides its answers: the rollout of limited time begins; its memory has grown too much.
+BEGUN, GROWN = b"B", b"G"
 
-def serve(connection: Connection, runners: Runners) -> None:
-    """Answers until the other end closes, which it also does by dying.
+
+def serve(connection: Connection, runners: Runners, *, growth: float = inf) -> None:
+    """Answer requests until the other end closes, which it also does when its process dies.
 
     A task (T) has no answer. A rollout (R) has one: (its index, its result or an exception). One of limited time (L)
-    has None before it, when it begins, unless no testbed can be had for it.
+    has `BEGUN` before it, unless no testbed can be had for it. Once, `GROWN` comes before an answer.
+
+    Args:
+        growth: by how many bytes the memory may grow after the first rollout.
     """
     load: Callable[[], RolloutTask] | None = None
+    limit = inf
     while True:
         try:
             message = connection.recv_bytes()
@@ -33,10 +45,21 @@ def serve(connection: Connection, runners: Runners) -> None:
                 continue
             index, point = pickle.loads(content)
             assert load is not None, "a worker got a rollout before its task"
-            begin = partial(connection.send_bytes, pickle.dumps(None)) if kind == b"L" else None
-            connection.send_bytes(answer(index, partial(_rollout, runners, load, point, begin)))
+            begin = partial(connection.send_bytes, BEGUN) if kind == b"L" else None
+            reply = answer(index, partial(_rollout, runners, load, point, begin))
+            if limit == inf:
+                limit = _peak_memory() + growth
+            elif _peak_memory() > limit:
+                connection.send_bytes(GROWN)
+                limit = growth = inf
+            connection.send_bytes(reply)
         except (EOFError, OSError):
             return
+
+
+def _peak_memory() -> float:
+    """Return the most memory that this process ever held, in bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
 def _rollout(
@@ -77,6 +100,16 @@ def _pickled_error(index: int, error: BaseException) -> bytes:
 
 
 def main() -> None:
+    """Run a worker: its arguments are the socket, how many testbeds it keeps, and the growth of `serve`."""
     connection = Connection(int(sys.argv[1]))
+    threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
     connection.send_bytes(b"ready")
-    serve(connection, Runners(Testbeds(kept=int(sys.argv[2]))))
+    serve(connection, Runners(Testbeds(kept=int(sys.argv[2]))), growth=float(sys.argv[3]))
+
+
+def _end_with(connection: Connection) -> None:
+    """End this process when the other end closes, also in the midst of a rollout that hangs."""
+    poll = select.poll()
+    poll.register(connection, 0)  # A hang-up is reported without being asked for.
+    poll.poll()
+    os._exit(1)

@@ -8,6 +8,7 @@ from typing import Any
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPortIndex, LeafSystem
 
+from vtbdrake.state.weakly import weakly
 from vtbdrake.testbed.signal import Signal
 
 
@@ -33,13 +34,18 @@ class AbstractSwitch(LeafSystem):
         - value
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, signal: Signal, count: int) -> None:
         super().__init__()
         self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
         for i in range(count):
             self.DeclareAbstractInputPort(f"in{i + 1}", signal.abstract_value())
         self.DeclareAbstractOutputPort(
-            "value", signal.abstract_value, self._calc, prerequisites_of_calc={self.all_input_ports_ticket()}
+            "value",
+            signal.abstract_value,
+            weakly(self, AbstractSwitch._calc),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
@@ -60,13 +66,18 @@ class CommandGate(LeafSystem):
         - value
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(self, signal: Signal, closed: InputPortIndex) -> None:
         super().__init__()
         self._closed = closed
         self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
         self._command = self.DeclareAbstractInputPort("command", signal.abstract_value())
         self.DeclareAbstractOutputPort(
-            "value", lambda: Value(Command()), self._calc, prerequisites_of_calc={self.all_input_ports_ticket()}
+            "value",
+            lambda: Value(Command()),
+            weakly(self, CommandGate._calc),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
     def _calc(self, context: Context, output: AbstractValue) -> None:

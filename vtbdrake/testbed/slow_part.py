@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, S
 from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.systems import leaves
+from vtbdrake.state.weakly import weakly
 from vtbdrake.testbed.slow_function import (
     MEMORY,
     Arrays,
@@ -80,6 +81,8 @@ class SlowPart(LeafSystem):
         ValueError: a name or a time is impossible, more than 16 samples would be under way, or a value has no codec.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         function: Callable[..., Any],
@@ -135,9 +138,10 @@ class SlowPart(LeafSystem):
 
     def _declare_abstract_output(self, name: str, model: Any) -> None:
         codec = self.function.outputs[name]
+        read = weakly(self, SlowPart._read)
 
         def calc(context: Context, output: AbstractValue) -> None:
-            output.set_value(decode(self._read(context).shown, name, codec))
+            output.set_value(decode(read(context).shown, name, codec))
 
         ticket = self.abstract_state_ticket(self._progress)
         self.DeclareAbstractOutputPort(name, lambda: Value(model), calc, prerequisites_of_calc={ticket})

@@ -51,6 +51,8 @@ def SwitchBoard_(T: type) -> type:
     """
 
     class Impl(LeafSystem_[T]):
+        __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
         def _construct(
             self,
             switches: Mapping[str, int],

@@ -53,6 +53,8 @@ class JointDrives(LeafSystem):
     All values are parameters of the Context, by address; ``delay`` counts whole periods, up to ``max_delay``.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         plant: MultibodyPlant,

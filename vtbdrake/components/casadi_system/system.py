@@ -17,6 +17,7 @@ from pydrake.systems.framework import (
     DependencyTicket,
     DiscreteStateIndex,
     DiscreteValues_,
+    InputPort_,
     LeafSystem_,
     NumericParameterIndex,
     SystemScalarConverter,
@@ -25,6 +26,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from vtbdrake.components.casadi_system.handler import handler
 from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
+from vtbdrake.state.weakly import weakly
 
 
 @TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]
@@ -79,6 +81,8 @@ def CasadiSystem_(T: type) -> type:
             ValueError: names, sizes or arguments that do not fit together.
             CompilerError: there is no C compiler, or it fails.
         """
+
+        __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
 
         def _construct(
             self,
@@ -155,7 +159,9 @@ def CasadiSystem_(T: type) -> type:
                 updates=updates,
                 clock=TIME in sources,
                 parameters=Context_[T].get_numeric_parameter if PARAMETER in sources else None,
-                inputs=tuple(self._ports[b.names[0]].Eval for b in result.blocks if b.source == INPUT),
+                inputs=tuple(
+                    weakly(self._ports[b.names[0]], InputPort_[T].Eval) for b in result.blocks if b.source == INPUT
+                ),
                 # Views are cheaper, but there are none of AutoDiffXd.
                 state_value=DiscreteValues_[T].value if deliver else DiscreteValues_[T].get_mutable_value,
                 vector_value=BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector,

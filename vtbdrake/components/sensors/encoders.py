@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 class _JointSensor(SampledSensor):
     """Measures one entry of the plant's [q; v] for each of some joints."""
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         signal: str,
@@ -57,6 +59,8 @@ class JointEncoders(_JointSensor):
     ``joints``. Before the first sample it shows the plant's default positions.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         plant: MultibodyPlant,
@@ -88,6 +92,8 @@ class JointTachometers(_JointSensor):
     ``state`` is the plant's [q; v]; ``joint_velocity`` holds one velocity (rad/s or m/s) per joint, in the order of
     ``joints``. Before the first sample it shows zeros.
     """
+
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
 
     def __init__(
         self,

@@ -21,6 +21,7 @@ from pydrake.systems.framework import (
 
 from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
 from vtbdrake.state import Element, discrete_state, parameter
+from vtbdrake.state.weakly import weakly
 
 # Channels of a sensor's stream; 0 is its white noise.
 _DRIFT_CHANNEL, _DROPOUT_CHANNEL = 1, 2
@@ -143,11 +144,14 @@ class ErrorStage:
             values += [float(model.latency), float(model.dropout)]
             self._memory = int(sensor.DeclareDiscreteState(np.r_[np.zeros(self._n), np.tile(default, self._longest)]))
         self._parameters = int(sensor.DeclareNumericParameter(BasicVector(values)))
-        self._settings = sensor.DeclareCacheEntry(
+        entry = sensor.DeclareCacheEntry(
             "error settings",
-            ValueProducer(allocate=lambda: Value(object()), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: Value(object()), calc=weakly(self, type(self)._calc_settings)),
             {sensor.numeric_parameter_ticket(NumericParameterIndex(self._parameters))},
         )
+        # The entry itself would hold the sensor, which holds this.
+        index = entry.cache_index()
+        self._settings = weakly(sensor, lambda sensor, context: sensor.get_cache_entry(index).Eval(context))
         self.variables = tuple(self._elements(noise, unit))
 
     def _elements(self, noise: Mapping[str, tuple[int, str]], unit: str) -> Iterator[Element]:
@@ -186,7 +190,7 @@ class ErrorStage:
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the sensor shows when it measures ``y``."""
-        settings: _Settings = self._settings.Eval(context)
+        settings: _Settings = self._settings(context)
         if settings.exact and not (self._more and self._remembers(context)):
             return y
         key = {"seed": settings.seed, "stream": self._stream, "tick": round(context.get_time() / self._period)}

@@ -37,6 +37,8 @@ class ContactSensor(SampledSensor):
     step.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         plant: MultibodyPlant,
@@ -60,7 +62,10 @@ class ContactSensor(SampledSensor):
         for k, body in enumerate(bodies):
             self._slots[int(body.index())] = k
         self._geometry_slots = {
-            geometry: k for k, body in enumerate(bodies) for geometry in plant.GetCollisionGeometriesForBody(body)
+            # By number: the ids themselves would hold the plant.
+            geometry.get_value(): k
+            for k, body in enumerate(bodies)
+            for geometry in plant.GetCollisionGeometriesForBody(body)
         }
         self._threshold = int(self.DeclareNumericParameter(BasicVector([threshold])))
         self.variables += (parameter("threshold", self._threshold, unit="N", bounds=(0.0, np.inf)),)
@@ -79,6 +84,6 @@ class ContactSensor(SampledSensor):
             magnitude = float(np.linalg.norm(info.F_Ac_W().translational()))
             surface = info.contact_surface()
             for geometry in (surface.id_M(), surface.id_N()):
-                force[self._geometry_slots.get(geometry, -1)] += magnitude
+                force[self._geometry_slots.get(geometry.get_value(), -1)] += magnitude
         threshold = context.get_numeric_parameter(self._threshold)[0]
         return np.array([1.0 if f > threshold else 0.0 for f in force[:-1]])

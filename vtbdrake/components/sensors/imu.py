@@ -50,6 +50,8 @@ class Imu(SampledSensor):
     where the sensor sits; moving ``frame`` does not move it.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         plant: MultibodyPlant,

@@ -42,6 +42,8 @@ class ForceTorqueSensor(SampledSensor):
     in a continuous plant, they follow from state and actuation of the same instant.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self, plant: MultibodyPlant, joint: Joint, *, period: float, stream: int = 4, errors: ErrorModel | None = None
     ) -> None:
@@ -77,6 +79,8 @@ class JointTorqueSensors(SampledSensor):
     drive's torque, less what accelerates its rotor. Before the first sample it shows zeros. About restored
     contexts, see `ForceTorqueSensor`.
     """
+
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
 
     def __init__(
         self,

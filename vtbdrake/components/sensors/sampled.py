@@ -27,6 +27,8 @@ class SampledSensor(LeafSystem):
     The input ports have the names of the plant's output ports that they belong to, see `connect_to_plant`.
     """
 
+    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+
     def __init__(
         self,
         signal: str,
