@@ -15,7 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericP
 from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from diagrams.manipulator.model import ARM_SDF
 from vtbdrake.state import parameter
-from vtbdrake.state.weakly import weakly
+from vtbdrake.state.collectable import NO_DICT, weakly
 
 BALL_STIFFNESS = 1e8
 """Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""
@@ -75,7 +75,7 @@ class Push(LeafSystem):
     The parameter ``wrench``, [torque (N m); force (N)] in the world, acts at the origin of the frame.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, plant: MultibodyPlant, frame: str) -> None:
         super().__init__()

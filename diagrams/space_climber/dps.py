@@ -14,6 +14,7 @@ from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
 from diagrams.space_climber.walking import make_walking
 from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.collectable import NO_DICT
 
 SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": len(LEGS)}
 
@@ -77,7 +78,7 @@ class Calibration(LeafSystem):
     ``y += (1 - exp(-T / tau)) (u - y)``. The output is the state of the last sample.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
@@ -125,7 +126,7 @@ class CommandLimiter(LeafSystem):
     between ``lower`` and ``upper``. The first command is the nominal stance.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()

@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.collectable import NO_DICT
 
 
 def wrap(angle: float) -> float:
@@ -43,7 +44,7 @@ class PerceivedEnvironment(LeafSystem):
     displacement. The height is that of the torso's centre over the ground under the feet, on average.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()

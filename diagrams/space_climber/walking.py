@@ -11,6 +11,7 @@ from diagrams.space_climber.gait import Gait, advance, heights
 from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.collectable import NO_DICT
 
 
 class GaitGenerator(LeafSystem):
@@ -36,7 +37,7 @@ class GaitGenerator(LeafSystem):
     ``joint_position`` is a state: the inverse kinematics of the feet, as of the last sample.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, gait: Gait, *, period: float, morphology: Morphology) -> None:
         super().__init__()

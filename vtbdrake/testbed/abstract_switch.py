@@ -8,7 +8,7 @@ from typing import Any
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPortIndex, LeafSystem
 
-from vtbdrake.state.weakly import weakly
+from vtbdrake.state.collectable import NO_DICT, weakly
 from vtbdrake.testbed.signal import Signal
 
 
@@ -34,7 +34,7 @@ class AbstractSwitch(LeafSystem):
         - value
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, signal: Signal, count: int) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class CommandGate(LeafSystem):
         - value
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(self, signal: Signal, closed: InputPortIndex) -> None:
         super().__init__()

@@ -13,8 +13,8 @@ from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, S
 
 from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
+from vtbdrake.state.collectable import NO_DICT, weakly
 from vtbdrake.state.systems import leaves
-from vtbdrake.state.weakly import weakly
 from vtbdrake.testbed.slow_function import (
     MEMORY,
     Arrays,
@@ -81,7 +81,7 @@ class SlowPart(LeafSystem):
         ValueError: a name or a time is impossible, more than 16 samples would be under way, or a value has no codec.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

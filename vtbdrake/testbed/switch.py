@@ -21,6 +21,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantValueSource, PortSwitch
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from vtbdrake.state.collectable import NO_DICT
 from vtbdrake.state.element import DISCRETE, Codec, Element
 from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variable import Variable, VariableError, X
@@ -51,7 +52,7 @@ def SwitchBoard_(T: type) -> type:
     """
 
     class Impl(LeafSystem_[T]):
-        __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+        __slots__ = NO_DICT
 
         def _construct(
             self,

@@ -13,6 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel
 from vtbdrake.state import Element, discrete_state, parameter
+from vtbdrake.state.collectable import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -53,7 +54,7 @@ class JointDrives(LeafSystem):
     All values are parameters of the Context, by address; ``delay`` counts whole periods, up to ``max_delay``.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

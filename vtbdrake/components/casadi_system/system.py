@@ -26,7 +26,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from vtbdrake.components.casadi_system.handler import handler
 from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
-from vtbdrake.state.weakly import weakly
+from vtbdrake.state.collectable import NO_DICT, weakly
 
 
 @TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]
@@ -82,7 +82,7 @@ def CasadiSystem_(T: type) -> type:
             CompilerError: there is no C compiler, or it fails.
         """
 
-        __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+        __slots__ = NO_DICT
 
         def _construct(
             self,

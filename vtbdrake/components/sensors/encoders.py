@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
+from vtbdrake.state.collectable import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 class _JointSensor(SampledSensor):
     """Measures one entry of the plant's [q; v] for each of some joints."""
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -59,7 +60,7 @@ class JointEncoders(_JointSensor):
     ``joints``. Before the first sample it shows the plant's default positions.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -93,7 +94,7 @@ class JointTachometers(_JointSensor):
     ``joints``. Before the first sample it shows zeros.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

@@ -15,6 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.collectable import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -50,7 +51,7 @@ class Imu(SampledSensor):
     where the sensor sits; moving ``frame`` does not move it.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

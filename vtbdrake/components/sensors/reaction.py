@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
+from vtbdrake.state.collectable import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -42,7 +43,7 @@ class ForceTorqueSensor(SampledSensor):
     in a continuous plant, they follow from state and actuation of the same instant.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self, plant: MultibodyPlant, joint: Joint, *, period: float, stream: int = 4, errors: ErrorModel | None = None
@@ -80,7 +81,7 @@ class JointTorqueSensors(SampledSensor):
     contexts, see `ForceTorqueSensor`.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateInde
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
 from vtbdrake.state import Element, discrete_state
+from vtbdrake.state.collectable import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -27,7 +28,7 @@ class SampledSensor(LeafSystem):
     The input ports have the names of the plant's output ports that they belong to, see `connect_to_plant`.
     """
 
-    __slots__ = ()  # else Drake's pybind11 never frees it (ARCHITECTURE.md, Memory)
+    __slots__ = NO_DICT
 
     def __init__(
         self,

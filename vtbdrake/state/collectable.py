@@ -1,10 +1,14 @@
-"""What computes an output port, without holding the system that it belongs to."""
+"""What lets the garbage collector free a Diagram with systems in Python (ARCHITECTURE.md, Memory)."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
 from typing import Any
+
+# The ``__slots__`` of every class that derives from LeafSystem. A dict of its own, beside that of Drake's class, is
+# visited twice by the collector (drake 1.51), which then takes it for used from elsewhere. Attributes go into Drake's.
+NO_DICT: tuple[str, ...] = ()
 
 
 def weakly(owner: Any, method: Callable[..., Any]) -> Callable[..., Any]:
