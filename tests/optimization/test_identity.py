@@ -1,14 +1,17 @@
 """When a problem is the same one: it is not the way in which it is written that counts, but what it means."""
 
 import functools
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import LeafSystem
 
 from tests.optimization.studies import DAMPING, THETA, pendulum_problem
+from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Choice, CVaR, Risk, StudyError
 from vtbdrake.optimization.identity import describe
 from vtbdrake.rollout import Constraint, Quality
@@ -87,6 +90,84 @@ def test_a_constant_of_the_module_belongs_to_a_quality_function(monkeypatch):
     before = describe(quality(from_the_wanted))
     monkeypatch.setattr(sys.modules[__name__], "WANTED", 0.5)
     assert describe(quality(from_the_wanted)) != before
+
+
+def test_constants_in_a_comprehension_belong_to_a_quality_function(monkeypatch):
+    def nearest(theta):
+        return min(abs(theta - wanted) for wanted in [WANTED, 2.0 * WANTED])
+
+    before = describe(quality(nearest))
+    monkeypatch.setattr(sys.modules[__name__], "WANTED", 0.5)
+    assert describe(quality(nearest)) != before
+
+
+GAINS = "def gain():\n    return {gain}\n"
+LAW = """
+import gains_of_a_test
+from tests.testbeds import PendulumScenario
+
+
+class LawScenario(PendulumScenario):
+    def make_dps(self):
+        gains_of_a_test.gain()
+        return super().make_dps(){more}
+"""
+
+
+def law_problem(folder, *, gain="1.0", more=""):
+    (folder / "gains_of_a_test.py").write_text(GAINS.format(gain=gain))
+    (folder / "law_of_a_test.py").write_text(LAW.format(more=more))
+    for name in ("gains_of_a_test", "law_of_a_test"):
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    return pendulum_problem(scenario=importlib.import_module("law_of_a_test").LawScenario())
+
+
+@pytest.mark.parametrize("change", [{"gain": "2.25"}, {"more": "  # changed"}])
+def test_a_changed_dps_is_told_and_noted_where_it_is_allowed(tmp_path, monkeypatch, change):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    path = tmp_path / "a.db"
+    with law_problem(tmp_path).study(path, solver="sobol") as study:
+        study.run(rollouts=4, executor="serial", progress=False)
+    law_problem(tmp_path).study(path).close()
+    changed = law_problem(tmp_path, **change)
+    with pytest.raises(StudyError, match="law_of_a_test:LawScenario, a part of the testbed, has other code.*=True"):
+        changed.study(path)
+    with changed.study(path, allow_changed_code=True) as study:
+        study.run(rollouts=6, executor="serial", progress=False)
+        assert len(study) == len(study.trials) == 6
+        (noted,) = study.record["changes"]
+        assert noted["what"] == ["law_of_a_test:LawScenario, a part of the testbed, has other code"]
+        assert "the code changed on " in study.summary()
+    changed.study(path).close()
+    with pytest.raises(StudyError, match="of another problem"):
+        pendulum_problem().study(path, allow_changed_code=True)
+
+
+class Law(LeafSystem):
+    """A system whose function is handed in."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+        self.DeclareVectorOutputPort("y", 1, lambda context, y: y.SetFromVector([self.function(0.0)]))
+
+
+@pytest.mark.parametrize(("one", "other"), [(away_from(0.3), away_from(0.4)), (away_from(0.3), from_the_wanted)])
+def test_a_function_that_a_system_holds_is_code_of_the_testbed(one, other):
+    class HoldingScenario(PendulumScenario):
+        def add_world(self, builder):
+            super().add_world(builder)
+            builder.add("env", "law", Law(held[0]))
+
+    def code(function):
+        held[0] = function
+        return describe(pendulum_problem(scenario=HoldingScenario()))["code"]
+
+    held = [one]
+    assert any("test_identity:Law" in name for name in code(one))
+    assert code(one) == code(away_from(0.3)) != code(other)
 
 
 def test_another_process_knows_the_same_functions():

@@ -502,13 +502,51 @@ def test_a_quality_function_that_raises_leaves_the_study_whole(tmp_path, executo
     problem = pendulum_problem(quality=Quality(_raises_beyond, THETA, reading="end"))
     study = problem.study(path, solver="sobol")
     with pytest.raises(QualityError, match="ValueError: too far"):
-        study.run(rollouts=64, executor=executor, progress=False)
+        study.run(rollouts=64, executor=executor, on_error="raise", progress=False)
     finished = len(study)
     study.close()
     with Study.open(path) as again:
         assert len(again) == finished < 64
         assert all(o.value <= 1.0 for o in again.rollouts.values())
         assert again._file.sessions()[0][2] == "QualityError"
+
+
+@pytest.mark.parametrize("executor", ["serial", "processes"])
+def test_a_quality_function_that_raises_fails_its_rollout_until_it_is_repaired(tmp_path, caplog, executor):
+    path = tmp_path / "a.db"
+
+    def f(theta):
+        return {"raise": lambda: 1 / 0, "nan": lambda: np.nan, "negative": lambda: -1.0}[fault]() if theta > 1 else 1.0
+
+    for kind in ("raise", "nan", "negative"):
+        fault = kind
+        path.unlink(missing_ok=True)
+        caplog.clear()
+        with pendulum_problem(quality=Quality(f, THETA, reading="end")).study(path, solver="sobol") as study:
+            study.run(rollouts=32, executor=executor, progress=False)
+            failed = [o for o in study.rollouts.values() if o.end == "failed"]
+            assert len(study) == len(study.trials) == 32 and study.reason == "solver"
+            assert 0 < len(failed) == sum(t.failed for t in study.trials) < 32
+            assert all(o.message.startswith("QualityError: the quality function f at t = ") for o in failed)
+            (warning,) = [record.getMessage() for record in caplog.records if "on_error='raise'" in record.getMessage()]
+            assert failed[0].message.removeprefix("QualityError: ") in warning
+            kept = {row: o for row, o in study.rollouts.items() if o.end != "failed"}
+
+    def f(theta):
+        return 2.0 if theta > 1 else 1.0
+
+    repaired = pendulum_problem(quality=Quality(f, THETA, reading="end"))
+    with pytest.raises(StudyError, match="the function f has other code.*allow_changed_code=True"):
+        repaired.study(path)
+    with repaired.study(path, allow_changed_code=True) as study:
+        study.run(rollouts=32, executor=executor, progress=False)
+        assert len(study) == len(study.trials) == 32 and not any(t.failed for t in study.trials)
+        assert {row: study.rollouts[row] for row in kept} == kept and study.best.value == 2.0
+
+
+def test_what_becomes_of_errors_is_one_of_two(tmp_path):
+    with pytest.raises(ValueError, match="on_error is 'record' or 'raise', not 'ignore'"):
+        pendulum_problem().study().run(rollouts=1, on_error="ignore")
 
 
 def _raises_beyond(theta: float) -> float:

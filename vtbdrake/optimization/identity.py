@@ -7,17 +7,19 @@ import inspect
 import json
 import platform
 import subprocess
+import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
 from pathlib import Path
-from types import BuiltinFunctionType, FunctionType, MethodType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import Diagram, System
 
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
@@ -26,6 +28,7 @@ from vtbdrake.testbed import Scenario
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None))
 _ARRAYS = (np.generic, np.ndarray)
+_MEASURES = ("qualities", "constraints")
 
 
 def describe(problem: Problem) -> dict[str, Any]:
@@ -37,11 +40,12 @@ def describe(problem: Problem) -> dict[str, Any]:
         "qualities": [_measure(quality) for quality in problem.objectives],
         "constraints": [_measure(constraint) for constraint in problem.constraints],
         "conditions": [{key: np.asarray(value).tolist() for key, value in c.items()} for c in problem.conditions],
-        "risk": _text(problem.risk),
+        "risk": _object_text(problem.risk),
         "horizon": float(task.horizon),
         "threshold": repr(inf if task.threshold is None else task.threshold),
         "sample_period": float(task.sample_period),
         "start": _start(problem),
+        "code": _classes(problem),
     }
     plain: dict[str, Any] = json.loads(json.dumps(described))
     return plain
@@ -93,8 +97,9 @@ def _code(function: Callable[..., Any]) -> str:
 def _text(value: Any, seen: set[int] | None = None) -> str:
     """The same text for the same value in every process.
 
-    Plain data as they are; functions by their source and by what they use: closure, default values, constants and
-    functions of their module; all else by its type and the plain data in it.
+    Plain data as they are; functions and classes by their source and by what they use: closure, default values, and the
+    constants, functions and classes of their module and of others of the user's; all else by its type and the plain
+    data in it.
     """
     seen = set() if seen is None else seen
     if isinstance(value, np.generic | np.ndarray):
@@ -111,38 +116,114 @@ def _text(value: Any, seen: set[int] | None = None) -> str:
             parts = (value.func, value.args, value.keywords)
         case MethodType():
             parts = (value.__func__, value.__self__)
-        case FunctionType() if id(value) in seen:
+        case FunctionType() | type() if id(value) in seen:
             return value.__qualname__
+        case type():
+            seen.add(id(value))
+            parts = (value.__qualname__, _members(value), [base for base in value.__bases__ if _is_own(base)])
+        case CodeType():
+            parts = (value.co_code, value.co_consts, value.co_names)
         case FunctionType():
             seen.add(id(value))
             parts = (_source(value), value.__defaults__, value.__kwdefaults__, _used(value))
         case BuiltinFunctionType() | np.ufunc():
             return value.__name__
+        case _ if _is_own(type(value)):
+            return f"{_object_text(value)} of {_text(type(value), seen)}"
         case _:
-            plain = {k: v for k, v in getattr(value, "__dict__", {}).items() if isinstance(v, (*_PLAIN, *_ARRAYS))}
-            return f"{type(value).__qualname__}({', '.join(f'{k}={_text(v)}' for k, v in plain.items())})"
+            return _object_text(value)
     return f"{type(value).__name__}({', '.join(_text(part, seen) for part in parts)})"
 
 
-def _source(function: FunctionType) -> str | tuple[Any, ...]:
+def _object_text(value: Any) -> str:
+    """The type of an object, and the plain data in it."""
+    plain = {k: v for k, v in getattr(value, "__dict__", {}).items() if isinstance(v, (*_PLAIN, *_ARRAYS))}
+    return f"{type(value).__qualname__}({', '.join(f'{k}={_text(v)}' for k, v in plain.items())})"
+
+
+def _source(function: FunctionType) -> str | CodeType:
     """Its source text; what was typed into an interpreter has none, but it has bytecode."""
     try:
         return textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
-        code = function.__code__
-        return code.co_code, code.co_consts, code.co_names
+        return function.__code__
 
 
 def _used(function: FunctionType) -> list[tuple[str, Any]]:
+    """What a function uses of its surroundings, by name; only data and the user's own code count."""
     names, cells = function.__code__.co_freevars, function.__closure__ or ()
-    closure = [(name, cell.cell_contents) for name, cell in zip(names, cells, strict=True)]
-    found = ((name, function.__globals__.get(name)) for name in function.__code__.co_names)
+    closure = [(name, _content(cell)) for name, cell in zip(names, cells, strict=True)]
+    words = _words(function.__code__)
+    found = [(name, function.__globals__[name]) for name in words if name in function.__globals__]
+    for name, value in list(found):
+        if isinstance(value, ModuleType) and _is_own(value):
+            found += [(f"{name}.{word}", vars(value)[word]) for word in words if word in vars(value)]
     return closure + [
         (name, value)
         for name, value in found
         if isinstance(value, (*_PLAIN, *_ARRAYS, tuple))
-        or (isinstance(value, FunctionType) and value.__module__ == function.__module__)
+        or (isinstance(value, FunctionType | type) and (value.__module__ == function.__module__ or _is_own(value)))
     ]
+
+
+def _words(code: CodeType) -> list[str]:
+    """The names that a function uses, and the functions and comprehensions in it."""
+    inner = [word for constant in code.co_consts if isinstance(constant, CodeType) for word in _words(constant)]
+    return list(dict.fromkeys([*code.co_names, *inner]))
+
+
+def _content(cell: CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # It is not filled yet.
+        return None
+
+
+def _members(kind: type) -> list[tuple[str, Any]]:
+    """The constants and functions of a class; what Python has generated follows from the rest."""
+    found = []
+    for name, member in vars(kind).items():
+        for attribute in ("__func__", "fget", "func"):  # Static and class methods, properties, cached properties.
+            member = getattr(member, attribute, member)
+        generated = isinstance(member, FunctionType) and member.__code__.co_filename == "<string>"
+        hidden = name.startswith("__") and not isinstance(member, FunctionType)
+        if isinstance(member, (*_PLAIN, *_ARRAYS, FunctionType)) and not generated and not hidden:
+            found.append((name, member))
+    return found
+
+
+def _is_own(thing: Any) -> bool:
+    """Whether a module, a class or a function is the user's: neither Python's, nor this package's, nor installed."""
+    return _is_own_module(thing.__name__ if isinstance(thing, ModuleType) else str(thing.__module__))
+
+
+@cache
+def _is_own_module(name: str) -> bool:
+    if name.partition(".")[0] in (*sys.stdlib_module_names, "vtbdrake"):
+        return False
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return file is None or not {"site-packages", "dist-packages"} & set(Path(file).parts)
+
+
+def _classes(problem: Problem) -> dict[str, str]:
+    """Digests of the user's code in a testbed: its scenario and risk, its systems and the functions that they hold."""
+    found: dict[str, Any] = {}
+    for kind in (type(problem.scenario), type(problem.risk)):
+        found[f"{kind.__module__}:{kind.__qualname__}"] = kind
+    for system in _systems(problem.testbed.diagram):
+        held = [
+            value for value in getattr(system, "__dict__", {}).values() if isinstance(value, FunctionType | partial)
+        ]
+        things: list[Any] = [type(system), *(value.func if isinstance(value, partial) else value for value in held)]
+        found |= {f"{thing.__module__}:{thing.__qualname__}": thing for thing in things}
+    return {name: _code(thing) for name, thing in sorted(found.items()) if _is_own(thing)}
+
+
+def _systems(diagram: Diagram) -> Iterator[System]:
+    for system in diagram.GetSystems():
+        yield system
+        if isinstance(system, Diagram):
+            yield from _systems(system)
 
 
 def _start(problem: Problem) -> str:
@@ -163,19 +244,31 @@ def dimensions(described: Mapping[str, Any]) -> tuple[Dimension, ...]:
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """In what two described problems differ, each in a phrase."""
+    """In what two described problems differ but in their code, each in a phrase."""
     found = []
-    for key in sorted({*theirs, *ours}):
+    for key in sorted({*theirs, *ours} - {"code"}):
         a, b = theirs.get(key), ours.get(key)
-        if a == b:
+        if a == b or (key in _MEASURES and _without_code(a) == _without_code(b)):
             continue
         if isinstance(a, dict) and isinstance(b, dict):
             inner = [k for k in sorted({*a, *b}) if a.get(k) != b.get(k)]
             found += [f"{key} {k}: {a.get(k)!r} there, {b.get(k)!r} here" for k in inner]
-        elif key in ("qualities", "constraints") and _without_code(a) == _without_code(b):
-            found.append(f"the function {', '.join(q['name'] for q in ours[key])} has other code, or uses other values")
         else:
             found.append(f"{key}: {a!r} there, {b!r} here")
+    return found
+
+
+def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
+    """What code of two described problems differs, which are the same otherwise, each in a phrase."""
+    pairs = ((a, b) for key in _MEASURES for a, b in zip(theirs[key], ours[key], strict=True))
+    found = [
+        f"the function {a['name']} has other code, or uses other values" for a, b in pairs if a["code"] != b["code"]
+    ]
+    there, here = theirs["code"], ours["code"]
+    for name in sorted({*there, *here}):
+        if there.get(name) != here.get(name):
+            how = "has other code" if name in there and name in here else "is new" if name in here else "is gone"
+            found.append(f"{name}, a part of the testbed, {how}")
     return found
 
 

@@ -296,6 +296,7 @@ class Problem:
         solver: str | None = None,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
+        allow_changed_code: bool = False,
     ) -> Study:
         """A study of the problem: begins a new one, or resumes the one in the file.
 
@@ -305,10 +306,13 @@ class Problem:
                 or that of the file.
             seed: of the solver; 0 by default, or that of the file.
             options: of the solver.
+            allow_changed_code: go on although the functions of the problem, or the Python code of its testbed, are not
+                those that the study began with. The file notes what has changed (`Study.record`, ``changes``). Its
+                rollouts stay as they are, but those in which a quality function failed run again.
 
         Raises:
-            StudyError: the file is no study, is damaged, of another version, problem, solver or seed.
+            StudyError: the file is no study, is damaged, of another version, problem, solver or seed, or of other code.
         """
         from vtbdrake.optimization.study import Study
 
-        return Study.of(self, path, solver=solver, seed=seed, options=options)
+        return Study.of(self, path, solver=solver, seed=seed, options=options, allow_changed_code=allow_changed_code)

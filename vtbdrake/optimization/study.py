@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor as FuturesExecutor
 from typing import TYPE_CHECKING, Any, Self
 
-from vtbdrake.optimization.identity import describe, differences, plain, plain_options, revision, versions
+from vtbdrake.optimization.identity import code_changes, describe, differences, plain, plain_options, revision, versions
 from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
 from vtbdrake.optimization.solvers.solver import Point, Solver
@@ -61,6 +61,7 @@ class Study(StudyRecord):
         solver: str | None = None,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
+        allow_changed_code: bool = False,
     ) -> Self:
         """See `Problem.study`."""
         meta: dict[str, Any] = {
@@ -85,12 +86,21 @@ class Study(StudyRecord):
                     f"{path} is a study of another problem ({'; '.join(changed)}): give another file, or restore the "
                     "problem"
                 )
+            code = code_changes(study._meta["problem"], meta["problem"])
+            if code and not allow_changed_code:
+                raise StudyError(
+                    f"{path} was made with other code ({'; '.join(code)}): give another file, restore the code, or, if "
+                    "its rollouts would come out the same, go on with allow_changed_code=True"
+                )
             for key, value in given.items():
                 if value is not None and study._meta[key] != meta[key]:
                     raise StudyError(
                         f"{path} was begun with {key} {study._meta[key]!r}, not {meta[key]!r}: leave {key} out to "
                         "resume it, or give another file"
                     )
+            if code:
+                study._file.change_code(meta["problem"], code, versions=meta["versions"], revision=meta["revision"])
+                study._meta = study._file.meta
         except BaseException:
             study.close()
             raise
@@ -108,6 +118,7 @@ class Study(StudyRecord):
         executor: str | Executor | FuturesExecutor = "auto",
         workers: int | None = None,
         time_limit: float | None = None,
+        on_error: str = "record",
         progress: bool = True,
     ) -> Self:
         """Goes on until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
@@ -121,12 +132,15 @@ class Study(StudyRecord):
                 where there are several conditions and one quality.
             executor, workers: see `Problem.sweep`.
             time_limit: of one rollout, in seconds; one that takes longer fails.
+            on_error: what becomes of a rollout in which a quality or constraint function raises, is negative or NaN.
+                ``record``: it counts as failed, with the message, and the first of a run is logged; ``raise``: the run
+                ends there.
             progress: show a progress bar: rollouts per second, the best so far, the time left.
 
         Raises:
             ValueError: there is no budget at all, or it makes no sense; an executor or solver is unknown.
             StudyError: another process runs the study, or it was opened without its problem.
-            QualityError: f raises, is negative or NaN. What was finished before is kept.
+            QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``. What was finished is kept.
         """
         problem = self._problem
         if problem is None:
@@ -134,6 +148,8 @@ class Study(StudyRecord):
                 f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
             )
         check_budget(problem, rollouts=rollouts, seconds=seconds, target=target)
+        if on_error not in ("record", "raise"):
+            raise ValueError(f"on_error is 'record' or 'raise', not {on_error!r}")
         racing = len(problem.conditions) > 1 and len(problem.objectives) == 1 if racing is None else racing
         budget = rollouts if rollouts is not None else 10**9
         chosen = make_executor(
@@ -142,7 +158,15 @@ class Study(StudyRecord):
         try:
             with self._file.running(versions=versions(), revision=revision(problem.scenario)) as reason:
                 solver = self._make_solver(problem, rollouts, racing=racing)
-                run = StudyRun(self._file, problem, solver, chosen, racing=racing, progress=progress)
+                run = StudyRun(
+                    self._file,
+                    problem,
+                    solver,
+                    chosen,
+                    racing=racing,
+                    catch=on_error == "record",
+                    progress=progress,
+                )
                 self.reason, self.message = run.until(rollouts=rollouts, seconds=seconds, target=target)
                 reason.append(self.reason)
         finally:

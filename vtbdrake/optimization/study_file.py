@@ -23,6 +23,7 @@ from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study_error import StudyError, damaged, explained
 from vtbdrake.optimization.study_lock import claim
 from vtbdrake.optimization.study_name import sqlite_name
+from vtbdrake.rollout.result import QUALITY_FAILED
 
 VERSION = 2
 _APPLICATION = 0x56544253  # "VTBS"
@@ -290,6 +291,26 @@ class StudyFile:
             self._db.execute("DELETE FROM trials")
             self._insert("trials", [(batch, position - shift, *rest) for batch, position, *rest in rows])
         self._set({"told": 0})
+
+    def change_code(
+        self, problem: Mapping[str, Any], what: Sequence[str], *, versions: Mapping[str, str], revision: str
+    ) -> None:
+        """Notes that the code of the problem has changed, and forgets the rollouts in which the old quality failed.
+
+        Raises:
+            StudyError: another process runs the study.
+        """
+        with claim(self.path), self._transaction():
+            failed = {row[0] for row in self._rows("rollouts") if row[7].startswith(QUALITY_FAILED)}
+            self._db.execute("DELETE FROM gradients")
+            for point in failed:
+                self._db.execute("DELETE FROM trials WHERE point = ?", (point,))
+            self._db.execute(
+                "DELETE FROM rollouts WHERE substr(message, 1, ?) = ?", (len(QUALITY_FAILED), QUALITY_FAILED)
+            )
+            self._withdraw()
+            change = {"at": _now(), "what": list(what), "versions": dict(versions), "revision": revision}
+            self._set({"problem": problem, "changes": [*self.meta.get("changes", []), change]})
 
     def trials(self) -> list[TrialRow]:
         """All judged points, in the order of the study."""

@@ -92,7 +92,8 @@ class StudyRecord:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What the study is about: the problem, the scenario, the solver, the seed, the versions, the git revision."""
+        """What the study is about: the problem, the scenario, the solver, the seed, the versions, the git revision, and
+        the ``changes`` of the code that were allowed."""
         return dict(self._meta)
 
     @property
@@ -203,6 +204,8 @@ class StudyRecord:
             f"{len(trials)} points, {len(outcomes)} rollouts; solver {self._meta['solver']}, seed "
             f"{self._meta['seed']}: " + ", ".join(f"{method} ({count})" for method, count in methods.items())
         ]
+        for change in self._meta.get("changes", []):
+            lines.append(f"the code changed on {change['at'][:10]}: {'; '.join(change['what'])}")
         if self.message:
             lines.append(f"ended: {self.message}")
         if len(self.directions) > 1:

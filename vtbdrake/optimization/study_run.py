@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf, isfinite, isnan
 from queue import Empty, SimpleQueue
 
@@ -20,6 +21,7 @@ from vtbdrake.optimization.study_file import StudyFile, TrialRow
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.many import watched
+from vtbdrake.rollout.result import QUALITY_FAILED
 
 _log = logging.getLogger(__name__)
 
@@ -42,10 +44,20 @@ class StudyRun:
     """Runs a study in a file once. What the file holds is told to the solver first, batch by batch as it was found."""
 
     def __init__(
-        self, file: StudyFile, problem: Problem, solver: Solver, executor: Executor, *, racing: bool, progress: bool
+        self,
+        file: StudyFile,
+        problem: Problem,
+        solver: Solver,
+        executor: Executor,
+        *,
+        racing: bool,
+        catch: bool,
+        progress: bool,
     ) -> None:
         self._file = file
         self._problem = problem
+        self._task = replace(problem.task, catch=True) if catch else problem.task
+        self._warned = False
         self._solver = solver
         self._executor = executor
         self._known: dict[Row, Outcome] = file.outcomes()
@@ -183,12 +195,13 @@ class StudyRun:
         now = rows[: max(0, int(min(self._limit - len(self._known), len(rows))))]
         points = [self._problem.values(point, condition=condition) for point, condition in now]
         self._refuse_lateness()
-        results = self._executor.run(self._problem.task, points) if points else iter(())
+        results = self._executor.run(self._task, points) if points else iter(())
         try:
             for index, result in results:
                 outcome = Outcome.of(result)
                 self._known[now[index]] = outcome
                 self._file.add(*now[index], outcome)
+                self._warn(outcome)
                 assert self._bar is not None
                 self._bar.update()
                 self._refuse_success([now[index][0]])
@@ -198,6 +211,15 @@ class StudyRun:
                 results.close()  # type: ignore[attr-defined]
         if len(now) < len(rows):
             raise _SpentError(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
+
+    def _warn(self, outcome: Outcome) -> None:
+        """Says once in a run that the quality function fails: it may be wrong, and all that follows in vain."""
+        if outcome.message.startswith(QUALITY_FAILED) and not self._warned:
+            self._warned = True
+            _log.warning(
+                "%s. The rollout counts as failed, and so do others of this kind; on_error='raise' ends the run",
+                outcome.message.removeprefix(QUALITY_FAILED),
+            )
 
     def _with_gradient(self, evaluation: Evaluation) -> Evaluation:
         if self._gradients is None:

@@ -17,6 +17,8 @@ THRESHOLD = "threshold"
 HORIZON = "horizon"
 TERMINATED = "terminated"
 FAILED = "failed"
+# How the message of a rollout begins that failed since its quality function did.
+QUALITY_FAILED = "QualityError: "
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.quality import Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.readings import READINGS
-from vtbdrake.rollout.result import FAILED, HORIZON, TERMINATED, THRESHOLD, RolloutResult
+from vtbdrake.rollout.result import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
@@ -70,7 +70,7 @@ class RolloutRunner:
         """One rollout from s0 with ``parameters`` (address -> value) set in it.
 
         Raises:
-            QualityError: f raises, is negative or NaN.
+            QualityError: f raises, is negative or NaN, and the task does not catch that.
             CancelledError: ``cancel`` was set meanwhile.
         """
         begin = time.perf_counter()
@@ -93,6 +93,10 @@ class RolloutRunner:
                         break
             except SimulationError as failure:
                 end, message = FAILED, str(failure)
+            except QualityError as failure:
+                if not self.task.catch:
+                    raise
+                end, message = FAILED, f"{QUALITY_FAILED}{failure}"
             return samples.result(dict(parameters), end, message, begin)
 
     def state(self, parameters: Mapping[str, Any], t: float) -> Any:

@@ -35,6 +35,8 @@ class RolloutTask:
             simulation with error control take it by `AddressedDiagram.fork`, or its future will differ a little.
         keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
         measures: what else is sampled and read as one number each: further objectives, constraints.
+        catch: what f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
+            diverges. Otherwise it is raised, and ends the others.
     """
 
     scenario: Scenario
@@ -47,6 +49,7 @@ class RolloutTask:
     start: Snapshot | None = None
     keep_state: bool = False
     measures: tuple[Measure, ...] = ()
+    catch: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.scenario, Scenario):
