@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +18,14 @@ import pytest
 from tests.control.recording.servo import Servo
 from tests.control.scripted import PERIOD
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.cycle import Change
+from vtbdrake.control.lcm_wire import decode
+from vtbdrake.control.recording.changes import change_events
 from vtbdrake.control.recording.control_log import ControlLog
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
+from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.control.recording.log_events import LogEvents
-from vtbdrake.control.recording.log_format import EVENT, SYNC, VERSION, LogError
+from vtbdrake.control.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, event
 from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.recorder import Recorder
 from vtbdrake.control.recording.replay import replay
@@ -179,8 +186,6 @@ def test_a_change_of_a_damaged_cycle_is_not_taken_for_another_cycles(
 
 def shifted(content: bytes, reference: ControlLog, first: int, seconds: float) -> bytes:
     """The log with other times of day from a cycle on, as if the clock had been set; checksums as they should be."""
-    import zlib
-
     data = bytearray(content)
     begin = 0
     for i, (_, _, start, end) in enumerate(reference.events.on("VTB_CYCLE")):
@@ -243,8 +248,6 @@ def test_damage_at_the_beginning_is_told(whole: bytes, reference: ControlLog, tm
 
 
 def test_a_log_of_another_version_is_refused(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
-    import zlib
-
     _, _, begin, end = reference.events.on("VTB_LOG")[0]
     content = bytearray(whole)
     at = whole.index(b'"version": %d' % VERSION, begin)
@@ -289,3 +292,166 @@ def test_a_killed_loop_leaves_what_it_had_recorded(tmp_path: Path) -> None:
     assert not log.closed and not log.gaps and not log.damages
     assert len(log) == 500 and os.path.getsize(path) == len(log.events.content)
     assert replay(log).identical
+
+
+# -- logs from strangers: every checksum is right, and what they say cannot be
+
+
+def with_header(whole: bytes, reference: ControlLog, **fields: object) -> bytes:
+    """The same log, whose header has other values."""
+    _, utime, begin, end = reference.events.on("VTB_LOG")[0]
+    message = decode(lcmt_vtb_log, whole[begin:end])
+    message.header = json.dumps({**json.loads(message.header), **fields})
+    message.crc = signed_crc(message.header.encode())
+    return event(0, utime, b"VTB_LOG", message.encode()) + whole[end:]
+
+
+def signed_crc(data: bytes) -> int:
+    return struct.unpack(">i", zlib.crc32(data).to_bytes(4, "big"))[0]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"sense": [["position", 10**12, "m"]]},
+        {"sense": [["position", -1, "m"]]},
+        {"sense": [["position", "2", "m"]]},
+        {"sense": [["position", 1 << 20, "m"], ["speed", 1, "m"]]},
+        {"sense": "abc"},
+        {"sense": 3},
+        {"sense": [[1, 2]]},
+        {"act": None},
+        {"period": 0.0},
+        {"period": "fast"},
+        {"period": float("nan")},
+        {"start_time": float("inf")},
+        {"steps": -1},
+        {"steps": 10**30},
+        {"first_cycle": True},
+        {"first_cycle": 10**30},
+        {"target": "elsewhere"},
+        {"record": [1]},
+        {"record": None},
+        {"scenario": 7},
+        {"positions": {"sense": 3}},
+        {"versions": "mine"},
+        {"unknown": 1},
+    ],
+)
+def test_a_header_that_cannot_be_is_refused(
+    whole: bytes, reference: ControlLog, tmp_path: Path, fields: dict[str, object]
+) -> None:
+    assert read(tmp_path, with_header(whole, reference)).numbers.tolist() == reference.numbers.tolist()
+    with pytest.raises(LogError, match="the log's header cannot be read"):
+        read(tmp_path, with_header(whole, reference, **fields))
+
+
+def test_no_more_memory_is_asked_for_than_the_file_has(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    """The header tells of cycles of 8 MiB, the file has 1,000 of one byte."""
+    content = with_header(whole, reference, sense=[["position", 1 << 20, "m"]])
+    path = tmp_path / "large.lcm"
+    path.write_bytes(content + b"".join(event(i, 0, b"VTB_CYCLE", b"x") for i in range(1000)))
+    code = """
+import resource, sys
+from vtbdrake.control.recording.log_reader import read_log
+limit = 4 << 30
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+log = read_log(sys.argv[1])
+print(len(log), len(log.damages))
+"""
+    done = subprocess.run([sys.executable, "-c", code, path], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == ["0", str(1000 + CYCLES)], done.stderr[-2000:]
+    assert len(done.stderr) < 10_000
+
+
+def framed(number: int, *messages: tuple[str, bytes], reference: ControlLog, whole: bytes) -> bytes:
+    """A whole cycle with these messages before it, as the recorder writes them."""
+    _, _, begin, end = reference.events.on("VTB_CYCLE")[-1]
+    before = b"".join(event(0, 0, channel.encode(), data) for channel, data in messages)
+    layout = CycleLayout(reference.header.sense, reference.header.act)
+    record = np.frombuffer(whole[begin:end], layout.dtype).copy()
+    head = EVENT.pack(SYNC, 0, 0, len("VTB_CYCLE"), layout.dtype.itemsize) + b"VTB_CYCLE"
+    record["number"] = number
+    record["size"] = len(before) + len(head) + layout.dtype.itemsize
+    data = before + head + record.tobytes()
+    return data[:-4] + zlib.crc32(data[:-4]).to_bytes(4, "big")
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"dtype": "O"}, "array of type 'O'"),
+        ({"dtype": "nonsense"}, "array of type 'nonsense'"),
+        ({"dtype": "(1000000,)f8"}, "array of type"),
+        ({"dtype": "<U0"}, "itemsize"),
+        ({"shape": (-1,)}, "shape"),
+        ({"shape": (3,)}, "cannot reshape"),
+        ({"shape": ()}, "cannot reshape"),
+        ({"data": b"123", "size": 3}, "buffer size"),
+        ({"number": 1000}, "is of cycle 1000, which is not there"),
+        ({"number": -(1 << 63)}, "which is not there"),
+    ],
+)
+def test_a_change_that_cannot_be_is_a_damage(
+    whole: bytes, reference: ControlLog, tmp_path: Path, fields: dict[str, object], told: str
+) -> None:
+    [good] = change_events([Change("write", {"u.target": np.array([1.0, 2.0])})], 100, 0)
+    for name, value in fields.items():
+        setattr(good, name, value)
+    good.ndim = len(good.shape)
+    log = read(tmp_path, whole + framed(100, ("VTB_CHANGE", good.encode()), reference=reference, whole=whole))
+    assert log.numbers[-1] == 100
+    [damage] = log.damages
+    assert told in damage.what
+    assert all(index < len(log) - 1 for index, _ in log.changes)
+
+
+def test_damages_without_end_are_told_in_few_words(
+    whole: bytes, reference: ControlLog, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = read(tmp_path, whole + SYNC.to_bytes(4, "big") * 50_000)
+    assert len(log) == CYCLES and len(log.damages) == 1001
+    assert "the last of 49000 more" in str(log.damages[-1])
+    assert len(caplog.records[-1].getMessage()) < 5000
+
+
+def test_a_file_with_channels_without_end_is_no_log(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="more than 10000 channels"):
+        read(tmp_path, b"".join(event(i, 0, b"CHANNEL_%d" % i, b"") for i in range(10_001)))
+
+
+def test_a_pipe_or_a_folder_is_no_log(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(LogError, match="not a file"):
+            read_log(path)
+
+
+def test_random_damage_is_reported_or_an_error_of_its_own(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
+    chosen, numbers = random.Random(7), set(reference.numbers.tolist())
+    first, read_again = reference.events.on("VTB_STATE")[0][3], 0
+    for k in range(150):
+        content = bytearray(whole)
+        for _ in range(chosen.randrange(1, 6)):
+            at = chosen.randrange(0 if k % 3 == 0 else first, len(content))
+            size = chosen.choice([1, 4, 50, 3000])
+            kind = chosen.randrange(4)
+            if kind == 0:
+                content[at : at + size] = chosen.randbytes(size)
+            elif kind == 1:
+                del content[at : at + size]
+            elif kind == 2:
+                content[at:at] = chosen.randbytes(size)
+            else:
+                content[at:at] = content[chosen.randrange(len(content)) :][:size]
+        try:
+            log = read(tmp_path, bytes(content))
+        except LogError:
+            continue
+        read_again += 1
+        assert set(log.numbers.tolist()) <= numbers
+        missing = numbers - set(log.numbers.tolist())
+        told = {n for gap in log.gaps for n in range(gap.first, (gap.last or gap.first) + 1)}
+        assert missing <= told or not log.closed
+        assert log.damages or not missing
+    assert read_again >= 100

@@ -28,7 +28,7 @@ def test_lcm_logplayer_plays_every_message_onto_a_hub(tmp_path: Path) -> None:
     player = Path(sys.executable).with_name("lcm-logplayer")
     with Hub(port=0) as hub:
         bus = lcm.LCM(hub.url)
-        subscription = bus.subscribe(".*", lambda channel, data: heard.append((channel, data)))
+        subscription = bus.subscribe("(?!VTB_HUB).*", lambda channel, data: heard.append((channel, data)))
         subscription.set_queue_capacity(0)
         with subprocess.Popen([player, "--lcm-url", hub.url, "--speed", "5", path], stdout=subprocess.DEVNULL) as run:
             guard = threading.Timer(PATIENCE, run.kill)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from typing import Any
@@ -40,8 +41,8 @@ def _entries(values: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
 def changes_of(messages: Iterable[lcmt_vtb_change]) -> list[tuple[int, Change]]:
     """The changes of some messages, in order, each with the number of its cycle.
 
-    Raises:
-        ValueError: a message says what cannot be.
+    Args:
+        messages: such that `value_of` each can be told.
     """
     found = []
     for (number, _), group in groupby(messages, key=lambda message: (message.number, message.change)):
@@ -50,13 +51,22 @@ def changes_of(messages: Iterable[lcmt_vtb_change]) -> list[tuple[int, Change]]:
         for message in group:
             kind = message.kind
             if message.name:
-                values.setdefault(message.address, {})[message.name] = _value(message)
+                parts = values.setdefault(message.address, {})
+                if isinstance(parts, dict):
+                    parts[message.name] = value_of(message)
             elif message.address:
-                values[message.address] = _value(message)
+                values[message.address] = value_of(message)
         found.append((number, Change(kind, values)))
     return found
 
 
-def _value(message: lcmt_vtb_change) -> Any:
+def value_of(message: lcmt_vtb_change) -> Any:
+    """Return the number, the text, or the array of such, that a message carries.
+
+    Raises:
+        ValueError: it carries none.
+    """
+    if not re.fullmatch(r"[<>|][biufU][0-9]{1,5}", message.dtype) or any(size < 0 for size in message.shape):
+        raise ValueError(f"an array of type {message.dtype[:20]!r} and shape {message.shape[:9]}")
     array = np.frombuffer(message.data, np.dtype(message.dtype)).reshape(message.shape)
     return array if message.shape else array.item()

@@ -104,9 +104,9 @@ class ControlLog:
         lines = [
             f"{self.path}: {len(self)} cycles of {self.header.period:g} s, {self.header.record.get('scenario', '')}"
         ]
-        lines += [f"damage {damage}" for damage in self.damages]
-        lines += [f"missing: {gap}" for gap in self.gaps]
-        lines += [f"the clock jumps at cycle {self.numbers[i]}" for i in self.clock_jumps]
+        lines += _first([f"damage {damage}" for damage in self.damages])
+        lines += _first([f"missing: {gap}" for gap in self.gaps])
+        lines += _first([f"the clock jumps at cycle {self.numbers[i]}" for i in self.clock_jumps])
         return "\n".join(lines if self.closed else [*lines, "the recorder was not closed: what followed is not known"])
 
     @property
@@ -133,3 +133,7 @@ class ControlLog:
             raise LogError(f"{self.path} has no channel {channel!r}; it has: {', '.join(self.channels) or 'none'}")
         for number, utime, begin, end in self.events.on(channel):
             yield Message(number, utime, channel, self.events.data(begin, end))
+
+
+def _first(lines: list[str], most: int = 20) -> list[str]:
+    return lines if len(lines) <= most else [*lines[:most], f"... and {len(lines) - most} more like it"]

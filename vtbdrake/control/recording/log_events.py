@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vtbdrake.control.recording.log_format import OWN
+from vtbdrake.control.recording.log_format import OWN, LogError
 from vtbdrake.control.recording.scan import find_events
 
 Place = tuple[int, int, int, int]
@@ -29,7 +29,10 @@ class LogEvents:
         """
         Raises:
             OSError: the file cannot be read.
+            LogError: it is no file, but a pipe, say; or it has too many channels for a log.
         """
+        if path.exists() and not path.is_file():
+            raise LogError(f"{path} is no log: it is a folder, a device or a pipe, not a file")
         with path.open("rb") as file:
             empty = file.seek(0, 2) == 0  # which cannot be mapped
             self.content: mmap.mmap | bytes = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -22,6 +22,13 @@ SYNC = 0xEDA1DA01
 EVENT = struct.Struct(">IqqII")
 """Sync word, number of the event, time in microseconds, length of the channel's name, length of the data."""
 
+MAX_CHANNELS = 10_000
+"""Of a log; in memory each costs much more than its smallest event in the file."""
+MAX_DAMAGES = 1000
+"""So many places where a file is damaged are told one by one."""
+MAX_SIZE = 1 << 20
+"""Of all signals of one side together, in numbers."""
+
 DIGEST_SIZE = 16
 VECTOR = -1
 """`lcmt_vtb_cycle.source` of a vector signal."""

@@ -9,10 +9,11 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.control.recording.log_format import VERSION, LogError, LoggedSignal
+from vtbdrake.control.recording.log_format import MAX_SIZE, VERSION, LogError, LoggedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, Signal, VirtualTestbed, load_scenario
 from vtbdrake.testbed.scenario import is_imported
@@ -20,6 +21,23 @@ from vtbdrake.testbed.scenario import is_imported
 _log = logging.getLogger(__name__)
 
 TESTBED, DPS = "testbed", "dps"
+
+_LARGE = 1 << 52
+_FIELDS: dict[str, tuple[type, ...]] = {
+    "scenario": (str,),
+    "record": (dict,),
+    "target": (str,),
+    "period": (int, float),
+    "start_time": (int, float),
+    "steps": (int,),
+    "first_cycle": (int,),
+    "initialized": (bool,),
+    "idle": (bool,),
+    "pace": (str, type(None)),
+    "positions": (dict,),
+    "versions": (dict,),
+}
+"""What the JSON of a header's fields may be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +115,35 @@ class LogHeader:
                 raise LogError(f"the log has the format {values['version']}, this version of vtbdrake reads {VERSION}")
             for side in ("sense", "act", "commands"):
                 values[side] = tuple(LoggedSignal(*signal) for signal in values[side])
-            return cls(**values)
+            header = cls(**values)
+            header._check_fields()
+            return header
         except LogError:
             raise
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise LogError(f"the log's header cannot be read: {error!r}") from error
+
+    def _check_fields(self) -> None:
+        """
+        Raises:
+            ValueError: a field is not what it can be.
+        """
+        for name, kinds in _FIELDS.items():
+            if type(value := getattr(self, name)) not in kinds:
+                raise ValueError(f"{name} cannot be {str(value)[:50]!r}")
+        if self.target not in (TESTBED, DPS) or not 0.0 < self.period < inf or not abs(self.start_time) < inf:
+            raise ValueError(f"target {self.target!r}, period {self.period}, start_time {self.start_time}")
+        if not 0 <= self.steps < _LARGE or not 0 <= self.first_cycle < _LARGE:
+            raise ValueError(f"steps {self.steps}, first_cycle {self.first_cycle}")
+        for signals in (self.sense, self.act, self.commands):
+            for name, size, unit in signals:
+                if not isinstance(name, str) or not isinstance(unit, str) or not (size is None or type(size) is int):
+                    raise ValueError(f"a signal cannot be {str((name, size, unit))[:50]}")
+            sizes = [size for _, size, _ in signals if size is not None]
+            if min(sizes, default=0) < 0 or sum(sizes) > MAX_SIZE or len(signals) > MAX_SIZE:
+                raise ValueError(f"the signals of one side have together at most {MAX_SIZE} numbers")
+        if not all(isinstance(side, dict) for side in self.positions.values()):
+            raise ValueError(f"positions cannot be {str(self.positions)[:50]!r}")
 
     @property
     def scenario_name(self) -> str:

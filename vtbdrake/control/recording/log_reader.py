@@ -6,14 +6,14 @@ import logging
 import os
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vtbdrake.control.lcm_wire import MalformedError, decode
-from vtbdrake.control.recording.changes import changes_of
+from vtbdrake.control.recording.changes import changes_of, value_of
 from vtbdrake.control.recording.control_log import ControlLog, Damage, Gap
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.control.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
@@ -38,7 +38,6 @@ from vtbdrake.control.recording.log_format import (
 from vtbdrake.control.recording.log_header import LogHeader
 from vtbdrake.control.recording.scan import whole_cycles
 from vtbdrake.state import Snapshot
-from vtbdrake.state.archive import ArchiveError
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +62,10 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
     damages = [Damage(*damage) for damage in events.damages]
     records, frames = _cycles(events, layout, damages)
     index = {number: i for i, number in enumerate(records["number"].tolist())}
+    changes, faults, digests = (
+        _of_cycles(events, channel, message_type, damages, frames, index)
+        for channel, message_type in ((CHANGE, lcmt_vtb_change), (FAULT, lcmt_vtb_fault), (DIGEST, lcmt_vtb_digest))
+    )
     source, act = records["source"], records["act"]
     log = ControlLog(
         path=path,
@@ -78,18 +81,9 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
         commands=_where(records["commands"], layout, header, act & COMMANDED),
         commanded={signal.name: act[:, i] & COMMANDED != 0 for i, signal in enumerate(header.act)},
         sent=_where(records["sent"], layout, header, act & SENT),
-        changes=[
-            (index[number], change)
-            for number, change in changes_of(_messages(events, CHANGE, lcmt_vtb_change, damages, frames))
-        ],
-        faults=[
-            (index[message.number], tuple(message.reasons))
-            for message in _messages(events, FAULT, lcmt_vtb_fault, damages, frames)
-        ],
-        digests=[
-            (index[message.number], message.digest)
-            for message in _messages(events, DIGEST, lcmt_vtb_digest, damages, frames)
-        ],
+        changes=[(index[number], change) for number, change in changes_of(changes)],
+        faults=[(index[message.number], tuple(message.reasons)) for message in faults],
+        digests=[(index[message.number], message.digest) for message in digests],
         damages=damages,
         gaps=_gaps(header, records["number"], _last(events, damages)),
         clock_jumps=_jumps(records),
@@ -119,7 +113,9 @@ def _begin(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         if zlib.crc32(state.snapshot) != state.crc & 0xFFFFFFFF:
             raise LogError(f"{path} cannot be used: the state before the first cycle is damaged")
         return header, Snapshot.load(state.snapshot)
-    except (MalformedError, ArchiveError) as error:
+    except LogError:
+        raise
+    except (ValueError, TypeError, LookupError, struct.error) as error:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 
 
@@ -146,23 +142,41 @@ def _where(entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: n
     return columns
 
 
-def _messages(
-    events: LogEvents, channel: str, message_type: Any, damages: list[Damage], frames: np.ndarray | None = None
+def _of_cycles(
+    events: LogEvents,
+    channel: str,
+    message_type: Any,
+    damages: list[Damage],
+    frames: np.ndarray,
+    numbers: Collection[int],
 ) -> list[Any]:
-    """Those of a channel; with ``frames`` only what belongs to them: of a cycle that does not count, nothing does."""
+    """The messages of a channel that belong to the cycles that count: of another cycle, nothing does."""
     found = []
-    places = events.places(channel)
-    for _, _, begin, end in (places if frames is None else _within(frames, places)).tolist():
+    for begin, message in _decoded(events, channel, message_type, damages, _within(frames, events.places(channel))):
+        if message.number in numbers:
+            found.append(message)
+        else:
+            damages.append(Damage(begin, f"an event on {channel} is of cycle {message.number}, which is not there"))
+    return found
+
+
+def _decoded(
+    events: LogEvents, channel: str, message_type: Any, damages: list[Damage], places: np.ndarray
+) -> Iterator[tuple[int, Any]]:
+    for _, _, begin, end in places.tolist():
         try:
-            found.append(decode(message_type, events.data(begin, end)))
+            message = decode(message_type, events.data(begin, end))
+            if message_type is lcmt_vtb_change:
+                value_of(message)
         except (MalformedError, struct.error, ValueError) as error:
             damages.append(Damage(begin, f"an event on {channel} cannot be read ({error})"))
-    return found
+        else:
+            yield begin, message
 
 
 def _last(events: LogEvents, damages: list[Damage]) -> list[int]:
     """The number of the last cycle that was recorded or lost, where the end of the log tells it."""
-    ends = _messages(events, END, lcmt_vtb_end, damages)
+    ends = [message for _, message in _decoded(events, END, lcmt_vtb_end, damages, events.places(END))]
     whole = [end.number for end in ends if zlib.crc32(end.encode()[:-4]) == end.crc & 0xFFFFFFFF]
     if len(whole) < len(ends):
         damages.append(Damage(events.on(END)[-1][2], "the checksum of the log's end is wrong"))

@@ -13,7 +13,7 @@ from libc.string cimport memcpy
 
 from vtbdrake.control.byte_order cimport get_uint32, get_uint64
 from vtbdrake.control.lcm_maps import LONGEST_CHANNEL_NAME
-from vtbdrake.control.recording.log_format import EVENT, SYNC
+from vtbdrake.control.recording.log_format import EVENT, MAX_CHANNELS, MAX_DAMAGES, SYNC, LogError
 
 cdef packed struct Header:  # EVENT, in the byte order of the file
     uint32_t sync
@@ -37,6 +37,7 @@ def find_events(content not None):
     cdef bint whole, good
     cdef array found
     cdef dict places = {}
+    cdef int64_t more = 0, latest = 0
     damages, sync = [], SYNC.to_bytes(4, "big")
     while at < size:
         header = <const Header*>(data + at)
@@ -51,7 +52,10 @@ def find_events(content not None):
             # Where an event lies within another one, the length of that is wrong; else what follows is.
             if not good or 0 <= following < end:
                 torn = following < 0 and (not whole or get_uint32(&header.sync) == _SYNC)
-                damages.append((at, "the file ends in the middle of an event" if torn else "no event"))
+                if len(damages) < MAX_DAMAGES:
+                    damages.append((at, "the file ends in the middle of an event" if torn else "no event"))
+                else:
+                    more, latest = more + 1, at
                 if following < 0:
                     break
                 at = following
@@ -61,12 +65,16 @@ def find_events(content not None):
         )
         entry = places.get(channel)
         if entry is None:
+            if len(places) >= MAX_CHANNELS:
+                raise LogError(f"the file has events on more than {MAX_CHANNELS} channels: that is no log")
             entry = places[channel] = array("q")
         found = entry
         place[0], place[1] = <int64_t>get_uint64(&header.number), <int64_t>get_uint64(&header.utime)
         place[2], place[3] = begin, end
         extend_buffer(found, <char*>place, 4)
         at = end
+    if more:
+        damages.append((latest, f"the last of {more} more"))
     return {channel: np.frombuffer(entry, np.int64).reshape(-1, 4) for channel, entry in places.items()}, damages
 
 
@@ -79,7 +87,11 @@ def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None)
     cdef int64_t begin, end, length, number, newest = -1
     cdef Py_ssize_t i, n = 0
     cdef uint32_t crc
-    records, frames = np.empty((places.shape[0], size), np.uint8), np.empty((places.shape[0], 2), np.int64)
+    # The size is what a header says. Only so much memory is asked for as there are bytes in the file.
+    cdef Py_ssize_t fitting = 0
+    for i in range(places.shape[0]):
+        fitting += places[i, 3] - places[i, 2] == size
+    records, frames = np.empty((fitting, size), np.uint8), np.empty((fitting, 2), np.int64)
     cdef unsigned char[:, ::1] record = records
     cdef int64_t[:, ::1] frame = frames
     damages, crc32 = [], zlib.crc32
