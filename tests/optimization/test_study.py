@@ -676,3 +676,42 @@ def test_attributes_are_kept_and_come_with_the_table(tmp_path):
         ]:
             with pytest.raises(ValueError, match=message):
                 study.set_attribute(key, value, point=point)
+
+
+def test_callbacks_are_told_of_every_trial_once_and_may_stop_the_study(tmp_path):
+    seen = []
+
+    def note(study, trial):
+        seen.append(trial)
+        study.set_attribute("number", trial.number, point=trial.parameters)
+        if trial.number == 9:
+            study.stop()
+
+    study = pendulum_problem().study(tmp_path / "a.db", solver="cmaes")
+    study.run(rollouts=40, executor="serial", callbacks=[note], progress=False)
+    assert study.reason == "stopped" and 10 <= len(study.trials) < 40
+    study.run(rollouts=60, executor="serial", callbacks=[note], progress=False)
+    assert study.reason == "budget" and len(study.trials) > 40
+    assert [t.parameters for t in seen] == [
+        t.parameters for t in sorted(study.trials, key=lambda t: t.attributes["number"])
+    ]
+    assert len({tuple(t.parameters.values()) for t in seen}) == len(seen) == len(study.trials)
+
+    def broken(study, trial):
+        raise ZeroDivisionError("in the callback")
+
+    with pytest.raises(ZeroDivisionError, match="in the callback"):
+        study.run(rollouts=70, executor="serial", callbacks=[broken], progress=False)
+    with pytest.raises(ValueError, match="a callback is a function of a study and a trial, not 3"):
+        study.run(rollouts=70, callbacks=[3])
+
+
+def test_a_study_without_a_terminal_logs_its_progress(monkeypatch, caplog):
+    monkeypatch.setattr("vtbdrake.optimization.study_run.LOG_PERIOD", 0.0)
+    caplog.set_level("INFO")
+    study = pendulum_problem().study(solver="sobol").run(rollouts=8, executor="serial")
+    lines = [record.getMessage() for record in caplog.records if record.name.startswith("vtbdrake.optimization")]
+    assert lines[0] == "study (sobol): 1 of 8 rollouts" and lines[-1].startswith("study (sobol): 8 of 8 rollouts")
+    caplog.clear()
+    study.run(rollouts=9, executor="serial", progress=False)
+    assert not caplog.records

@@ -14,6 +14,7 @@ main.homes |= {
     "rollout": "vtbdrake.cli.rollout:run_rollout",
     "run": "vtbdrake.cli.run:run_dps",
     "set": "vtbdrake.cli.live:set_values",
+    "study": "vtbdrake.cli.study:study",
     "sweep": "vtbdrake.cli.sweep:run_sweep",
     "variables": "vtbdrake.cli.variables:list_variables",
     "watch": "vtbdrake.cli.watch:watch_values",

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from vtbdrake.cli.options import converted, parse_range
-from vtbdrake.cli.study import (
+from vtbdrake.cli.problem import (
     condition_text,
     execution_options,
     make_problem,

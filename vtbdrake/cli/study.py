@@ -1,145 +1,155 @@
-"""What ``vtbdrake sweep`` and ``vtbdrake boundary`` have in common: how a problem is stated, and its results shown."""
+"""``vtbdrake study``: runs a study, shows it, and gives it points, also while another process runs it."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
-from math import inf
+import logging
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
-import numpy as np
 
-from vtbdrake.cli.group import FailedError, one_line
-from vtbdrake.cli.options import (
-    Setting,
-    converted,
-    horizon_option,
-    output,
-    parse_condition,
-    sample_period_option,
-    scenario_argument,
-    set_option,
-    settings,
-    start_option,
-)
-from vtbdrake.cli.quality import make_quality
-from vtbdrake.cli.text import number, table, write_csv
-from vtbdrake.optimization import Parameter, Problem, Sweep
+from vtbdrake.cli.group import FailedError
+from vtbdrake.cli.options import converted, output, parse_field, parse_range, settings
+from vtbdrake.cli.problem import make_problem, problem_options
+from vtbdrake.cli.text import table, write_csv
+from vtbdrake.optimization import Parameter, Study
 from vtbdrake.rollout.choice import NAMES
-from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
-F = TypeVar("F", bound=Callable[..., Any])
+_file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 
-_PROBLEM = (
-    scenario_argument,
-    click.option(
-        "--quality",
-        required=True,
-        metavar="ADDRESS|MODULE:FUNCTION",
-        help="f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
-        "Python function of the variables named by --of.",
-    ),
-    click.option("--of", multiple=True, metavar="ADDRESS", help="An argument of the function. May be repeated."),
-    horizon_option,
-    set_option,
-    click.option(
-        "--condition",
-        "conditions",
-        callback=converted(parse_condition),
-        multiple=True,
-        metavar="ADDRESS=VALUE[;...]",
-        help="A condition that every point is tried under. May be repeated.",
-    ),
-    sample_period_option,
-    start_option,
-)
 
-_EXECUTION = (
-    click.option("--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True),
-    click.option(
-        "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
-    ),
-    click.option("--save", callback=output(), metavar="FILE", help="Write all of it, for vtbdrake.Sweep.load."),
-    click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write the table."),
-    click.option("--plot", callback=output(".png", ".svg", ".pdf"), metavar="FILE", help="Draw h and the qualities."),
+_point = click.argument(
+    "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
 )
 
 
-def problem_options(command: F) -> F:
-    """The options that state a problem."""
-    return reduce(lambda wrapped, option: option(wrapped), reversed(_PROBLEM), command)
+@click.group("study")
+def study() -> None:
+    """Solve a problem, recorded rollout by rollout in a file that can be resumed.
+
+    \b
+    Example:
+      vtbdrake study run gait.db diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+          --vary dps.impl.gait.period=1:4 --vary dps.impl.gait.stroke=0.05:0.3 --quality sim.sys.climber.base.x
+      vtbdrake study show gait.db
+    """
 
 
-def execution_options(command: F) -> F:
-    """The options about where rollouts run and where the results go."""
-    return reduce(lambda wrapped, option: option(wrapped), reversed(_EXECUTION), command)
-
-
-def make_problem(
+@study.command("run")
+@click.argument("file", callback=output())
+@problem_options
+@click.option(
+    "--vary",
+    callback=converted(parse_range),
+    multiple=True,
+    required=True,
+    metavar="ADDRESS=LOWER:UPPER",
+    help="A parameter and its range. May be repeated.",
+)
+@click.option("--minimize", is_flag=True, help="The quality is a cost: smaller is better.")
+@click.option("--risk", default="worst", show_default=True, help="How conditions become one: worst or mean.")
+@click.option("--solver", metavar="NAME", help="auto if left out, or that of the file.")
+@click.option("--seed", type=int, metavar="N", help="Of the solver; 0 if left out, or that of the file.")
+@click.option("--rollouts", type=click.IntRange(min=1), metavar="N", help="How many the study has in the end.")
+@click.option("--seconds", type=float, metavar="S", help="Wall time of this run.")
+@click.option("--target", type=float, metavar="H", help="End when a point is at least as good.")
+@click.option("--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True)
+@click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
+)
+@click.option("--time-limit", type=float, metavar="S", help="A rollout that takes longer fails.")
+@click.option("--allow-changed-code", is_flag=True, help="Resume although the code of the problem has changed.")
+def run(
+    file: Path,
     scenario: Scenario,
-    parameters: Sequence[Parameter],
+    vary: tuple[Parameter, ...],
     *,
-    quality: str,
-    of: Sequence[str],
-    horizon: float,
-    values: Sequence[Setting],
-    conditions: Sequence[dict[str, Any]],
-    threshold: float = inf,
-    sample_period: float,
-    start: Snapshot | None,
-) -> Problem:
-    """The problem that the options state; ``values`` hold under every condition."""
-    common = list(settings(values).items())
-    return Problem(
-        scenario=scenario,
-        parameters=parameters,
-        quality=make_quality(quality, of),
-        horizon=horizon,
-        threshold=threshold,
-        sample_period=sample_period,
-        conditions=[settings([*common, *condition.items()]) for condition in conditions or ({},)],
-        start=start,
-    )
+    minimize: bool,
+    risk: str,
+    solver: str | None,
+    seed: int | None,
+    rollouts: int | None,
+    seconds: float | None,
+    target: float | None,
+    executor: str,
+    workers: int | None,
+    time_limit: float | None,
+    allow_changed_code: bool,
+    **problem: Any,
+) -> None:
+    """Begin a study, or go on with the one in FILE. Ctrl-C keeps what is finished."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    stated = make_problem(scenario, vary, **problem, minimize=minimize, risk=risk)
+    with stated.study(file, solver=solver, seed=seed, allow_changed_code=allow_changed_code) as opened:
+        opened.run(
+            rollouts=rollouts,
+            seconds=seconds,
+            target=target,
+            executor=executor,
+            workers=workers,
+            time_limit=time_limit,
+        )
+        click.echo(opened.summary())
+        if opened.reason == "interrupted":
+            raise FailedError("the study was interrupted: the same command goes on with it")
 
 
-def points_table(sweep: Sweep) -> str:
-    """One row per point and condition: the parameters, h, t*, how the rollout ended; below, why some failed."""
-    several = len(sweep.conditions) > 1
-    names = [f"{p.address} [{unit}]" for p, unit in zip(sweep.parameters, sweep.units, strict=True)]
-    header = [*names, *(["condition"] if several else []), "h", "t* [s]", "end"]
-    rows = []
-    for point, condition, rollout in zip(sweep.points, sweep.condition, sweep.rollouts, strict=True):
-        which = [str(condition)] if several else []
-        rows.append([*map(number, point), *which, number(rollout.h), number(rollout.t_star), rollout.end])
-    reasons = Counter(one_line(rollout.message) for rollout in sweep.rollouts if rollout.failed)
-    return "\n".join([table(header, rows), *(f"failed ({count}): {text}" for text, count in reasons.items())])
+@study.command("show")
+@_file
+@click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write all points with their attributes.")
+def show(file: Path, csv: Path | None) -> None:
+    """Show what a study has found, the points that wait, and its attributes."""
+    with Study.open(file) as opened:
+        click.echo(opened.summary())
+        queue, attributes = opened.queue, opened.attributes
+        if queue:
+            header = ["waiting", *(parameter.address for parameter in opened.parameters)]
+            rows = [[str(number), *map(str, point.values())] for number, point in queue.items()]
+            click.echo("\n" + table(header, rows))
+        for key, value in attributes.items():
+            click.echo(f"attribute {key}: {json.dumps(value)}")
+        if csv is not None:
+            write_csv(csv, opened.to_dict())
 
 
-def condition_text(index: int, condition: Mapping[str, Any]) -> str:
-    """``condition 0 (address = value, ...)``"""
-    values = (f"{address} = {json.dumps(np.asarray(value).tolist())}" for address, value in condition.items())
-    return f"condition {index} ({', '.join(values)})"
+@study.command("add")
+@_file
+@_point
+def add(file: Path, point: tuple[tuple[str, Any], ...]) -> None:
+    """Give a point, to be judged with the next batch."""
+    with Study.open(file) as opened:
+        opened.add(settings(point))
 
 
-def write_files(sweep: Sweep, *, save: Path | None, csv: Path | None, plot: Path | None) -> None:
-    """Writes what was asked for."""
-    if save is not None:
-        sweep.save(save)
-    if csv is not None:
-        write_csv(csv, sweep.to_dict())
-    if plot is not None:
-        sweep.plot().savefig(plot)
+@study.command("edit")
+@_file
+@click.argument("number", type=int)
+@_point
+def edit(file: Path, number: int, point: tuple[tuple[str, Any], ...]) -> None:
+    """Put another point in the place of one that waits; `show` lists their numbers."""
+    with Study.open(file) as opened:
+        opened.edit(number, settings(point))
 
 
-def refuse_failures(sweep: Sweep) -> None:
-    """
-    Raises:
-        FailedError: not one rollout succeeded.
-    """
-    if len(sweep) and sweep.failed.all():
-        raise FailedError(f"all {len(sweep)} rollouts failed; the first: {one_line(sweep.rollouts[0].message)}")
+@study.command("remove")
+@_file
+@click.argument("number", type=int)
+def remove(file: Path, number: int) -> None:
+    """Take back a point that waits; `show` lists their numbers."""
+    with Study.open(file) as opened:
+        opened.remove(number)
+
+
+@study.command("note")
+@_file
+@click.argument("attribute", callback=converted(parse_field), metavar="KEY=VALUE")
+@click.option("--trial", type=int, metavar="NUMBER", help="Note it of the point of a trial, not of the study.")
+def note(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
+    """Note an attribute of a study, or of a point."""
+    with Study.open(file) as opened:
+        trials = opened.trials if trial is not None else ()
+        if trial is not None and not 0 <= trial < len(trials):
+            raise click.BadParameter(f"the study has {len(trials)} trials, counted from 0, and no trial {trial}")
+        opened.set_attribute(*attribute, point=None if trial is None else trials[trial].parameters)

@@ -10,7 +10,7 @@ import click
 
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import converted, parse_grid
-from vtbdrake.cli.study import (
+from vtbdrake.cli.problem import (
     condition_text,
     execution_options,
     make_problem,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.optimization.identity import code_changes, describe, differences, plain, plain_options, revision, versions
+from vtbdrake.optimization.outcome import Trial
 from vtbdrake.optimization.parameter import checked_point
 from vtbdrake.optimization.solvers.catalogue import make_solver
 from vtbdrake.optimization.solvers.solver import Point, Solver
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from vtbdrake.optimization.problem import Problem
 
 
+# Is told of a trial of a study.
+Callback = Callable[["Study", Trial], Any]
+
+
 class Study(StudyRecord):
     """The rollouts and points of one problem, in one file or in memory.
 
@@ -36,12 +41,14 @@ class Study(StudyRecord):
     known, and costs nothing.
 
     Attributes:
-        reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``interrupted``.
+        reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
+            ``interrupted``.
     """
 
     def __init__(self, file: StudyFile, problem: Problem | None = None) -> None:
         super().__init__(file)
         self._problem = problem
+        self._stopped = False
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
@@ -119,6 +126,7 @@ class Study(StudyRecord):
         workers: int | None = None,
         time_limit: float | None = None,
         on_error: str = "record",
+        callbacks: Sequence[Callback] = (),
         progress: bool = True,
     ) -> Self:
         """Goes on until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
@@ -135,7 +143,11 @@ class Study(StudyRecord):
             on_error: what becomes of a rollout in which a quality or constraint function raises, is negative or NaN.
                 ``record``: it counts as failed, with the message, and the first of a run is logged; ``raise``: the run
                 ends there.
-            progress: show a progress bar: rollouts per second, the best so far, the time left.
+            callbacks: each is called with the study and a trial when that is judged and recorded for the first time,
+                batch by batch, in this thread. It may note attributes, add points, or `stop` the run; what it raises
+                ends the run.
+            progress: show a progress bar: rollouts per second, the best so far, the time left. Where there is neither a
+                terminal nor a notebook, log it every half minute instead, at the level INFO.
 
         Raises:
             ValueError: there is no budget at all, or it makes no sense; an executor or solver is unknown.
@@ -150,6 +162,17 @@ class Study(StudyRecord):
         check_budget(problem, rollouts=rollouts, seconds=seconds, target=target)
         if on_error not in ("record", "raise"):
             raise ValueError(f"on_error is 'record' or 'raise', not {on_error!r}")
+        for callback in callbacks:
+            if not callable(callback):
+                raise ValueError(f"a callback is a function of a study and a trial, not {callback!r}")
+
+        def after_batch(batch: int) -> bool:
+            for trial in self._trials_of(batch) if callbacks else ():
+                for callback in callbacks:
+                    callback(self, trial)
+            return self._stopped
+
+        self._stopped = False
         racing = len(problem.conditions) > 1 and len(problem.objectives) == 1 if racing is None else racing
         budget = rollouts if rollouts is not None else 10**9
         chosen = make_executor(
@@ -166,6 +189,7 @@ class Study(StudyRecord):
                     racing=racing,
                     catch=on_error == "record",
                     progress=progress,
+                    after_batch=after_batch,
                 )
                 self.reason, self.message = run.until(rollouts=rollouts, seconds=seconds, target=target)
                 reason.append(self.reason)
@@ -173,6 +197,10 @@ class Study(StudyRecord):
             if chosen is not executor:
                 chosen.close()
         return self
+
+    def stop(self) -> None:
+        """Ends the run when the batch of points that is being judged is complete; of a callback, or another thread."""
+        self._stopped = True
 
     def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
         self._meta = self._file.meta

@@ -314,21 +314,16 @@ class StudyFile:
 
     def trials(self) -> list[TrialRow]:
         """All judged points, in the order of the study."""
-        return [
-            (
-                batch,
-                position,
-                decode(point),
-                tuple(json.loads(values)),
-                tuple(json.loads(violations)),
-                bool(exact),
-                origin,
-                method,
-            )
-            for batch, position, point, values, violations, exact, origin, method in self._rows(
-                "trials", "ORDER BY batch, position"
-            )
-        ]
+        return [_trial(row) for row in self._rows("trials", "ORDER BY batch, position")]
+
+    def trials_of(self, batch: int) -> tuple[int, list[TrialRow]]:
+        """The number of the first trial of a batch, among all of them, and those trials; without withdrawn ones."""
+        rows = self._rows("trials", "WHERE batch = ? AND position >= 0 ORDER BY position", (batch,))
+        with self._lock, explained(self.path):
+            (before,) = self._db.execute(
+                "SELECT count(*) FROM trials WHERE batch < ? OR (batch = ? AND position < 0)", (batch, batch)
+            ).fetchone()
+        return before, [_trial(row) for row in rows]
 
     def add_gradient(self, point: Point, gradient: Sequence[float]) -> None:
         """Records the gradient at a point."""
@@ -391,6 +386,12 @@ class StudyFile:
         for point, key, value in self._rows("notes", "ORDER BY rowid"):
             found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return found
+
+
+def _trial(row: tuple[Any, ...]) -> TrialRow:
+    batch, position, point, values, violations, exact, origin, method = row
+    numbers = tuple(json.loads(values)), tuple(json.loads(violations))
+    return batch, position, decode(point), *numbers, bool(exact), origin, method
 
 
 def _checksum(table: str, row: Sequence[Any]) -> int:

@@ -102,6 +102,12 @@ class StudyRecord:
         notes = self._file.notes()
         return tuple(self._trial(number, row, notes) for number, row in enumerate(self._file.trials()))
 
+    def _trials_of(self, batch: int) -> tuple[Trial, ...]:
+        """The trials that were judged last in a batch."""
+        first, rows = self._file.trials_of(batch)
+        notes = self._file.notes()
+        return tuple(self._trial(first + k, row, notes) for k, row in enumerate(rows))
+
     def _trial(self, number: int, row: TrialRow, notes: Mapping[Point | None, Mapping[str, Any]]) -> Trial:
         batch, _, point, values, violations, exact, origin, method = row
         noted = dict(notes.get(point, {}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf, isfinite, isnan
 from queue import Empty, SimpleQueue
@@ -25,10 +25,13 @@ from vtbdrake.rollout.result import QUALITY_FAILED
 
 _log = logging.getLogger(__name__)
 
-BUDGET, TIME, TARGET, SOLVER, INTERRUPTED = "budget", "time", "target", "solver", "interrupted"
+BUDGET, TIME, TARGET, SOLVER, INTERRUPTED, STOPPED = "budget", "time", "target", "solver", "interrupted", "stopped"
 
 # A solver of a small space may ask for ever for what is known; so many batches in a row without news are enough.
 _WITHOUT_NEWS = 50
+
+# Without a terminal, the progress is logged so often, in seconds.
+LOG_PERIOD = 30.0
 
 
 class _SpentError(Exception):
@@ -41,7 +44,19 @@ class _SpentError(Exception):
 
 
 class StudyRun:
-    """Runs a study in a file once. What the file holds is told to the solver first, batch by batch as it was found."""
+    """Runs a study in a file once. What the file holds is told to the solver first, batch by batch as it was found.
+
+    Args:
+        file: of the study; this process has claimed it.
+        problem: what is asked.
+        solver: made for the budget that the file names.
+        executor: runs the rollouts.
+        racing: see `Judge`.
+        catch: a quality function that fails fails its rollout; see `RolloutTask`.
+        progress: show a progress bar in a terminal or a notebook, and log the progress elsewhere.
+        after_batch: is called with the number of every batch that is judged and recorded for the first time; returns
+            whether the run is to end.
+    """
 
     def __init__(
         self,
@@ -53,6 +68,7 @@ class StudyRun:
         racing: bool,
         catch: bool,
         progress: bool,
+        after_batch: Callable[[int], bool],
     ) -> None:
         self._file = file
         self._problem = problem
@@ -74,6 +90,8 @@ class StudyRun:
         self._earlier = {row[2]: row[5] for row in sorted(earlier, key=lambda row: row[5])}
         self._new_from = max([self._told, *(row[0] + 1 for row in earlier)])
         self._progress = progress
+        self._after_batch = after_batch
+        self._next_log = inf
         self._bar: tqdm | None = None  # type: ignore[type-arg]
         self._limit: float = inf
         self._deadline = inf
@@ -87,6 +105,8 @@ class StudyRun:
             self._target = -target if self._problem.objectives[0].minimize else target
         shown = self._progress and watched()
         name = f"study ({self._solver.name})"
+        if self._progress and not shown:
+            self._next_log = time.monotonic() + LOG_PERIOD
         with tqdm(total=rollouts, initial=len(self._known), desc=name, unit="rollout", disable=not shown) as self._bar:
             try:
                 return self._batches()
@@ -105,7 +125,9 @@ class StudyRun:
         while silent < _WITHOUT_NEWS:
             before = len(self._known)
             if not self._one_batch(batch):
-                return SOLVER, self._solvers_end()
+                return self._solvers_end()
+            if batch >= self._told and self._after_batch(batch):
+                return STOPPED, "it was told to stop"
             if batch >= self._new_from:
                 silent = 0 if len(self._known) > before else silent + 1
             self._show()
@@ -187,9 +209,11 @@ class StudyRun:
         self._show()
         return self._told
 
-    def _solvers_end(self) -> str:
+    def _solvers_end(self) -> tuple[str, str]:
+        if self._solver.success is False and self._limit - len(self._known) < len(self._problem.conditions):
+            return BUDGET, self._budget_is_spent
         how = {True: "is finished", False: "has ended without success", None: "has ended"}[self._solver.success]
-        return f"{self._solver.name} {how}" + (f": {self._solver.message}" if self._solver.message else "")
+        return SOLVER, f"{self._solver.name} {how}" + (f": {self._solver.message}" if self._solver.message else "")
 
     def _roll_out(self, rows: Sequence[Row]) -> None:
         now = rows[: max(0, int(min(self._limit - len(self._known), len(rows))))]
@@ -202,6 +226,9 @@ class StudyRun:
                 self._known[now[index]] = outcome
                 self._file.add(*now[index], outcome)
                 self._warn(outcome)
+                if time.monotonic() >= self._next_log:
+                    self._next_log += LOG_PERIOD
+                    self._log_progress()
                 assert self._bar is not None
                 self._bar.update()
                 self._refuse_success([now[index][0]])
@@ -210,7 +237,11 @@ class StudyRun:
             if points:
                 results.close()  # type: ignore[attr-defined]
         if len(now) < len(rows):
-            raise _SpentError(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
+            raise _SpentError(BUDGET, self._budget_is_spent)
+
+    @property
+    def _budget_is_spent(self) -> str:
+        return f"the budget of {self._limit:g} rollouts is spent"
 
     def _warn(self, outcome: Outcome) -> None:
         """Says once in a run that the quality function fails: it may be wrong, and all that follows in vain."""
@@ -220,6 +251,12 @@ class StudyRun:
                 "%s. The rollout counts as failed, and so do others of this kind; on_error='raise' ends the run",
                 outcome.message.removeprefix(QUALITY_FAILED),
             )
+
+    def _log_progress(self) -> None:
+        of = "" if self._limit == inf else f" of {self._limit:g}"
+        best = self._judge.best
+        found = "" if best is None else f", best {self._judge.in_the_users_terms(best)[0]:.6g}"
+        _log.info("study (%s): %d%s rollouts%s", self._solver.method, len(self._known), of, found)
 
     def _with_gradient(self, evaluation: Evaluation) -> Evaluation:
         if self._gradients is None:

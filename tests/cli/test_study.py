@@ -1,0 +1,66 @@
+"""``vtbdrake study``: what it records is what the library finds."""
+
+from pathlib import Path
+
+from tests.cli.program import ANGLE, DAMPING, PENDULUM, RATE, run
+from tests.testbeds import PendulumScenario
+from vtbdrake import Parameter, Problem, Quality, Study
+from vtbdrake.cli.quality import magnitude
+
+BEGIN = [PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--vary", f"{RATE}=-3:3", "--quality", ANGLE]
+BEGIN += ["--sample-period", 0.1, "--minimize", "--condition", f"{DAMPING}=0.1", "--condition", f"{DAMPING}=0.2"]
+
+
+def test_a_study_is_run_shown_given_points_and_resumed(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    begun = run("study", "run", file, *BEGIN, "--solver", "sobol", "--rollouts", 16, "--executor", "serial")
+    assert (begun.returncode, begun.stderr) == (0, "")
+    problem = Problem(
+        scenario=PendulumScenario(),
+        parameters=[Parameter(ANGLE, -1.5, 1.5), Parameter(RATE, -3.0, 3.0)],
+        quality=Quality(magnitude, ANGLE, minimize=True),
+        horizon=0.3,
+        sample_period=0.1,
+        conditions=[{DAMPING: 0.1}, {DAMPING: 0.2}],
+    )
+    expected = problem.study(solver="sobol").run(rollouts=16, executor="serial", progress=False)
+    assert f"best: magnitude = {expected.best.value:g} at" in begun.stdout
+
+    for arguments in (
+        ["add", file, f"{ANGLE}=0.5", f"{RATE}=1"],
+        ["add", file, f"{ANGLE}=0.25", f"{RATE}=0"],
+        ["edit", file, 1, f"{RATE}=2", f"{ANGLE}=-0.5"],
+        ["add", file, f"{ANGLE}=1", f"{RATE}=1"],
+        ["remove", file, 3],
+        ["note", file, "operator=somebody=else"],
+        ["note", file, "marks=[1, 2]", "--trial", 0],
+    ):
+        done = run("study", *arguments)
+        assert (done.returncode, done.stderr) == (0, "")
+    shown = run("study", "show", file, "--csv", tmp_path / "a.csv")
+    rows = [line.split() for line in shown.stdout.splitlines()]
+    assert ["1", "-0.5", "2.0"] in rows and ["2", "0.25", "0.0"] in rows
+    assert 'attribute operator: "somebody=else"' in shown.stdout
+    header, first, *_ = (tmp_path / "a.csv").read_text().splitlines()
+    assert header.endswith("attribute marks") and first.endswith('"[1, 2]"')
+
+    run("study", "run", file, *BEGIN, "--rollouts", 24, "--executor", "serial")
+    with Study.open(file) as study:
+        given = [tuple(trial.parameters.values()) for trial in study.trials if trial.origin == "user"]
+        assert given == [(-0.5, 2.0), (0.25, 0.0)]
+
+
+def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    run("study", "run", file, *BEGIN, "--rollouts", 4, "--executor", "serial")
+    for arguments, message in (
+        (["run", file, *BEGIN], "give rollouts=, seconds= or target="),
+        (["show", tmp_path / "none.db"], "does not exist"),
+        (["add", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
+        (["add", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
+        (["remove", file, 7], "no point 7 waits to be judged"),
+        (["note", file, "a=1", "--trial", 99], "no trial 99"),
+        (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
+    ):
+        failed = run("study", *arguments)
+        assert failed.returncode == 2 and message in failed.stderr and len(failed.stderr.splitlines()) == 1
