@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
+from diagrams.manipulator.safety import CARRY
 from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
@@ -153,8 +154,13 @@ class Demo:
         loop.run(until=lambda: bool(loop.guards.latched), seconds=5.0)
         fault = loop.guards.latched[0]
         print(f"  {1e3 * (fault.time - killed):.1f} ms later the guards latch: {fault.reason}")
-        loop.run(seconds=0.5)
+        loop.run(seconds=0.5 * CARRY)
         print(f"  the loop goes on, and sends what carries the arm where it was last: {_torque(_last_sent(loop))}")
+        loop.run(seconds=CARRY)
+        sent = self.bridge.sent["joint_torque"].count
+        loop.run(seconds=0.5)
+        silent = self.bridge.sent["joint_torque"].count == sent
+        print(f"  {CARRY:g} s after the last sample it {'falls' if silent else 'DOES NOT FALL'} silent: brakes take over")
         with suppress(SwitchRefusedError):
             loop.reset()
         print(f"  a reset is {'refused' if loop.guards.latched else 'GRANTED'} as long as nothing is sensed")
