@@ -160,7 +160,9 @@ class Demo:
         sent = self.bridge.sent["joint_torque"].count
         loop.run(seconds=0.5)
         silent = self.bridge.sent["joint_torque"].count == sent
-        print(f"  {CARRY:g} s after the last sample it {'falls' if silent else 'DOES NOT FALL'} silent: brakes take over")
+        print(
+            f"  {CARRY:g} s after the last sample it {'falls' if silent else 'DOES NOT FALL'} silent: brakes take over"
+        )
         with suppress(SwitchRefusedError):
             loop.reset()
         print(f"  a reset is {'refused' if loop.guards.latched else 'GRANTED'} as long as nothing is sensed")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,16 @@ def test_what_does_not_fit_the_signals_is_refused(operation: Any, reason: str) -
     with pytest.raises(OperationError) as error:
         operation_of(told(operation))
     assert reason in str(error.value)
+
+
+def test_machine_whose_silence_nobody_would_notice_is_refused_outside_of_lock_step() -> None:
+    interface = ServoScenario().interface()
+    ageless = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
+    operation = Operation(continuity=CONTINUITY)
+    with pytest.raises(ValueError, match=r"no sensor signal has a max_age, .* \(position, speed\)"):
+        operation.check(ageless)
+    operation.check(interface)
+    replace(operation, aging=False).check(ageless)
 
 
 def test_period_and_pace_may_be_chosen() -> None:

@@ -300,6 +300,39 @@ def test_a_machine_that_falls_silent_leads_to_the_fallback_within_its_age_and_a_
     assert stopped <= last + age + PERIOD + 1e-9
 
 
+@pytest.mark.parametrize(("took", "kind"), [(0.005, None), (0.0108, "stale"), (0.03, "missed")])
+def test_a_command_that_a_step_took_long_to_find_is_judged_by_the_age_that_its_samples_have_then(took, kind):
+    runtime, bridge, clock = switched(rate=0.0)
+    runtime.run(cycles=5)
+    step = runtime.step
+
+    def slow():
+        runtime.step = step
+        clock.advance(took)
+        return step()
+
+    runtime.step = slow
+    done = runtime.cycle()
+    assert (done.verdict.faults[0].kind if done.verdict.faults else None) == kind
+    assert (np.linalg.norm(sent(bridge)[-1]) > 0.0) == (kind is None)
+
+
+def test_a_reset_is_refused_while_the_command_would_jump_as_at_a_switch():
+    runtime, bridge, _ = switched(rate=0.0, continuity={"velocity": ("speed", 1.2)})
+    runtime.run(cycles=5)
+    runtime.send_fallback("told")
+    runtime.write({"u.target": [0.9, -0.1]})
+    runtime.run(cycles=3)
+    with pytest.raises(SwitchRefusedError, match=r"the command velocity is 4.25 away from the measured speed; 1.2 is"):
+        runtime.reset()
+    assert runtime.guards.latched
+    runtime.write({"u.target": TARGET})
+    runtime.run(cycles=3)
+    runtime.reset()
+    runtime.run(cycles=1)
+    assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
+
+
 def test_a_missed_deadline_is_left_out_and_no_command_is_sent_twice():
     # The fifth waking is 3.4 periods late.
     runtime, bridge, clock = switched(rate=0.0, lateness=[0.0] * 4 + [3.4 * PERIOD])

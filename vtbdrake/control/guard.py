@@ -225,15 +225,20 @@ class Guards:
             self._latch((told,))
         return Verdict(self._fall_back(now, receptions), False, (*self._faults, told))
 
-    def reset(self, now: float, receptions: Mapping[str, Reception]) -> tuple[str, ...]:
+    def reset(self, now: float, receptions: Mapping[str, Reception], against: Collection[str] = ()) -> tuple[str, ...]:
         """Releases the latch, unless a cause persists: the DPS's and the loop's as of the last `check`, the sensor
         signals' as of now. A sensor signal that has jumped is accepted where it is, if it has been steady there.
+
+        Args:
+            now, receptions: as of `check`.
+            against: further reasons not to.
 
         Returns:
             Why it stays; empty if it was released.
         """
         self._accept_steady()
-        reasons = tuple(fault.reason for fault in (*self._causes, *found(now, self.watchdogs, receptions)))
+        faults = (*self._causes, *found(now, self.watchdogs, receptions))
+        reasons = (*(fault.reason for fault in faults), *against)
         if not reasons:
             self._latched = ()
         return reasons

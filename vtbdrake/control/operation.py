@@ -61,9 +61,15 @@ class Operation:
     def check(self, interface: Interface) -> None:
         """
         Raises:
-            ValueError: it does not fit the signals, or leaves a limit without something measured to depart from.
+            ValueError: it does not fit the signals, leaves a limit without something measured to depart from, or would
+                not notice that the machine has fallen silent.
         """
         guards = self._guards(interface)
+        if self.aging and interface.sense and all(signal.max_age == inf for signal in interface.sense):
+            raise ValueError(
+                "no sensor signal has a max_age, so that nobody would notice a machine that falls silent: give one to "
+                f"those that come regularly ({', '.join(signal.name for signal in interface.sense)})"
+            )
         sensed = {signal.name: signal for signal in interface.sense}
         acted = {signal.name: signal for signal in interface.act}
         for name, (sensor, _) in self.continuity.items():

@@ -19,7 +19,7 @@ from vtbdrake.control.guard import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepped import Stepped
-from vtbdrake.control.switching import Preparation, SwitchRefusedError, prepare
+from vtbdrake.control.switching import Preparation, SwitchRefusedError, jumps, prepare
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -223,13 +223,15 @@ class Runtime(Stepped):
         error, commands = self.step()
         stepped = self.clock.now()
         verdict = self.guards.check(
-            now,
+            # As old as its samples are when it leaves, so old is a command: a long step makes them stale.
+            stepped,
             self.watched,
             commands,
             active,
             error=error,
-            # Who slept for long wakes up to old messages: those deadlines count before anything is sent.
-            missed=self.statistics.run + int(lateness / self.period),
+            # Who slept for long wakes up to old messages, and who steps for long answers old ones: those deadlines
+            # count before anything is sent.
+            missed=self.statistics.run + int((lateness + stepped - begin) / self.period),
             not_ready=self.not_ready() if active else None,
             others=self.bridge.sensed,
         )
@@ -324,9 +326,11 @@ class Runtime(Stepped):
         """Releases the latch of the guards; the DPS's commands go out again from the next cycle on.
 
         Raises:
-            SwitchRefusedError: what they latched for is still there.
+            SwitchRefusedError: what they latched for is still there, or a command would not continue what is measured,
+                as at a switch to real.
         """
-        reasons = self.guards.reset(self.clock.now(), self.watched)
+        against = jumps(self, self.guards.driven)
+        reasons = self.guards.reset(self.clock.now(), self.watched, against)
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
         self.changed(RESET, {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -87,7 +87,7 @@ def prepare(
         contention = runtime.bridge.contention
         if becoming and contention is not None:
             reasons.append(contention)
-        reasons += _jumps(runtime, becoming)
+        reasons += jumps(runtime, becoming)
 
     def perform() -> None:
         _throw(runtime, senses, acts)
@@ -109,8 +109,8 @@ def _positions(
     return given
 
 
-def _jumps(runtime: Runtime, names: list[str]) -> list[str]:
-    """The actuator signals whose command would not continue what the machine measures."""
+def jumps(runtime: Runtime, names: Iterable[str]) -> list[str]:
+    """Return what speaks against commanding actuator signals: commands that would not continue what is measured."""
     found = []
     for name in names:
         if name not in runtime.continuity:
@@ -122,9 +122,13 @@ def _jumps(runtime: Runtime, names: list[str]) -> list[str]:
             continue
         sensor, limit = runtime.continuity[name]
         measured = runtime.bridge.sensed[sensor].value
-        command = runtime.command(name)
         if measured is None:
             found.append(f"nothing is measured of {sensor}, from which the command {name} departs")
+            continue
+        try:
+            command = runtime.command(name)
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            found.append(f"the command {name} cannot be computed: {type(error).__name__}: {error}")
             continue
         if command is None:
             continue  # A DPS that has not begun has no command.
