@@ -11,7 +11,6 @@ from diagrams.space_climber.payload import (
     MOON,
     PAPER,
     PHASES,
-    find_limit,
     locked_problem,
     payload_problem,
     static_limit,
@@ -32,11 +31,12 @@ def payload(full: bool) -> Answer:
     boundaries = {}
     for name, fields in ENVIRONMENTS.items():
         phases = PHASES if full or name == MOON else PHASES[::2]
-        boundaries[name] = find_limit(payload_problem(phases=phases, **fields), resolution=0.5 if full else 1.0)
+        problem = payload_problem(phases=phases, **fields)
+        boundaries[name] = problem.boundary(resolution=0.5 if full else 1.0, coarse=5.0)
     moon = boundaries[MOON]
     locked = locked_problem()
     static = static_limit(locked.testbed)
-    simulated = locked.boundary(resolution=LOCKED_STEP, coarse=10.0)
+    simulated = locked.boundary(resolution=LOCKED_STEP, coarse=10.0, repeats=0)
     agrees = simulated.lower - LOCKED_STEP <= static <= simulated.upper + LOCKED_STEP
     environments = "; ".join(f"{name} {_range(boundary)}" for name, boundary in boundaries.items())
     feet = "; ".join(f"{name} {limit:.1f} kg" for name, limit in statics(payload_problem().testbed).items())

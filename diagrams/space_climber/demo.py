@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, find_limit, payload_problem, statics
+from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
 from vtbdrake.visualization import make_meshcat, save_html, show_motions
 
 OUT = Path("out")
@@ -15,7 +15,7 @@ def main() -> None:
     begin = time.perf_counter()
     print("How heavy may a component attached to the front of the SpaceClimber be before it is no longer stable?")
     problem = payload_problem()
-    boundary = find_limit(problem)
+    boundary = problem.boundary(resolution=1.0, coarse=5.0)
     sweep, repeated = boundary.sweep, boundary.repeated
     assert sweep is not None
     assert repeated is not None

@@ -34,8 +34,6 @@ PHASES = (0.0, 1 / 8, 2 / 8, 3 / 8)
 HORIZON = 15.0
 # Period of the gait in seconds.
 STRIDE = 2.0
-# Rollouts with jitter, per start phase, of each mass around the boundary.
-REPEATS = 5
 # A multiple of the DPS's period, so that the simulation does not pause more often than it has to.
 SAMPLE_PERIOD = 0.1
 PAPER = "about 45 kg"
@@ -78,11 +76,6 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
         sample_period=SAMPLE_PERIOD,
         conditions=[{PHASE: phase, PERIOD: stride} for phase in phases],
     )
-
-
-def find_limit(problem: vtb.Problem, *, resolution: float = 1.0) -> vtb.Boundary:
-    """The interval in which the heaviest stable attachment lies; what is uncertain is repeated with jitter."""
-    return problem.boundary(resolution=resolution, coarse=5.0, repeats=REPEATS)
 
 
 def static_limit(testbed: vtb.VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: float = 0.0) -> float:

@@ -143,15 +143,21 @@ def test_boundary_for_all_and_for_each_condition() -> None:
         threshold=4.0,
         conditions=[{DAMPING: 0.1}, {DAMPING: 0.5}],
     )
-    expected = problem.boundary(resolution=0.1, coarse=0.5, progress=False)
+    expected = problem.boundary(resolution=0.1, coarse=0.5, repeats=2, progress=False)
     assert expected.lower < expected.by_condition[1, 0]
 
     vary = ("--vary", f"{ANGLE}=0:3", "--quality", RATE, "--threshold", 4, "--horizon", 2)
     conditions = ("--condition", f"{DAMPING}=0.1", "--condition", f"{DAMPING}=0.5")
-    program = run("boundary", PENDULUM, *vary, *conditions, "--resolution", 0.1, "--coarse", 0.5)
+    steps = ("--resolution", 0.1, "--coarse", 0.5, "--repeats", 2)
+    program = run("boundary", PENDULUM, *vary, *conditions, *steps)
 
     lines = program.stdout.splitlines()
     assert lines[0] == str(expected)
+    safe, unsafe = expected.worst_chances
+    assert lines[3:5] == [
+        f"  {safe.value:.6g} rad: unsafe in 0 of 3 rollouts (a chance of 0% to 71%) under condition 0",
+        f"  {unsafe.value:.6g} rad: unsafe in 3 of 3 rollouts (a chance of 29% to 100%) under condition 0",
+    ]
     lower, upper = expected.by_condition[1]
     assert lines[2] == f"  condition 1 ({DAMPING} = 0.5): safe up to {lower:.6g} rad, not at {upper:.6g} rad"
 

@@ -297,6 +297,8 @@ def test_close_to_the_boundary_values_are_repeated_until_they_are_certain():
     assert again == boundary
     # Without, a single rollout decides.
     assert problem.boundary(**{**search, "repeats": 0}).chances == ()
+    del search["repeats"]
+    assert {c.rollouts for c in problem.boundary(**search).chances} == {6}
 
 
 def test_a_boundary_beyond_the_range_is_told_with_repeats_too():

@@ -36,10 +36,9 @@ from vtbdrake.testbed import Scenario
 @click.option(
     "--repeats",
     type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
     metavar="N",
-    help="Repeat values close to the boundary N times with jitter, until they are safe, or unsafe, each time.",
+    help="Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one; 5 if "
+    "left out.",
 )
 @click.option(
     "--jitter",
@@ -55,7 +54,7 @@ def find_boundary(
     vary: Parameter,
     resolution: float,
     coarse: float,
-    repeats: int,
+    repeats: int | None,
     jitter: float,
     executor: str,
     workers: int | None,

@@ -64,7 +64,7 @@ class Boundary:
         unit: its unit.
         lower: the largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
         upper: the smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
-            none). There is one rollout per value and condition; close to the boundary more, if ``repeats`` was given.
+            none). There is one rollout per value and condition; close to the boundary there are repeats.
         by_condition: the same interval for each condition alone, shape (conditions, 2).
         examined: the smallest and the largest value examined.
         gap: width of the widest range below ``lower`` in which nothing was examined, over all conditions: an unsafe

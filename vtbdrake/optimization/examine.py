@@ -26,6 +26,9 @@ from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.many import run_rollouts
 
+# Of each value close to a boundary, under each condition.
+_REPEATS = 5
+
 
 def sweep(
     problem: Problem,
@@ -49,7 +52,7 @@ def boundary(
     *,
     resolution: float,
     coarse: float,
-    repeats: int,
+    repeats: int | None,
     jitter: float,
     executor: str | Executor,
     workers: int | None,
@@ -79,7 +82,9 @@ def boundary(
     return search.boundary()
 
 
-def _checked_jitter(parameter: Parameter, repeats: int, jitter: float) -> tuple[int, float]:
+def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> tuple[int, float]:
+    if repeats is None:
+        repeats = 0 if parameter.integer or parameter.is_field else _REPEATS
     repeats, jitter = as_whole("the number of repeats", repeats), as_number("the jitter", jitter)
     if repeats < 0 or not 0.0 < jitter <= 0.5:
         raise ValueError(f"it takes repeats >= 0 and 0 < jitter <= 0.5, not {repeats} and {jitter:g}")

@@ -241,7 +241,7 @@ class Problem:
         *,
         resolution: float,
         coarse: float,
-        repeats: int = 0,
+        repeats: int | None = None,
         jitter: float = 1e-6,
         executor: str | Executor = "auto",
         workers: int | None = None,
@@ -254,15 +254,17 @@ class Problem:
         the outcome need not be monotonic. An unsafe range narrower than the coarse step can be missed; the answer says
         so (`Boundary.gap`).
 
-        Close to the boundary, a contact-rich simulation is chaotic: the last digits of s0 decide. With ``repeats``,
-        values around the boundary are repeated, each time with the parameter moved a little: downwards until a value
-        is safe each time, upwards until one is unsafe each time. What lies between is undecided.
+        Close to the boundary, a contact-rich simulation is chaotic: the last digits of s0 decide. So values around the
+        boundary are repeated, each time with the parameter moved a little: downwards until a value is safe each time,
+        upwards until one is unsafe each time. What lies between is undecided, and comes with the chance of an unsafe
+        rollout (`Boundary.chances`).
 
         Args:
             resolution: step of the fine grid, in the parameter's unit; of a parameter with a logarithmic range, the
                 ratio of neighbouring values, above 1.
             coarse: step of the coarse grid, likewise.
-            repeats: rollouts with jitter for each value close to the boundary and each condition; 0 for none.
+            repeats: rollouts with jitter for each value close to the boundary and each condition; 0 for none. By
+                default 5, and none for integers, and for fields of the scenario, where each takes another Diagram.
             jitter: how far the parameter is moved at most in these, as a fraction of its range (on its own scale).
 
         Raises:
