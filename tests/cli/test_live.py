@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +13,7 @@ from click.testing import CliRunner
 from tests.control.live.rig import PATIENCE, Rig, served
 from vtbdrake.cli import main
 from vtbdrake.control.hub import Hub
+from vtbdrake.control.lcm_connections import TcpqConnection
 
 
 @pytest.fixture
@@ -40,3 +43,36 @@ def test_what_is_no_number_is_null_in_a_line_of_json(broken: Rig) -> None:
 
 def test_what_is_no_number_is_shown_as_it_is(broken: Rig) -> None:
     assert told(broken, "get", "dps.velocity") == "dps.velocity = [nan, 0.0]\n"
+
+
+GET, WATCH = ("get", "dps.gain"), ("watch", "dps.gain")
+COMMANDS = [GET, WATCH, ("set", "dps.gain=1"), ("reset",)]
+
+
+def refused(url: str, *arguments: str) -> str:
+    result = CliRunner().invoke(main, [*arguments, "--url", url, "--timeout", "0.3"], prog_name="vtbdrake")
+    assert result.exit_code == 1, result.output
+    assert result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_hub_that_is_full_is_one_line(command: tuple[str, ...]) -> None:
+    with Hub(port=0, max_clients=1) as bus:
+        other = TcpqConnection(bus.url, {"A": lambda *_: None}, PATIENCE)
+        assert "refuses the connection: the hub is full: max_clients=1" in refused(bus.url, *command)
+        other.close()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_hub_without_a_dps_is_one_line(command: tuple[str, ...]) -> None:
+    with Hub(port=0) as bus:
+        assert "does a DPS run there (vtbdrake run)?" in refused(bus.url, *command)
+
+
+@pytest.mark.parametrize("command", [GET, WATCH])
+def test_a_frozen_hub_is_one_line(command: tuple[str, ...]) -> None:
+    with Hub(port=0) as bus:
+        os.kill(bus.pid, signal.SIGSTOP)
+        assert "it is frozen" in refused(bus.url, *command)
+        os.kill(bus.pid, signal.SIGCONT)

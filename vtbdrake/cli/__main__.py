@@ -1,5 +1,9 @@
 """``python -m vtbdrake.cli`` is the program ``vtbdrake``."""
 
+import sys
+
 from vtbdrake.cli import main
 
+if not sys.flags.safe_path:
+    del sys.path[0]  # The current directory, which `main` puts last.
 main(prog_name="vtbdrake")

@@ -109,14 +109,7 @@ def main(traceback: bool) -> None:
       vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match mass
     """
     logging.getLogger("drake").setLevel(logging.WARNING)
-    _look_here_last()
-
-
-def _look_here_last() -> None:
-    """Lets modules be found in the current directory, if they are nowhere else: what lies there by chance, or came with
-    somebody's log, must not take the place of an installed module."""
+    # Last: what lies here by chance, or came with somebody's log, must not take the place of an installed module.
     here = os.getcwd()
-    if not sys.flags.safe_path and sys.path[:1] in ([""], [here]):
-        del sys.path[0]  # Put there by `python -m`.
-    if here not in sys.path:
+    if here not in sys.path and "" not in sys.path:
         sys.path.append(here)

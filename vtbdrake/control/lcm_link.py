@@ -93,6 +93,8 @@ class LcmLink:
             raise BridgeError(f"the hub at {self.url} refuses the connection: {error}") from error
         except OSError as error:
             remedy = "start a hub there (vtbdrake hub)" if self.url.startswith("tcpq:") else "is the URL right?"
+            if isinstance(error, TimeoutError):
+                remedy = "if a hub runs there, it is frozen; else, is the URL right?"
             raise BridgeError(f"no LCM bus at {self.url} ({error}); {remedy}") from error
 
     @property

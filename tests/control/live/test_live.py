@@ -15,6 +15,7 @@ import pytest
 from tests.control.live.rig import PATIENCE, Rig, served
 from tests.control.scripted import PERIOD
 from vtbdrake.control.hub import Hub, client_name
+from vtbdrake.control.lcm_connections import TcpqConnection
 from vtbdrake.control.live.client import LiveClient, LiveError, SilenceError, watch
 from vtbdrake.control.live.desk import MAX_WAITING
 from vtbdrake.control.live.live_watch import LiveWatch
@@ -46,6 +47,19 @@ def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[
 
 
 # -- set and get
+
+
+def test_the_service_waits_for_a_place_at_a_full_hub(capfd: pytest.CaptureFixture[str]) -> None:
+    with Hub(port=0, max_clients=2) as bus:
+        others = [TcpqConnection(bus.url, {"A": lambda *_: None}, PATIENCE) for _ in range(2)]
+        with served(bus.url) as (rig, _):
+            rig.until(lambda: bus.statistics().disconnected.get("too many", 0) >= 2)
+            for other in others:
+                other.close()
+            rig.until(lambda: bus.statistics().clients == 1)
+            assert list(rig.during(asked, bus.url, "get", ["dps.gain"])) == ["dps.gain"]
+    told = capfd.readouterr().err
+    assert "Traceback" not in told and told.count("the live service waits for the bus") == 1
 
 
 def test_who_sets_next_on_a_protected_channel_gets_it() -> None:

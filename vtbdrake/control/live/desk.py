@@ -5,6 +5,8 @@ Between the loop and its companion go frames of `pickle`, and those of `Values`,
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import pickle
 import select
 import struct
@@ -15,6 +17,7 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
+from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.companion import Channel
 from vtbdrake.control.lcm_link import LcmLink
 from vtbdrake.control.live.messages import (
@@ -35,6 +38,8 @@ from vtbdrake.control.live.messages import (
     to_json,
 )
 
+_log = logging.getLogger(__name__)
+
 MAX_WAITING = 16
 """Requests that the loop has not fulfilled yet."""
 MAX_WATCHES = 16
@@ -43,6 +48,7 @@ _TICK = 0.1  # s; leases are no more exact than that
 _BURST = 200  # messages to take in at a time
 _MEMORY = 1000  # requests to set and get that are known if they are said again
 _CONNECT_TIMEOUT = 2.0  # s
+_TRY_AGAIN = 0.5  # s
 
 # From the loop:
 VALUES = b"v"  # records of what was read
@@ -83,12 +89,29 @@ class Desk:
         self._loop = channel
         self._addresses = addresses
         self._link = LcmLink(url, dict.fromkeys((SET, GET, RESET, WATCH), self._hear), connect_timeout=_CONNECT_TIMEOUT)
-        self._link.open()
+        self._open()
         self._tasks: dict[int, _Task] = {}
         self._numbers = 0
         self._heard: deque[str] = deque(maxlen=_MEMORY)
         self._told = 0  # of those refused
         self._tell_next = 0.0
+
+    def _open(self) -> None:
+        """Connects to the bus, sooner or later.
+
+        Raises:
+            EOFError: the loop's end of the line has closed before that.
+        """
+        told = False
+        while not self._link.is_open:
+            try:
+                self._link.open()
+            except BridgeError as error:
+                if not told:
+                    _log.error("the live service waits for the bus, nobody can get or set: %s", error)
+                told = True
+                with contextlib.suppress(TimeoutError):
+                    self._loop.receive(_TRY_AGAIN)  # Nothing comes but the end.
 
     def run(self) -> None:
         """Until the loop's end of the line closes."""
