@@ -15,7 +15,15 @@ import pytest
 
 from tests.rollout.scenarios import KILL, RecordedScenario, TreacherousScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
-from vtbdrake.rollout import FuturesExecutor, Quality, QualityError, RolloutTask, WorkerError, make_executor
+from vtbdrake.rollout import (
+    FuturesExecutor,
+    Quality,
+    QualityError,
+    RolloutTask,
+    SerialExecutor,
+    WorkerError,
+    make_executor,
+)
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
@@ -109,36 +117,50 @@ def test_what_cannot_travel_is_an_error_with_the_remedy(process_pool):
         list(FuturesExecutor(process_pool).run(task, _points(1)))
 
 
-def test_a_broken_pool_takes_no_more_rollouts(tmp_path):
+def _standard(**options):
+    return ProcessPoolExecutor(1, mp_context=get_context("spawn"), **options)
+
+
+def _loky(**options):
+    return pytest.importorskip("loky").ProcessPoolExecutor(1, **options)
+
+
+@pytest.mark.parametrize("make", [_standard, _loky])
+@pytest.mark.parametrize("how", [KILL, -KILL])
+def test_a_killed_process_of_a_pool_costs_its_own_rollout_only(make, how, tmp_path, caplog):
+    """Once, and then it is run again; or each time."""
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
-    points = [{"dps.gain[0]": 0.0}] * 3 + [{"dps.gain[0]": KILL}] + [{"dps.gain[0]": 0.0}] * 20
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        executor = FuturesExecutor(pool)
-        with pytest.raises(WorkerError, match="ProcessPoolExecutor takes no more rollouts: .* terminated abruptly"):
-            list(executor.run(task, points))
-        with pytest.raises(WorkerError, match="takes no more rollouts"):
-            list(executor.run(task, points[:1]))
-
-
-def _standard():
-    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-
-
-def _loky():
-    return pytest.importorskip("loky").ProcessPoolExecutor(1)
+    points = [{"dps.gain[0]": 0.0, SHOULDER: 0.1 * i} for i in range(10)]
+    expected = dict(SerialExecutor().run(task, points))
+    points[3]["dps.gain[0]"] = how
+    with make() as pool, FuturesExecutor(pool) as executor:
+        results = dict(executor.run(task, points))
+        # It is used again, although the pool is broken.
+        again = dict(executor.run(task, points[:2]))
+    assert sorted(results) == list(range(10))
+    assert all(results[i].identical(expected[i]) for i in range(10) if i != 3)
+    assert all(again[i].identical(expected[i]) for i in range(2))
+    assert results[3].failed == (how < 0)
+    assert "processes of vtbdrake take its place" in caplog.text
 
 
 @pytest.mark.parametrize(("make", "error"), [(_standard, "BrokenProcessPool"), (_loky, "TerminatedWorkerError")])
-def test_a_broken_pool_costs_the_rollouts_that_it_had(make, error, tmp_path):
+def test_a_broken_pool_that_cannot_be_replaced_costs_what_it_had(make, error, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
-    points = [{"dps.gain[0]": 0.0}, {"dps.gain[0]": 0.0}, {"dps.gain[0]": KILL}, {"dps.gain[0]": 0.0}]
-    with make() as pool:
-        results = dict(FuturesExecutor(pool, in_flight=4).run(task, points))
-    assert [results[i].failed for i in range(4)] == [False, False, True, True]
+    points = [{"dps.gain[0]": 0.0}] * 2 + [{"dps.gain[0]": KILL}] + [{"dps.gain[0]": 0.0}] * 10
+    results = {}
+    with make(initializer=os.getpid) as pool:
+        executor = FuturesExecutor(pool, in_flight=4)
+        with pytest.raises(WorkerError, match="ProcessPoolExecutor takes no more rollouts: .* terminated"):
+            for index, result in executor.run(task, points):
+                results[index] = result
+        with pytest.raises(WorkerError, match="takes no more rollouts"):
+            list(executor.run(task, points[:1]))
+    assert [results[i].failed for i in range(3)] == [False, False, True]
     assert f"the pool broke while it had this rollout ({error}: " in results[2].message
     assert results[2].parameters == points[2]
 
