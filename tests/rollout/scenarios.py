@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
 
-KILL, STOP, HANG = 1.0, 2.0, 3.0
+KILL, STOP, HANG, KILL_PARENT = 1.0, 2.0, 3.0, 4.0
 
 
 @dataclass
@@ -36,7 +36,7 @@ class GreedyScenario(RecordedScenario):
 
 
 class Treacherous(SampledFeedback):
-    """Kills, stops or hangs its process when its gain says so, but only as long as a file is there."""
+    """Kills, stops or hangs its process, or kills its parent, when its gain says so, as long as a file is there."""
 
     def __init__(self, fuse):
         super().__init__(0.02)
@@ -50,6 +50,9 @@ class Treacherous(SampledFeedback):
                 self._fuse.unlink()  # Once only: the second try works.
             while abs(how) == HANG:
                 time.sleep(1.0)
+            if abs(how) == KILL_PARENT:
+                os.kill(os.getppid(), signal.SIGKILL)
+                time.sleep(60.0)  # This process ends with it.
             os.kill(os.getpid(), signal.SIGKILL if abs(how) == KILL else signal.SIGSTOP)
 
 

@@ -3,6 +3,7 @@
 import os
 import time
 import urllib.request
+from pathlib import Path
 
 import dask
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from distributed import Client
 
 from benchmarks.dask_cluster import dask_cluster
-from tests.rollout.scenarios import HANG, KILL, RecordedScenario, TreacherousScenario
+from tests.rollout.scenarios import HANG, KILL, KILL_PARENT, RecordedScenario, TreacherousScenario
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, WorkerError, make_executor
 from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor
@@ -90,32 +91,65 @@ def test_an_interruption_takes_back_what_has_not_begun(cluster):
         _assert_right(executor, TASK, _points(3))
 
 
-def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path, caplog):
-    """Kill -9, in the midst of a simulation."""
+@pytest.mark.parametrize("how", [KILL, KILL_PARENT])
+def test_a_killed_worker_costs_nothing_but_time(how, cluster, tmp_path, caplog):
+    """Kill -9, in the midst of a simulation, to the process that simulates or to the worker itself."""
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
     points = [{SHOULDER: value, "dps.gain[0]": 0.0} for value in np.linspace(0.1, 0.8, 8)]
-    points[2]["dps.gain[0]"] = KILL
+    points[2]["dps.gain[0]"] = how
     with DaskExecutor(cluster.client) as executor:
         results = dict(executor.run(task, points))
     assert not fuse.exists()
     assert sorted(results) == list(range(8))
     assert not any(result.failed for result in results.values())
-    assert "rollout 2 is tried again, alone" in caplog.text
+    assert ("rollout 2 is tried again, alone" in caplog.text) == (how == KILL_PARENT)
 
 
-@pytest.mark.parametrize(("how", "time_limit"), [(KILL, np.inf), (HANG, 0.3)])
-def test_a_rollout_that_kills_or_hangs_every_worker_fails_alone(how, time_limit, cluster, tmp_path):
+@pytest.mark.parametrize(
+    ("how", "time_limit", "reason"),
+    [
+        (KILL, np.inf, "its worker process died (exit code -9)"),
+        (HANG, 0.5, "it took longer than its time limit of 0.5 s"),
+    ],
+)
+def test_a_rollout_that_crashes_or_hangs_is_given_up_after_two_tries(how, time_limit, reason, cluster, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
     points = [{"dps.gain[0]": gain} for gain in (0.0, 0.0, -how, 0.0, 0.0)]
     with DaskExecutor(cluster.client, time_limit=time_limit) as executor:
+        before = cluster.client.run(os.getpid)
+        results = dict(executor.run(task, points))
+        assert before.items() <= cluster.client.run(os.getpid).items(), "it has cost a worker of the cluster"
+    assert [results[index].failed for index in range(5)] == [False, False, True, False, False]
+    assert results[2].message == f"{reason}; then {reason}"
+    assert results[2].parameters == points[2]
+
+
+def test_a_rollout_with_which_workers_are_lost_fails_alone(cluster, tmp_path):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{"dps.gain[0]": gain} for gain in (0.0, 0.0, -KILL_PARENT, 0.0, 0.0)]
+    with DaskExecutor(cluster.client) as executor:
         results = dict(executor.run(task, points))
     assert [results[index].failed for index in range(5)] == [False, False, True, False, False]
     assert "its workers died, time and again" in results[2].message
-    assert results[2].parameters == points[2]
+
+
+def test_a_closed_executor_leaves_no_processes_on_the_workers(cluster):
+    executor = DaskExecutor(cluster.client)
+    list(executor.run(TASK, _points(4)))
+    assert any(cluster.client.run(_children_of_this_process).values())
+    executor.close()
+    assert not any(cluster.client.run(_children_of_this_process).values())
+
+
+def _children_of_this_process():
+    threads = Path("/proc/self/task").iterdir()
+    return [child for thread in threads for child in (thread / "children").read_text().split()]
 
 
 def _slow(theta):
@@ -128,7 +162,7 @@ def test_a_rollout_beyond_its_time_limit_has_failed(cluster):
     with DaskExecutor(cluster.client, time_limit=1.0) as executor:
         results = dict(executor.run(task, [{THETA: 1.0}, {THETA: 0.1}, {THETA: 1.0}]))
     assert [results[index].end for index in range(3)] == ["threshold", "failed", "threshold"]
-    assert results[1].message == "it took longer than its time limit of 1 s"
+    assert results[1].message.count("it took longer than its time limit of 1 s") == 2
 
 
 def test_dask_by_name_goes_to_the_scheduler_in_the_environment(cluster, monkeypatch):

@@ -6,7 +6,7 @@ import hashlib
 import pickle
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,16 +120,10 @@ class _Kept:
 _kept = _Kept()
 
 
-def run_blob(
-    blob: Blob,
-    point: bytes,
-    *,
-    cancel: threading.Event | None = None,
-    begin: Callable[[], Any] | None = None,
-) -> RolloutResult:
+def run_blob(blob: Blob, point: bytes) -> RolloutResult:
     """One rollout of the task in ``blob``, in a process that keeps its testbed until the next; see `Runners.run`.
 
     Args:
         point: as `pack` made it.
     """
-    return _kept.runners.run(_kept.task(blob), unpack(point), cancel=cancel, begin=begin)
+    return _kept.runners.run(_kept.task(blob), unpack(point))

@@ -5,21 +5,19 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-import signal
 import threading
 import time
 import uuid
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
-from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob, unpack
+from vtbdrake.rollout.blob import Blob, Blobs, pack, unpack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
-from vtbdrake.rollout.processes import checked_time_limit
+from vtbdrake.rollout.processes import ProcessExecutor, checked_time_limit
 from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import failed
 from vtbdrake.rollout.worker import answer
@@ -42,18 +40,18 @@ _SIZE_PERIOD = 5.0
 class DaskExecutor(Executor):
     """Rollouts on a Dask cluster, whose workers need the same vtbdrake and what the problem imports.
 
-    A task is told to all workers once, also to those that come later, and each builds its testbed once and keeps it.
-    Workers with one thread each suit testbeds with systems in Python. When a worker is lost, Dask runs its rollouts
-    elsewhere. A rollout with which more workers were lost than ``distributed.scheduler.allowed-failures`` is tried
-    again when no other runs, for it may have been the neighbour of the one at fault; when that fails too, it is a
-    failed result. With no worker left, it waits for new ones, as one does for a queue of jobs.
+    A task is told to all workers once, also to those that come later. Each thread of a worker has its rollouts run in a
+    process of its own (see `ProcessExecutor`), which builds the testbed once and keeps it. So a rollout that crashes or
+    hangs costs two such processes, and is a failed result with the reasons; it costs no worker. When a worker itself is
+    lost, Dask runs its rollouts elsewhere. A rollout with which more workers were lost than
+    ``distributed.scheduler.allowed-failures`` is tried again when no other runs, for it may have been the neighbour of
+    the one at fault; when that fails too, it is a failed result. With no worker left, it waits for new ones, as one
+    does for a queue of jobs.
 
     Args:
         client: of the cluster, and left open; or the address of its scheduler; left out, that in the environment
             variable ``DASK_SCHEDULER_ADDRESS``.
-        time_limit: in seconds of wall time for one rollout. A rollout is asked to stop, and is then a failed result;
-            if it does not get to its next sample in as long again, its worker process is killed, to be started again
-            by its nanny.
+        time_limit: in seconds of wall time for one rollout, from when its testbed is there.
         in_flight: how many rollouts the cluster is given at a time; twice its threads if left out.
 
     Raises:
@@ -192,6 +190,39 @@ class TaskPlugin(WorkerPlugin):
     def __init__(self, blob: Blob) -> None:
         self.blob = blob
 
+    def setup(self, worker: Any) -> None:
+        _children.users += 1
+
+    def teardown(self, worker: Any) -> None:
+        _children.users -= 1
+        if not _children.users:
+            _children.close()
+
+
+class _Children:
+    """The processes in which the threads of this Dask worker have their rollouts run, one each.
+
+    Attributes:
+        users: how many tasks the worker knows.
+    """
+
+    def __init__(self) -> None:
+        self.users = 0
+        self._of: dict[tuple[int, float], ProcessExecutor] = {}
+
+    def get(self, time_limit: float) -> ProcessExecutor:
+        key = (threading.get_ident(), time_limit)
+        if key not in self._of:
+            self._of[key] = ProcessExecutor(1, time_limit=time_limit)
+        return self._of[key]
+
+    def close(self) -> None:
+        while self._of:
+            self._of.popitem()[1].close()
+
+
+_children = _Children()
+
 
 def roll_on_dask(name: str, index: int, point: bytes, time_limit: float) -> bytes:
     """One rollout on a worker, of the task that it knows by ``name``; the answer is that of `worker.answer`."""
@@ -200,23 +231,5 @@ def roll_on_dask(name: str, index: int, point: bytes, time_limit: float) -> byte
 
 
 def _roll(blob: Blob, point: bytes, time_limit: float) -> RolloutResult:
-    cancel = threading.Event()
-    timers = [threading.Timer(time_limit, cancel.set), threading.Timer(2.0 * time_limit, _die, [time_limit])]
-
-    def begin() -> None:
-        if isfinite(time_limit):
-            for timer in timers:
-                timer.start()
-
-    try:
-        return run_blob(blob, point, cancel=cancel, begin=begin)
-    except CancelledError:
-        return failed(unpack(point), f"it took longer than its time limit of {time_limit:g} s")
-    finally:
-        for timer in timers:
-            timer.cancel()
-
-
-def _die(time_limit: float) -> None:
-    _log.error("a rollout does not end within its time limit of %g s: its worker process is killed", time_limit)
-    os.kill(os.getpid(), signal.SIGKILL)
+    ((_, result),) = _children.get(time_limit).run_blob(blob, [unpack(point)])
+    return result

@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from vtbdrake.rollout.arguments import as_number
-from vtbdrake.rollout.blob import Blobs, pack
+from vtbdrake.rollout.blob import Blob, Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
@@ -129,7 +129,10 @@ class ProcessExecutor(Executor):
         Raises:
             WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
         """
-        blob = self._blobs.get(task).content
+        yield from self.run_blob(self._blobs.get(task), points)
+
+    def run_blob(self, blob: Blob, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        """Run one rollout per point, of a task that is pickled already; see `run`."""
         if self._running:
             raise WorkerError(
                 "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
@@ -137,7 +140,7 @@ class ProcessExecutor(Executor):
             )
         self._running = True
         try:
-            yield from self._run(blob, points)
+            yield from self._run(blob.content, points)
         finally:
             self._running = False
 
