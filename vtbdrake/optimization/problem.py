@@ -17,6 +17,8 @@ from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, grid
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
 from vtbdrake.rollout.arguments import all_of, as_number, as_whole
+from vtbdrake.rollout.blob import pack
+from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
@@ -24,6 +26,7 @@ from vtbdrake.testbed import Scenario, VirtualTestbed
 if TYPE_CHECKING:
     from vtbdrake.optimization.casadi_function import ProblemFunction
     from vtbdrake.optimization.study import Study
+    from vtbdrake.rollout.check import Check
 
 Condition = Mapping[str, Any]
 
@@ -195,6 +198,28 @@ class Problem:
         """The task and the testbed for ``values`` (address -> value), which may set fields of the scenario."""
         scenario = self._scenario(values)
         return replace(task, scenario=scenario), self._testbeds.get(scenario)
+
+    def check(self) -> Check:
+        """Look for what executors cannot cope with: memory outside the Context, values that do not travel to workers.
+
+        It takes about a second: the first part of a rollout is simulated four times, which must agree: twice in a row,
+        beside another rollout on the same Diagram, and in another process. Print what it returns.
+
+        Raises:
+            QualityError: f raises, is negative or NaN.
+        """
+        from vtbdrake.rollout.check import check_rollouts
+
+        ends = [{p.address: p.ends[k] for p in self.parameters if not p.is_field} for k in (0, -1)]
+        points = [{**split(self.conditions[k])[1], **ends[k]} for k in (0, -1)]
+        found = check_rollouts(self.task, self.testbed, points)
+        travelling = []
+        for values in (*self.conditions, *({p.address: end} for p in self.parameters for end in p.ends)):
+            try:
+                pack(values)
+            except WorkerError as error:
+                travelling.append(str(error))
+        return replace(found, findings=(*found.findings, *travelling))
 
     def sweep(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -98,6 +98,25 @@ class RolloutRunner:
                     raise
                 end, message = FAILED, f"{QUALITY_FAILED}{failure}"
             return samples.result(dict(parameters), end, message, begin)
+
+    def simulate(self, parameters: Mapping[str, Any]) -> Iterator[float]:
+        """Simulate from s0 with ``parameters`` set in it, and pause at every sample time, which is yielded.
+
+        Raises:
+            SimulationError: the simulation cannot go on.
+        """
+        self._reset(parameters)
+        for t, instant in zip(self._times, self._instants, strict=True):
+            status = self._advance(t, instant)
+            yield float(t)
+            if _terminated(status):
+                return
+
+    def measured(self, t: float) -> list[float]:
+        """f and the other measures as they are now, at the sample time ``t``."""
+        with _FailuresAsOutcomes():
+            values = {address: read(self.context) for address, read in self._readers.items()}
+        return [_sample(measure, [values[a] for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float) -> Any:
         """s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
@@ -206,9 +225,8 @@ class _Samples:
         """Samples f, the measures and what is to be recorded; says whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
         with _FailuresAsOutcomes():
-            values = {address: read(runner.context) for address, read in runner._readers.items()}
             recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
-        new = [_sample(measure, [values[a] for a in measure.of], t) for measure in runner._measures]
+        new = runner.measured(t)
         self._times.append(t)
         self._clock = runner.context.get_time()
         for address, value in recorded.items():

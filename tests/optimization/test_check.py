@@ -1,0 +1,115 @@
+"""`Problem.check` finds what would make rollouts differ, or not travel, and says where."""
+
+import os
+import threading
+from dataclasses import dataclass
+
+import pytest
+
+import vtbdrake as vtb
+from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
+THETA = "sim.sys.Pendulum.theta.position"
+
+
+def _problem(scenario, quality=abs, of=SHOULDER):
+    return vtb.Problem(
+        scenario=scenario,
+        parameters=[vtb.Parameter(of, 0.1, 1.0)],
+        quality=vtb.Quality(quality, of=of),
+        horizon=0.5,
+    )
+
+
+class Forgetful(SampledFeedback):
+    """Sums up in itself, as no system may; ``again`` says whether it begins at zero in each rollout."""
+
+    def __init__(self, again):
+        super().__init__(0.02)
+        self._sum = 0.0
+        if again:
+            self.DeclareInitializationDiscreteUpdateEvent(self._forget)
+
+    def _forget(self, context, discrete):
+        self._sum = 0.0
+
+    def _update(self, context, discrete):
+        self._sum += float(self._state.Eval(context)[0])
+        discrete.set_value(0, [-0.5 * self._sum])
+
+
+@dataclass
+class ForgetfulScenario(AcrobotScenario):
+    again: bool = False
+
+    def make_dps(self):
+        return Forgetful(self.again)
+
+
+@pytest.mark.parametrize("scenario", [AcrobotScenario(), PendulumScenario()])
+def test_nothing_is_found_where_nothing_is_wrong(scenario):
+    found = _problem(scenario, of=SHOULDER if isinstance(scenario, AcrobotScenario) else THETA).check()
+    assert found.ok and found.findings == ()
+    assert 0.0 < found.seconds <= 0.5
+    assert str(found).startswith("nothing found: rollouts repeat over ")
+
+
+@pytest.mark.parametrize(
+    ("again", "what"),
+    [(False, "a second rollout of the same point"), (True, "a rollout that runs beside another one")],
+)
+def test_memory_in_self_is_named_with_its_system(again, what):
+    found = _problem(ForgetfulScenario(again=again)).check()
+    (finding,) = found.findings
+    assert finding.startswith(f"{what} differs from t = 0.05 s on: self._sum of dps (Forgetful) has memory outside")
+    assert "DeclareDiscreteState" in finding
+    assert not found.ok and str(found) == finding
+
+
+def test_a_quality_with_memory_is_named():
+    calls = []
+
+    def counted(theta):
+        calls.append(theta)
+        return abs(theta) + len(calls)
+
+    (finding,) = _problem(AcrobotScenario(), counted).check().findings
+    assert finding.startswith("a second rollout of the same point differs at t = 0 s in its quality counted")
+
+
+def test_what_a_quality_holds_and_cannot_be_sent_is_named():
+    lock = threading.Lock()
+
+    def locked(theta):
+        return abs(theta) + lock.locked()
+
+    (finding,) = _problem(AcrobotScenario(), locked).check().findings
+    assert finding.startswith("'lock', which the quality locked uses, cannot be sent to workers (TypeError: ")
+    assert "executor='threads'" in finding
+
+
+@dataclass
+class PidScenario(AcrobotScenario):
+    def make_dps(self):
+        return SampledFeedback(0.02 + 0.001 * (os.getpid() != MAIN))
+
+
+MAIN = int(os.environ.setdefault("VTB_TEST_MAIN", str(os.getpid())))
+
+
+def test_what_depends_on_the_process_is_found():
+    (finding,) = _problem(PidScenario()).check().findings
+    assert finding.startswith("in another process, a rollout of the same point gives another result")
+
+
+def test_a_failing_simulation_is_compared_too():
+    from tests.rollout.test_runner import BrokenScenario
+
+    problem = vtb.Problem(
+        scenario=BrokenScenario(kind="raises"),
+        parameters=[vtb.Parameter(SHOULDER, 0.1, 1.0)],
+        quality=vtb.Quality(abs, of=SHOULDER),
+        horizon=2.0,
+    )
+    assert problem.check().ok

@@ -1,0 +1,216 @@
+"""Finds what executors cannot cope with: memory outside the Context, and values that do not travel to workers."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.pickling import dumps
+from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.processes import ProcessExecutor
+from vtbdrake.rollout.quality import QualityError
+from vtbdrake.rollout.runner import RolloutRunner, SimulationError
+from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.state.snapshot import numeric_groups
+from vtbdrake.state.systems import leaves, read_group
+from vtbdrake.testbed import VirtualTestbed
+
+# The reference is simulated for about so many seconds of processor time; the other rollouts go as far.
+_BUDGET = 0.1
+
+# What is compared at a sample time: by the path of a system its numbers, under "" those of f and the other measures.
+Sample = Mapping[str, tuple[Any, ...]]
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a check has found.
+
+    Attributes:
+        findings: one sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
+        seconds: how much simulated time of a rollout was looked at.
+    """
+
+    findings: tuple[str, ...]
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing was found."""
+        return not self.findings
+
+    def __str__(self) -> str:
+        if self.ok:
+            return f"nothing found: rollouts repeat over {self.seconds:g} s, side by side and in another process"
+        return "\n".join(self.findings)
+
+
+def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[Mapping[str, Any]]) -> Check:
+    """Compare rollouts that must agree: repeated, side by side on one Diagram, and in another process.
+
+    Args:
+        task: of the rollouts.
+        testbed: of the task's scenario, on which the rollouts run.
+        points: address -> value; the first is repeated, the last runs beside it. None sets a field of the scenario.
+
+    Raises:
+        QualityError: the quality is wrong, so that nothing can be compared.
+    """
+    point, other = points[0], points[-1]
+    reference = list(_within(_BUDGET, _trace(RolloutRunner(task, testbed), point)))
+    before = _attributes(testbed)
+    repeated = _first(_trace(RolloutRunner(task, testbed), point), count=len(reference))
+    changed = [name for name, value in _attributes(testbed).items() if before.get(name) != value]
+    findings = list(_compare(task, reference, repeated, changed, "a second rollout of the same point"))
+    if not findings:
+        beside = _side_by_side(RolloutRunner(task, testbed), point, RolloutRunner(task, testbed), other, len(reference))
+        changed = [name for name, value in _attributes(testbed).items() if before.get(name) != value]
+        findings += _compare(task, reference, beside, changed, "a rollout that runs beside another one")
+    short = replace(task, horizon=max(float(reference[-1][0]), task.sample_period), keep_state=False)
+    travelling = list(_unsendable(task))
+    if not travelling:
+        travelling = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
+    return Check((*findings, *travelling), float(reference[-1][0]))
+
+
+def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:
+    """The numbers of all systems at each sample time, and what ended it, at the time before."""
+    systems = list(leaves(runner.testbed.diagram))
+    t = 0.0
+    try:
+        for t in runner.simulate(point):
+            sample: dict[str, tuple[Any, ...]] = {"": tuple(runner.measured(t))}
+            for path, system in systems:
+                context = system.GetMyContextFromRoot(runner.context)
+                sample[path] = tuple(read_group(context, *group) for group in numeric_groups(context))
+            yield t, sample
+    except SimulationError as failure:
+        yield t, {"": (str(failure),)}
+
+
+def _within(budget: float, trace: Iterator[tuple[float, Sample]]) -> Iterator[tuple[float, Sample]]:
+    """A few samples at least, and those of ``budget`` seconds."""
+    end = time.thread_time() + budget
+    for count, sample in enumerate(trace):
+        yield sample
+        if count >= 2 and time.thread_time() > end:
+            return
+
+
+def _first(trace: Iterator[tuple[float, Sample]], *, count: int) -> list[tuple[float, Sample]]:
+    return [sample for _, sample in zip(range(count), trace, strict=False)]
+
+
+def _side_by_side(
+    runner: RolloutRunner, point: Mapping[str, Any], neighbour: RolloutRunner, other: Mapping[str, Any], count: int
+) -> list[tuple[float, Sample]]:
+    """``count`` samples of one rollout, while another one takes its steps in turn."""
+    pairs = zip_longest(_trace(neighbour, other), _trace(runner, point))
+    return [mine for _, (_, mine) in zip(range(count), pairs, strict=False) if mine is not None]
+
+
+def _compare(
+    task: RolloutTask,
+    reference: Sequence[tuple[float, Sample]],
+    repeated: Sequence[tuple[float, Sample]],
+    changed: Sequence[str],
+    what: str,
+) -> Iterator[str]:
+    """At most one finding: where the two part first."""
+    for (t, expected), (_, found) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
+        parted = [path for path in {**expected, **found} if not _same(expected.get(path), found.get(path))]
+        if not parted:
+            continue
+        name = task.quality.name if task.quality is not None else "the quality"
+        if parted == [""] and not changed:
+            yield (
+                f"{what} differs at t = {t:g} s in its quality {name} (or another measure), not in its state: it must "
+                "depend on its arguments alone, so keep no memory in it, and draw no random numbers"
+            )
+        else:
+            where = ", ".join(changed) or f"a system that drives {', '.join(path for path in parted if path)}"
+            yield (
+                f"{what} differs from t = {t:g} s on: {where} has memory outside the Context. Declare it as state "
+                "(DeclareDiscreteState, DeclareAbstractState) and read it from the context, so that rollouts repeat"
+            )
+        return
+
+
+def _same(a: tuple[Any, ...] | None, b: tuple[Any, ...] | None) -> bool:
+    if a is None or b is None or len(a) != len(b):
+        return False
+    return all(
+        x == y if isinstance(x, str) or isinstance(y, str) else np.array_equal(x, y, equal_nan=True)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
+    """By name, the attributes of the systems in Python: as bytes, or their identity where they do not pickle."""
+    return {
+        f"self.{name} of {path} ({type(system).__name__})": _fingerprint(value)
+        for path, system in leaves(testbed.diagram)
+        if path in testbed.python_systems
+        for name, value in vars(system).items()
+        if not name.startswith("_pydrake")
+    }
+
+
+def _fingerprint(value: Any) -> Any:
+    try:
+        return pickle.dumps(value)
+    except Exception:  # A port, or a function: it is what it is.
+        return id(value)
+
+
+def _unsendable(task: RolloutTask) -> Iterator[str]:
+    """What of the task cannot be pickled, as deep as it can be named."""
+    parts: dict[str, Any] = {}
+    for measure in (*([task.quality] if task.quality is not None else []), *task.measures):
+        function = measure.f
+        cells = getattr(function, "__closure__", None) or ()
+        names = function.__code__.co_freevars if cells else ()
+        for name, cell in zip(names, cells, strict=True):
+            parts[f"{name!r}, which the quality {measure.name} uses,"] = cell.cell_contents
+        parts[f"the quality {measure.name}"] = function
+    scenario = task.scenario
+    parts |= {f"the scenario's field {field.name}": getattr(scenario, field.name) for field in fields(scenario)}
+    parts |= {"the scenario": scenario, "the problem": task}
+    for what, value in parts.items():
+        try:
+            dumps(value)
+        except Exception as error:
+            yield (
+                f"{what} cannot be sent to workers ({type(error).__name__}: {error}): use executor='threads' or "
+                "'serial', or make it where it is used, from plain data"
+            )
+            return
+
+
+def _elsewhere(task: RolloutTask, runner: RolloutRunner, point: Mapping[str, Any], *, alone: bool) -> Iterator[str]:
+    """A rollout in another process; ``alone`` says whether rollouts agree in this one."""
+    here = _run(lambda: runner.run(point))
+    with ProcessExecutor(1) as executor:
+        there = _run(lambda: next(iter(executor.run(task, [point])))[1])
+    if isinstance(there, WorkerError):
+        yield str(there)
+    elif alone and isinstance(here, Exception) != isinstance(there, Exception):
+        yield f"in another process, a rollout ends otherwise: {there!r} instead of {here!r}"
+    elif alone and not isinstance(here, Exception) and not here.identical(there):
+        yield (
+            "in another process, a rollout of the same point gives another result: something depends on the process "
+            "(a global variable, the order of a set, the time, a file), or a system has memory outside the Context"
+        )
+
+
+def _run(rollout: Callable[[], Any]) -> Any:
+    try:
+        return rollout()
+    except (QualityError, WorkerError) as error:
+        return error
