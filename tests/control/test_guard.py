@@ -137,6 +137,20 @@ def test_level_that_a_sensor_jumped_to_is_accepted_by_a_reset_or_while_nothing_i
         assert loop.cycle({"torque": [0.0, 0.0]}).ok
 
 
+def test_reset_that_is_refused_does_not_accept_a_level_that_a_sensor_jumped_to() -> None:
+    sensor = Signal("velocity", size=2, rate=1.0)
+    brake = Brake("velocity", gain=0.01)
+    loop = Loop(TORQUE, sense=sensor, jump_tolerance={"velocity": 0.01}, fallback={"torque": brake})
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.receptions["velocity"].value = np.array([0.0, 5.0])
+    for _ in range(200):
+        loop.cycle({"torque": [nan, 0.0]})
+        assert loop.reset() != ()
+    assert loop.guards.watchdogs["velocity"].value.tolist() == [0.0, 0.0]
+    assert loop.guards.reset(loop.now, loop.receptions, ("somebody is in the cell",))[-1] == "somebody is in the cell"
+    assert loop.guards.watchdogs["velocity"].value.tolist() == [0.0, 0.0]
+
+
 def test_sensor_that_is_not_on_real_is_not_watched() -> None:
     loop = Loop(TORQUE)
     assert loop.guards.check(5.0, {}, {"torque": [0.0, 0.0]}).ok

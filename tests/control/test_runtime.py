@@ -300,9 +300,18 @@ def test_a_machine_that_falls_silent_leads_to_the_fallback_within_its_age_and_a_
     assert stopped <= last + age + PERIOD + 1e-9
 
 
-@pytest.mark.parametrize(("took", "kind"), [(0.005, None), (0.0108, "stale"), (0.03, "missed")])
-def test_a_command_that_a_step_took_long_to_find_is_judged_by_the_age_that_its_samples_have_then(took, kind):
-    runtime, bridge, clock = switched(rate=0.0)
+@pytest.mark.parametrize(
+    ("took", "kind", "options"),
+    [
+        (0.005, None, {}),
+        (0.0108, "stale", {}),
+        (0.03, "missed", {}),
+        (0.03, "missed", {"pace": "position"}),
+        (0.03, "stale", {"pace": "position", "patience": 60.0}),
+    ],
+)
+def test_a_command_that_a_step_took_long_to_find_is_judged_by_the_age_that_its_samples_have_then(took, kind, options):
+    runtime, bridge, clock = switched(rate=0.0, **options)
     runtime.run(cycles=5)
     step = runtime.step
 

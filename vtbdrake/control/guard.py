@@ -236,10 +236,11 @@ class Guards:
         Returns:
             Why it stays; empty if it was released.
         """
-        self._accept_steady()
-        faults = (*self._causes, *found(now, self.watchdogs, receptions))
-        reasons = (*(fault.reason for fault in faults), *against)
+        doubts = found(now, self.watchdogs, receptions)
+        lasting = [doubt for doubt in doubts if not (doubt.kind == "jump" and self._steady(doubt))]
+        reasons = (*(fault.reason for fault in (*self._causes, *lasting)), *against)
         if not reasons:
+            self._accept_steady()
             self._latched = ()
         return reasons
 
@@ -282,6 +283,9 @@ class Guards:
             else:
                 guard.release()
         return causes
+
+    def _steady(self, jump: Fault) -> bool:
+        return jump.signal is not None and self.watchdogs[jump.signal].steady
 
     def _accept_steady(self) -> None:
         for watchdog in self.watchdogs.values():

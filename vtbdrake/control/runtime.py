@@ -229,9 +229,7 @@ class Runtime(Stepped):
             commands,
             active,
             error=error,
-            # Who slept for long wakes up to old messages, and who steps for long answers old ones: those deadlines
-            # count before anything is sent.
-            missed=self.statistics.run + int((lateness + stepped - begin) / self.period),
+            missed=self.statistics.run + self._passed(lateness, stepped - begin),
             not_ready=self.not_ready() if active else None,
             others=self.bridge.sensed,
         )
@@ -250,6 +248,13 @@ class Runtime(Stepped):
                 _log.exception("a watcher of the loop raised, and is left out from now on")
                 self._watchers.remove(watcher)
         return done
+
+    def _passed(self, lateness: float, worked: float) -> int:
+        """How many deadlines have passed before anything is sent: who slept for long wakes up to old messages, and who
+        worked for long answers old ones. A paced loop may work for as long as its patience."""
+        if self.pace is not None and worked <= self._patience:
+            worked = 0.0
+        return int((lateness + worked) / self.period)
 
     def _tell_foreign(self) -> None:
         """Counts commands of somebody else, and logs them once per second at most."""

@@ -137,12 +137,17 @@ class Watchdog(Freshness):
             fault = self._jump(now, reception, self._reach)
         return fault
 
+    @property
+    def steady(self) -> bool:
+        """Whether the signal has jumped, and its samples have agreed with each other for `SETTLING` since then."""
+        return self._refused is not None and self._refused_at - self._steady_since >= SETTLING
+
     def accept_steady(self) -> None:
-        """Accept the level that the signal has jumped to, if its samples have agreed with each other for `SETTLING`.
+        """Accept the level that the signal has jumped to, if it is steady there.
 
         To be called when somebody takes the responsibility (a reset by hand), or nothing depends on the signal.
         """
-        if self._refused is not None and self._refused_at - self._steady_since >= SETTLING:
+        if self.steady:
             self.accept(self._refused, self._refused_at)
             self._refused = None
 
