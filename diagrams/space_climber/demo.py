@@ -32,7 +32,7 @@ def main() -> None:
     print(f"  paper     {PAPER} (its robot's dimensions and the lever of the mass are not published)")
 
     OUT.mkdir(exist_ok=True)
-    sweep.plot().savefig(OUT / "payload.png", dpi=150)
+    boundary.plot().savefig(OUT / "payload.png", dpi=150)
     sweep.save(OUT / "payload.vtb")
     meshcat = make_meshcat()
     motions = {

@@ -74,7 +74,7 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
         horizon=HORIZON * stride / STRIDE,
         threshold=0.9,
         sample_period=SAMPLE_PERIOD,
-        conditions=[{PHASE: phase, PERIOD: stride} for phase in phases],
+        conditions=[{PHASE: phase} if stride == STRIDE else {PHASE: phase, PERIOD: stride} for phase in phases],
     )
 
 

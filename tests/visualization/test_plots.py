@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +102,17 @@ def test_without_threshold_nothing_is_shaded() -> None:
     left = plot_sweep(smooth()).axes[0]
     assert not left.patches
     assert not marked(left, "threshold")
+
+
+def test_a_boundary_is_drawn_with_its_own_interval() -> None:
+    data = smooth(threshold=0.5)
+    boundary = replace(data.boundary(), lower=0.0, upper=60.0)
+    left = boundary.plot().axes[0]
+    (span,) = [patch for patch in left.patches if patch.get_gid() == "boundary"]
+    assert (span.get_x(), span.get_x() + span.get_width()) == (0.0, 60.0)
+    assert left.get_title() == "Safe up to 0 kg, not at 60 kg"
+    with pytest.raises(ValueError, match="without the sweep that it rests on"):
+        replace(boundary, sweep=None).plot()
 
 
 def test_points_that_hold_are_filled_those_that_exceed_are_open() -> None:

@@ -79,7 +79,7 @@ def find_boundary(
     )
     sweep = found.sweep
     assert sweep is not None
-    write_files(sweep, save=save, csv=csv, plot=plot)
+    write_files(sweep, save=save, csv=csv, plot=plot, boundary=found)
     refuse_failures(sweep)
     click.echo(_report(found, sweep))
 

@@ -28,7 +28,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.quality import make_quality
 from vtbdrake.cli.text import number, table, write_csv
-from vtbdrake.optimization import Parameter, Problem, Sweep
+from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
 from vtbdrake.rollout.choice import NAMES
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
@@ -129,14 +129,16 @@ def condition_text(index: int, condition: Mapping[str, Any]) -> str:
     return f"condition {index} ({', '.join(values)})"
 
 
-def write_files(sweep: Sweep, *, save: Path | None, csv: Path | None, plot: Path | None) -> None:
-    """Writes what was asked for."""
+def write_files(
+    sweep: Sweep, *, save: Path | None, csv: Path | None, plot: Path | None, boundary: Boundary | None = None
+) -> None:
+    """Writes what was asked for; the plot shows the boundary, if one was searched for."""
     if save is not None:
         sweep.save(save)
     if csv is not None:
         write_csv(csv, sweep.to_dict())
     if plot is not None:
-        sweep.plot().savefig(plot)
+        (sweep if boundary is None else boundary).plot().savefig(plot)
 
 
 def refuse_failures(sweep: Sweep) -> None:

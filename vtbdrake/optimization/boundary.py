@@ -15,6 +15,8 @@ from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.result import TERMINATED
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from vtbdrake.optimization.sweep import Sweep
 
 # (index of a value of the fine grid, number of the condition)
@@ -105,6 +107,18 @@ class Boundary:
             if chance.value not in worst or chance.share > worst[chance.value].share:
                 worst[chance.value] = chance
         return tuple(worst[value] for value in sorted(worst))
+
+    def plot(self) -> Figure:
+        """h over the parameter, with the interval shaded, beside the rollouts over time; see `Sweep.plot`.
+
+        Raises:
+            ValueError: it rests on no sweep.
+        """
+        from vtbdrake.visualization import plot_sweep
+
+        if self.sweep is None:
+            raise ValueError("the boundary comes without the sweep that it rests on, so that there is nothing to draw")
+        return plot_sweep(self.sweep, boundary=self)
 
     def __str__(self) -> str:
         missed = ""

@@ -30,7 +30,7 @@ from vtbdrake.visualization.trajectories import (
 )
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Sweep
+    from vtbdrake.optimization import Boundary, Sweep
     from vtbdrake.rollout import RolloutResult
 
 _BOUNDARY = "#f4a582"
@@ -39,13 +39,17 @@ _CONDITIONS = colormaps["tab10"]
 _SINGLE = "#2166ac"
 
 
-def plot_sweep(sweep: Sweep) -> Figure:
+def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
     """h over the parameters (Figure 6).
 
     Over one parameter: h, with the boundary interval shaded if there is a threshold, beside the quality trajectories
     with t* marked (Figure 5), coloured by the parameter's value. Where f' takes two values only (tipped over or not),
     trajectories would cover each other; then each rollout is a bar over time at its parameter value, up to t*. Over two
     parameters: the landscape of h, under the worst condition, with the best point.
+
+    Args:
+        sweep: what is drawn.
+        boundary: the boundary to be shaded; left out, it is that of the sweep, if there is one.
 
     Raises:
         ValueError: there are more than two parameters, or no rollouts.
@@ -64,7 +68,9 @@ def plot_sweep(sweep: Sweep) -> Figure:
         return figure
     figure = Picture(12.0, 4.6)
     left, right = figure.subplots(1, 2)
-    _draw_h(left, sweep)
+    if boundary is None and not why_no_boundary(sweep):
+        boundary = sweep.boundary()
+    _draw_h(left, sweep, boundary)
     if is_two_valued(sweep.rollouts):
         _draw_bars(right, sweep)
     else:
@@ -121,7 +127,7 @@ def _draw_qualities(
     )
 
 
-def _draw_h(axes: Axes, sweep: Sweep) -> None:
+def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
     values, h = sweep.points[:, 0], sweep.h
     many = len(sweep.conditions) > 1
     for number, condition in enumerate(sweep.conditions):
@@ -160,7 +166,7 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
             gid="failed",
         )
     handles += [key for key in keys(threshold=threshold) if key.get_label() != "t*"]
-    title = _draw_boundary(axes, sweep, handles)
+    title = "" if boundary is None else _draw_boundary(axes, sweep, boundary, handles)
     parameter = sweep.parameters[0]
     axes.set(
         xlabel=label(parameter.address, sweep.units[0]), ylabel="h(s⁰) = f'(s⁰, t*)", title=title or "Quality at t*"
@@ -170,11 +176,8 @@ def _draw_h(axes: Axes, sweep: Sweep) -> None:
         axes.legend(handles=handles, fontsize="small", title="condition" if many else None, loc="best")
 
 
-def _draw_boundary(axes: Axes, sweep: Sweep, handles: list[Artist]) -> str:
+def _draw_boundary(axes: Axes, sweep: Sweep, boundary: Boundary, handles: list[Artist]) -> str:
     """Shades the boundary interval; returns what it says."""
-    if why_no_boundary(sweep):
-        return ""
-    boundary = sweep.boundary()
     lower = max(boundary.lower, float(sweep.points[:, 0].min()))
     upper = min(boundary.upper, float(sweep.points[:, 0].max()))
     if lower < upper and np.isfinite([boundary.lower, boundary.upper]).all():
