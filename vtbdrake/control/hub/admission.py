@@ -67,5 +67,5 @@ class Admission:
                 limits = f"{self._most_of_a_user} for one, {self._most_of_others} for all others together"
                 return Decision(user, QUOTA, f"the hub is full for other users than its own ({limits})")
         if len(clients) >= self._most:
-            return Decision(user, FULL, f"the hub is full: max_clients={self._most} are connected")
+            return Decision(user, FULL, f"the hub is full: max_clients={self._most} are connected; end some")
         return Decision(user)
