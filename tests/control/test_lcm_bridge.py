@@ -23,7 +23,7 @@ import pytest
 
 from tests.control.arm import LIMIT, bridge, command, status
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.hub import STATUS_CHANNEL, Hub
+from vtbdrake.control.hub import STATUS_CHANNEL, ChannelStatistics, Hub, Statistics
 from vtbdrake.control.lcm_bridge import LcmBridge
 from vtbdrake.control.lcm_connections import TcpqConnection
 from vtbdrake.control.lcm_maps import LcmMap
@@ -357,6 +357,41 @@ def test_second_publisher_of_commands_is_heard_on_a_hub_and_speaks_against_comma
         assert "somebody else publishes commands on IIWA_COMMAND" in (arm.contention or "")
         assert wait(arm, lambda: arm.contention is None)
         assert arm.foreign == 1
+
+
+def test_second_publisher_that_a_hub_refuses_is_an_alarm_too() -> None:
+    with Hub(port=0, protect=["IIWA_COMMAND"], lease=300.0) as hub, closing(bridge(hub.url)) as arm:
+        intruder = Peer(hub.url)
+        arm.open()
+        arm.publish({"position": np.zeros(7)})
+        assert wait(arm, lambda: hub.statistics().protected["IIWA_COMMAND"].owner is not None)
+
+        def is_noticed() -> bool:
+            intruder.lcm.publish("IIWA_COMMAND", b"foreign")
+            return arm.foreign > 0
+
+        assert wait(arm, is_noticed)
+        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.contention or "")
+        assert [data for channel, data in intruder.heard if channel == "IIWA_COMMAND"].count(b"foreign") == 0
+        assert wait(arm, lambda: arm.contention is None)
+        assert arm.hindrance is None
+
+
+def test_refusals_of_ones_own_commands_and_those_before_are_no_attempts_of_others() -> None:
+    ownership = Ownership(["C"], lambda: "me")
+
+    def told(owner: str, refused: int, last: str) -> int:
+        state = ChannelStatistics(owner=owner, refused=refused, last_refused=last)
+        ownership.take(STATUS_CHANNEL, Statistics(protected={"C": state}).to_json())
+        return ownership.attempts
+
+    assert told("me", 7, "other") == 0  # before the first status
+    assert told("me", 9, "other") == 2
+    assert told("other", 12, "me") == 2
+    assert told("me", 13, "me") == 2
+    assert told("me", 0, "other") == 2  # of a hub that was started again
+    assert told("me", 1, "other") == 3
+    assert ownership.contended(60.0) == ["C"] and ownership.contended(0.0) == []
 
 
 def test_own_commands_that_come_back_late_all_at_once_or_not_in_order_are_no_alarm() -> None:

@@ -77,7 +77,8 @@ class Bridge(ABC):
 
     @property
     def foreign(self) -> int:
-        """How many commands of somebody else have been heard on the own command channels, by a bridge that listens."""
+        """How many commands of somebody else have been heard on the own command channels, by a bridge that listens, or
+        were refused there by a hub."""
         return 0
 
     @property

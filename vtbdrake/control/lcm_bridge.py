@@ -147,12 +147,13 @@ class LcmBridge(Bridge):
 
     @property
     def foreign(self) -> int:
-        return sum(watch.alarms for watch in self._watches.values())
+        return sum(watch.alarms for watch in self._watches.values()) + self._ownership.attempts
 
     @property
     def contention(self) -> str | None:
         since = time.monotonic() - CONTENTION
-        found = [channel for channel, watch in self._watches.items() if watch.last > since]
+        found = {channel for channel, watch in self._watches.items() if watch.last > since}
+        found.update(self._ownership.contended(CONTENTION))
         if not found:
             return None
         return f"somebody else publishes commands on {', '.join(sorted(found))}: only one may command a machine"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 
-from vtbdrake.control.hub.statistics import Statistics
+from vtbdrake.control.hub.statistics import ChannelStatistics, Statistics
 
 _log = logging.getLogger(__name__)
 
@@ -21,10 +22,15 @@ class Ownership:
 
     Attributes:
         foreign: the channels among them that belong to somebody else.
+        attempts: how often the hub has refused somebody else on a channel that is one's own.
+        last: by channel, when it did so last, in seconds by `time.monotonic`.
     """
 
     def __init__(self, channels: Iterable[str], name: Callable[[], str | None]) -> None:
         self.foreign: frozenset[str] = frozenset()
+        self.attempts = 0
+        self.last: dict[str, float] = {}
+        self._refused: dict[str, int] = {}  # by channel, as far as the hub has told
         self._channels = tuple(channels)
         self._name = name
 
@@ -42,4 +48,18 @@ class Ownership:
                 foreign.add(channel)
                 if channel not in self.foreign:
                     _log.error("commands on %s are refused by the hub: the channel belongs to %s", channel, owner)
+            if channel in protected:
+                self._count(channel, protected[channel], own)
         self.foreign = frozenset(foreign)
+
+    def _count(self, channel: str, state: ChannelStatistics, own: str | None) -> None:
+        """Counts what the hub has refused since its last status; what came before the first one is not one's own."""
+        before = self._refused.get(channel, state.refused)
+        self._refused[channel] = state.refused
+        if own is not None and state.owner == own != state.last_refused and state.refused > before:
+            self.attempts += state.refused - before
+            self.last[channel] = time.monotonic()
+
+    def contended(self, seconds: float) -> list[str]:
+        """Return the own channels on which somebody else was refused within the last ``seconds``."""
+        return [channel for channel, last in self.last.items() if last > time.monotonic() - seconds]
