@@ -32,8 +32,8 @@ def test_a_study_is_run_shown_given_points_and_resumed(tmp_path: Path) -> None:
         ["edit", file, 1, f"{RATE}=2", f"{ANGLE}=-0.5"],
         ["add", file, f"{ANGLE}=1", f"{RATE}=1"],
         ["remove", file, 3],
-        ["note", file, "operator=somebody=else"],
-        ["note", file, "marks=[1, 2]", "--trial", 0],
+        ["attribute", file, "operator=somebody=else"],
+        ["attribute", file, "marks=[1, 2]", "--trial", 0],
     ):
         done = run("study", *arguments)
         assert (done.returncode, done.stderr) == (0, "")
@@ -59,7 +59,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
         (["add", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
         (["add", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
         (["remove", file, 7], "no point 7 waits to be judged"),
-        (["note", file, "a=1", "--trial", 99], "no trial 99"),
+        (["attribute", file, "a=1", "--trial", 99], "no trial 99"),
         (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
     ):
         failed = run("study", *arguments)

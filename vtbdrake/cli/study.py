@@ -142,12 +142,12 @@ def remove(file: Path, number: int) -> None:
         opened.remove(number)
 
 
-@study.command("note")
+@study.command("attribute")
 @_file
 @click.argument("attribute", callback=converted(parse_field), metavar="KEY=VALUE")
-@click.option("--trial", type=int, metavar="NUMBER", help="Note it of the point of a trial, not of the study.")
-def note(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
-    """Note an attribute of a study, or of a point."""
+@click.option("--trial", type=int, metavar="NUMBER", help="Of the point of this trial, not of the study.")
+def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
+    """Set an attribute of a study, or of a point."""
     with Study.open(file) as opened:
         trials = opened.trials if trial is not None else ()
         if trial is not None and not 0 <= trial < len(trials):

@@ -11,6 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.optimization.identity import differences
 from vtbdrake.optimization.optuna_trials import insert_trials
 from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization.study_record import StudyRecord
 
-# What makes a study the one that it is: of the same ones it may be exported again.
-_IDENTITY = ("problem", "solver", "seed", "options")
+# What makes a study the one that it is, beside its problem: of the same ones it may be exported again.
+_IDENTITY = ("solver", "seed", "options")
 
 _FEWEST = 10
 
@@ -146,7 +147,10 @@ def _exported(optuna: Any, storage: BaseStorage, study: StudyRecord, name: str) 
     record = json.loads(json.dumps(study.record))
     if name in optuna.get_all_study_names(storage):
         found = optuna.load_study(study_name=name, storage=storage)
-        if any(found.user_attrs.get(key) != record[key] for key in _IDENTITY):
+        there = found.user_attrs
+        same = all(there.get(key) == record[key] for key in _IDENTITY)
+        # Its code may have changed since, see `Problem.study`.
+        if not same or "problem" not in there or differences(there["problem"], record["problem"]):
             raise StudyError(
                 f"Optuna's storage has another study {name!r} already: export this one by another name, or delete "
                 "the other"
@@ -197,6 +201,8 @@ def _frozen(
     }
     if state is states.PRUNED:
         attributes["bound"] = _plain(trial.values)
+    if trial.attributes:
+        attributes["attributes"] = dict(trial.attributes)
     messages = [outcome.message for outcome in rollouts if outcome.message]
     if messages:
         attributes["messages"] = messages

@@ -78,11 +78,12 @@ class Trial(Judged):
         values: one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
             simulation failed.
         violations: one per constraint, the worst over the conditions: at most 0 where it holds.
-        exact: False if racing dropped the point, so that ``values`` only says that it is no better than that.
+        exact: False if racing dropped the point, so that ``values`` only says that it is no better than that; infinite
+            if nothing is known of it but that it breaks a constraint.
         origin: who asked for it: ``solver`` or ``user``.
         method: what the solver worked with.
         batch: the number of the batch of points that were judged together.
-        attributes: what users noted of the point, see `Study.set_attribute`.
+        attributes: what users said of the point, see `Study.set_attribute`.
     """
 
     number: int

@@ -144,7 +144,7 @@ class Study(StudyRecord):
                 ``record``: it counts as failed, with the message, and the first of a run is logged; ``raise``: the run
                 ends there.
             callbacks: each is called with the study and a trial when that is judged and recorded for the first time,
-                batch by batch, in this thread. It may note attributes, add points, or `stop` the run; what it raises
+                batch by batch, in this thread. It may set attributes, add points, or `stop` the run; what it raises
                 ends the run.
             progress: show a progress bar: rollouts per second, the best so far, the time left. Where there is neither a
                 terminal nor a notebook, log it every half minute instead, at the level INFO.
@@ -240,10 +240,10 @@ class Study(StudyRecord):
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
-        """Notes something of the study, or of a point: who ran it, why the point looks odd. It changes no result.
+        """Sets an attribute of the study, or of a point: who ran it, why the point looks odd. It changes no result.
 
         Args:
-            key: a name; what was noted by that name before is replaced.
+            key: its name; an attribute of the same name is replaced.
             value: a number, a word, or lists and dicts of these.
             point: as in `add`; None for the study itself.
 
@@ -253,7 +253,7 @@ class Study(StudyRecord):
         if not isinstance(key, str) or not key:
             raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
         (kept,) = plain({key: value}, "attributes").values()
-        self._file.note(None if point is None else self._checked(point), key, kept)
+        self._file.set_attribute(None if point is None else self._checked(point), key, kept)
 
     def _checked(self, point: Any) -> Point:
         return checked_point(self.parameters, point)

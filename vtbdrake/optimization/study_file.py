@@ -40,10 +40,10 @@ _TABLES = {
     # Points given by hand; batch is that which they were judged with.
     "given": "number INTEGER PRIMARY KEY, point TEXT, batch INTEGER",
     "sessions": "number INTEGER PRIMARY KEY, started TEXT, ended TEXT, reason TEXT, versions TEXT, revision TEXT",
-    # What users note of a point; of the study, where the point is empty.
-    "notes": "point TEXT, key TEXT, value TEXT",
+    # What users say of a point; of the study, where the point is empty.
+    "attributes": "point TEXT, key TEXT, value TEXT",
 }
-_KEYS = {"rollouts": "point, condition", "trials": "batch, position", "notes": "point, key"}
+_KEYS = {"rollouts": "point, condition", "trials": "batch, position", "attributes": "point, key"}
 _ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units"}
 
 
@@ -269,6 +269,9 @@ class StudyFile:
             for batch, position, point, values, violations, exact, origin, method in rows
         ]
         with self._transaction():
+            if told is not None:
+                # What was complete of this batch when a run ended in its midst.
+                self._db.execute("DELETE FROM trials WHERE batch = ? AND position >= 0", (told - 1,))
             self._insert("trials", encoded, instead="REPLACE")
             if told is not None:
                 self._set({"told": told})
@@ -372,18 +375,18 @@ class StudyFile:
             else:
                 self._insert("given", [(number, encode(point), None)], instead="REPLACE")
 
-    # -- notes of users
+    # -- attributes
 
-    def note(self, point: Point | None, key: str, value: Any) -> None:
-        """Notes something of a point, or of the study."""
+    def set_attribute(self, point: Point | None, key: str, value: Any) -> None:
+        """Sets an attribute of a point, or of the study."""
         with self._transaction():
             row = ("" if point is None else encode(point), key, json.dumps(value))
-            self._insert("notes", [row], instead="REPLACE")
+            self._insert("attributes", [row], instead="REPLACE")
 
-    def notes(self) -> dict[Point | None, dict[str, Any]]:
-        """All notes by point; those of the study by None."""
+    def attributes(self) -> dict[Point | None, dict[str, Any]]:
+        """All attributes by point; those of the study by None."""
         found: dict[Point | None, dict[str, Any]] = {}
-        for point, key, value in self._rows("notes", "ORDER BY rowid"):
+        for point, key, value in self._rows("attributes", "ORDER BY rowid"):
             found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return found
 

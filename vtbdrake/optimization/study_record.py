@@ -99,19 +99,19 @@ class StudyRecord:
     @property
     def trials(self) -> tuple[Trial, ...]:
         """All judged points, as they are in the file now."""
-        notes = self._file.notes()
-        return tuple(self._trial(number, row, notes) for number, row in enumerate(self._file.trials()))
+        attributes = self._file.attributes()
+        return tuple(self._trial(number, row, attributes) for number, row in enumerate(self._file.trials()))
 
     def _trials_of(self, batch: int) -> tuple[Trial, ...]:
         """The trials that were judged last in a batch."""
         first, rows = self._file.trials_of(batch)
-        notes = self._file.notes()
-        return tuple(self._trial(first + k, row, notes) for k, row in enumerate(rows))
+        attributes = self._file.attributes()
+        return tuple(self._trial(first + k, row, attributes) for k, row in enumerate(rows))
 
-    def _trial(self, number: int, row: TrialRow, notes: Mapping[Point | None, Mapping[str, Any]]) -> Trial:
+    def _trial(self, number: int, row: TrialRow, attributes: Mapping[Point | None, Mapping[str, Any]]) -> Trial:
         batch, _, point, values, violations, exact, origin, method = row
-        noted = dict(notes.get(point, {}))
-        return Trial(number, self._by_address(point), values, violations, exact, origin, method, batch, noted)
+        own = dict(attributes.get(point, {}))
+        return Trial(number, self._by_address(point), values, violations, exact, origin, method, batch, own)
 
     def _by_address(self, point: Point) -> dict[str, Any]:
         return {parameter.address: value for parameter, value in zip(self.parameters, point, strict=True)}
@@ -123,8 +123,8 @@ class StudyRecord:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What users noted of the study, see `Study.set_attribute`; `Trial.attributes` is what they noted of points."""
-        return self._file.notes().get(None, {})
+        """The attributes of the study, see `Study.set_attribute`; those of a point are `Trial.attributes`."""
+        return self._file.attributes().get(None, {})
 
     @property
     def rollouts(self) -> dict[Row, Outcome]:
@@ -174,8 +174,8 @@ class StudyRecord:
     def to_dict(self) -> dict[str, list[Any]]:
         """Columns by name, one entry per trial.
 
-        The parameters by address, the qualities, the violations of the constraints, how the trial came about, and what
-        users noted of it (None where they noted nothing).
+        The parameters by address, the qualities, the violations of the constraints, how the trial came about, and its
+        attributes (None where it does not have one).
         """
         trials = self.trials
         columns: dict[str, list[Any]] = {d.address: [t.parameters[d.address] for t in trials] for d in self.parameters}

@@ -5,6 +5,7 @@ import itertools
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -282,3 +283,36 @@ def test_the_point_to_which_it_converges_keeps_the_constraint(name):
     nearest = min(log, key=lambda told: np.hypot(*(np.array(told.point) - CONSTRAINED.best + 1e-6)))
     assert solver.success is True
     assert nearest.feasible
+
+
+@pytest.mark.parametrize("name", ["CMA-ES", "differential-evolution", "NSGA-II", "TPE", "sobol", "random", "LN_COBYLA"])
+def test_what_evaluations_did_not_take_is_asked_for(name):
+    budget, effort, taken, count = 40, 0.25, 0.0, 0
+    solver = make_solver(name, ROSENBROCK.space, budget=budget, seed=1)
+    while points := solver.ask():
+        assert taken + len(points) <= budget + 1e-9
+        told = [replace(evaluation(p, ROSENBROCK.cost), effort=effort) for p in points]
+        solver.tell(told)
+        taken, count = taken + effort * len(points), count + len(points)
+    assert solver.message.endswith("is spent") or solver.success
+    assert count > 2 * budget or name == "LN_COBYLA"
+    assert taken > budget - 1.0 or name == "LN_COBYLA"
+
+
+def test_a_batch_in_parts_is_learned_as_a_whole():
+    whole = make_solver("CMA-ES", ROSENBROCK.space, seed=1)
+    parts = make_solver("CMA-ES", ROSENBROCK.space, budget=8, seed=1)
+    first, log, sizes = drive(whole, ROSENBROCK.cost, limit=18), [], []
+    while points := parts.ask():
+        sizes.append(len(points))
+        log += [evaluation(p, ROSENBROCK.cost) for p in points]
+        # 18 points take less than the budget; but it is charged in full for a generation of six until that is told.
+        parts.tell([replace(told, effort=0.4) for told in log[-len(points) :]])
+    assert [told.point for told in log[:18]] == [told.point for told in first]
+    assert sizes[0] == 6 > min(sizes)
+
+
+def test_points_given_by_hand_take_from_the_budget():
+    solver = make_solver("sobol", SPHERE.space, budget=20)
+    solver.tell([evaluation((float(i), 0.0), SPHERE.cost) for i in range(3)])
+    assert len(drive(solver, SPHERE.cost)) == 17

@@ -13,9 +13,9 @@ class BatchSolver(Solver):
     """A solver that says what comes next (`_next`) and learns from it (`_learn`).
 
     It asks until evaluations have taken ``search.budget``: a point is charged in full when it is asked for; what it did
-    not take (`Evaluation.effort`) comes back when it is told, and what points given by hand took is charged then. The
-    batch that exceeds the budget is cut, so that no evaluation is wasted; the method does not learn from a cut batch,
-    since it is over then.
+    not take (`Evaluation.effort`) comes back when it is told, and what points given by hand took is charged then. Of a
+    batch that exceeds the budget, as many points are asked for as it allows, so that no evaluation is wasted; the rest
+    follows if they leave budget for it, and the method learns when the batch is complete.
     """
 
     def __init__(self, search: Search, *, name: str) -> None:
@@ -23,7 +23,10 @@ class BatchSolver(Solver):
         self.search = search
         self._asked: list[Point] = []
         self._budget: float | None = search.budget
-        self._cut = False
+        # Of the method's present batch: what is to be asked for yet, and what was told.
+        self._rest: list[Point] = []
+        self._told: list[Evaluation] = []
+        self._given: list[Evaluation] = []
         self._success: bool | None = None
         self._message = ""
 
@@ -58,10 +61,10 @@ class BatchSolver(Solver):
             self._spent()
         if self._success is not None:
             return []
-        points = self._next()
+        if not self._rest:
+            self._rest = list(self._next())
+        points, self._rest = self._rest[: self._left], self._rest[self._left :] if self._left is not None else []
         if self._budget is not None:
-            self._cut = len(points) > (self._left or 0)
-            points = points[: self._left]
             self._budget -= len(points)
         self._asked = points
         return list(points)
@@ -77,9 +80,12 @@ class BatchSolver(Solver):
             self._check(evaluation)
         self._asked = []
         if self._budget is not None:
-            self._budget = 0.0 if self._cut else self._budget + count - sum(e.effort for e in evaluations)
-        if not self._cut:
-            self._learn(evaluations[:count], evaluations[count:])
+            self._budget += count - sum(evaluation.effort for evaluation in evaluations)
+        self._told += evaluations[:count]
+        self._given += evaluations[count:]
+        if not self._rest:
+            told, given, self._told, self._given = self._told, self._given, [], []
+            self._learn(told, given)
 
     def _check(self, evaluation: Evaluation) -> None:
         for name, told, expected in (
