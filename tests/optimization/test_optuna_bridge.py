@@ -186,7 +186,7 @@ def test_writing_again_adds_only_what_is_new(url):
 def test_a_point_that_a_batch_holds_twice_is_there_twice_and_stays_so(url):
     study = recorded([X, Y], [point((0.5, 0.5), 1.0)], qualities={"h": "maximize"})
     study.to_optuna(url, "twice")
-    study._file.save_trials([(0, 1, (0.5, 0.5), (1.0,), (), True, "user", "by hand")], told=1)
+    study._file.save_trials([(0, 1, (0.5, 0.5), (1.0,), (), True, "user", "by hand")], told=None)
     exported = study.to_optuna(url, "twice")
     assert [t.user_attrs["origin"] for t in exported.trials] == ["solver", "user"]
     assert len(study.to_optuna(url, "twice").trials) == 2

@@ -263,7 +263,13 @@ class StudyFile:
         return int(self.meta.get("told", 0))
 
     def save_trials(self, rows: Sequence[TrialRow], *, told: int | None) -> None:
-        """Records judged points, and with them how many batches the solver has now been told of."""
+        """Records judged points.
+
+        Args:
+            rows: the points.
+            told: how many batches the solver has now been told of, the last of which these points are; what an earlier
+                run has left of that batch is replaced. None: the batch is not complete.
+        """
         encoded = [
             (batch, position, encode(point), json.dumps(values), json.dumps(violations), int(exact), origin, method)
             for batch, position, point, values, violations, exact, origin, method in rows
