@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import struct
 import zipfile
 from typing import Any
@@ -180,3 +181,10 @@ def test_equal_snapshots_are_equal():
     assert SNAPSHOT in [None, again]
     with pytest.raises(TypeError, match="unhashable"):
         hash(SNAPSHOT)
+
+
+def test_a_pipe_or_a_folder_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(ArchiveError, match="a folder, a device or a pipe"):
+            Snapshot.load(path)

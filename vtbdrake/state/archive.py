@@ -88,6 +88,8 @@ def read_archive(
             than it has bytes (more than 1 GiB and than a hundred times as much).
     """
     path = f"an archive of {len(source)} bytes" if isinstance(source, bytes) else source
+    if not isinstance(source, bytes) and os.path.exists(source) and not os.path.isfile(source):
+        raise ArchiveError(f"{path} is not a {kind}: it is a folder, a device or a pipe, not a file")
     try:
         with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
             _check_entries(archive)

@@ -141,6 +141,14 @@ def test_the_user_of_a_peer_is_told_for_every_kind_of_socket() -> None:
         assert peer_user(one) == os.geteuid()
 
 
+def test_beyond_loopback_all_places_are_for_everybody() -> None:
+    with Hub(host="0.0.0.0", port=0, max_clients=4) as hub:
+        url = f"tcpq://127.0.0.1:{address(hub.url)[1]}"
+        clients = [Client(url, "A") for _ in range(4)]
+        clients[0].publish("A")
+        clients[3].wait(lambda: bool(clients[3].received))
+
+
 def test_a_full_hub_says_so_to_this_packages_clients_and_refuses_lcms() -> None:
     with Hub(port=0, max_clients=1) as hub:
         first = Client(hub.url, "A")

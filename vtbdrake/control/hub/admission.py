@@ -61,9 +61,10 @@ class Admission:
             whose = "a user that the kernel does not tell" if user is None else f"user {user}"
             remedy = "to let others in, start it with --user or --all-users"
             return Decision(user, STRANGER, f"it belongs to {whose}, and the hub is not open to that one ({remedy})")
-        if user not in self._own:
+        if local and user not in self._own:
             others = [client.user for client in clients if client.user not in self._own]
-            if len(others) >= self._most_of_others or others.count(user) >= self._most_of_a_user:
+            most = self._most_of_others if user is None else self._most_of_a_user
+            if len(others) >= self._most_of_others or others.count(user) >= most:
                 limits = f"{self._most_of_a_user} for one, {self._most_of_others} for all others together"
                 return Decision(user, QUOTA, f"the hub is full for other users than its own ({limits})")
         if len(clients) >= self._most:

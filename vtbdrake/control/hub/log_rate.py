@@ -12,16 +12,17 @@ PERIOD = 10.0
 
 
 class RateLimit(logging.Filter):
-    """Lets the first messages of each kind pass; those of one kind have the same text before their arguments are filled
-    in. The next one after a pause tells how many were left out."""
+    """Lets the first messages of each kind pass; those of one kind have the same level, and the same text before their
+    arguments are filled in. The next one after a pause tells how many were left out."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._windows: dict[str, tuple[float, int]] = {}  # kind -> its window's end, how many came in it
+        # By kind, the end of its window, and how many came in it.
+        self._windows: dict[tuple[int, str], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         now = time.monotonic()
-        kind = str(record.msg)
+        kind = (record.levelno, str(record.msg))
         end, count = self._windows.get(kind, (now, 0))
         if now >= end:
             left_out = max(0, count - BURST)
