@@ -61,6 +61,8 @@ class Search:
 def time_to_target(seeds: int = 10) -> list[Benchmark]:
     """Wall time of differential evolution over that of a study, each until it reaches the target; medians over seeds.
 
+    A search that does not reach the target has taken for ever.
+
     The target is 97 % of the best distance known, and was fixed before. The study: default solver, default executor on
     all cores, or serial; the problem is new each time, so that its build and the start of the workers count. The other:
     ``scipy.optimize.differential_evolution`` with its default settings on a function that builds the scenario and

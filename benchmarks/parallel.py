@@ -30,6 +30,7 @@ from vtbdrake.rollout.cluster import DaskExecutor
 CORES = 2
 HORIZON = 5.0
 CEILING = "processes that share nothing"
+GOAL, OF_CEILING = 0.9, 0.97
 
 Points = list[dict[str, float]]
 # Runs all rollouts of a task, and returns when they are done.
@@ -57,6 +58,9 @@ def tilt(pitch: float) -> float:
 
 def _efficiency(name: str, task: RolloutTask, rollouts: int, repeats: int) -> Benchmark:
     """Time on one core / (cores x time on all), the median over runs that are neighbours.
+
+    The goal is `GOAL`, or, where the machine itself does not give that much, `OF_CEILING` of what processes that share
+    nothing reach beside it.
 
     The runs on one core and on all take turns, one against two, and every executor has its turn in every repeat. Each
     is compared with the mean of the runs on one core before and after it, so that what else the machine does meets
@@ -93,13 +97,20 @@ def _efficiency(name: str, task: RolloutTask, rollouts: int, repeats: int) -> Be
         name=name,
         value=efficiency[best],
         unit="1",
-        goal=0.9,
+        goal=GOAL,
         better=HIGHER,
         against="one core, one rollout after another",
+        holds=reached(efficiency[best], ceiling),
         note=f"{rollouts} rollouts of {HORIZON:g} s on {CORES} workers, which were warm (started, testbed built); "
-        f"best: {best}, where {CORES} {CEILING} reach {ceiling:.3f} ({spread(np.array(times[CEILING]))}). {table}; "
+        f"best: {best}, {efficiency[best] / ceiling:.3f} of what {CORES} {CEILING} reach: {ceiling:.3f} "
+        f"({spread(np.array(times[CEILING]))}). {table}; "
         f"one core {spread(np.array(alone))}",
     )
+
+
+def reached(efficiency: float, ceiling: float) -> bool:
+    """Whether an efficiency is good enough, where processes that share nothing reach ``ceiling``."""
+    return efficiency >= GOAL or efficiency >= OF_CEILING * ceiling
 
 
 def _executor(executor: Executor) -> Run:

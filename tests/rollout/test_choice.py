@@ -89,3 +89,11 @@ def test_dask_without_its_package_names_the_extra(pendulum, monkeypatch):
     # Unknown things are refused all the same.
     with pytest.raises(ValueError, match="not 3"):
         make_executor(3, testbed=pendulum, rollouts=5)
+
+
+def test_workers_start_with_their_executor_and_end_with_it():
+    testbed = PendulumScenario().build()
+    with make_executor("processes", testbed=testbed, rollouts=3, workers=5) as executor:
+        processes = [worker.process for worker in executor._workers]
+        assert len(processes) == 3 and all(process.poll() is None for process in processes)
+    assert all(process.poll() is not None for process in processes)

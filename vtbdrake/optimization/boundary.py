@@ -8,7 +8,6 @@ from math import exp, inf, isinf, log
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import binomtest
 
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout.arguments import as_number, as_whole
@@ -47,6 +46,8 @@ class Chance:
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % confidence interval of the probability of an unsafe rollout (Clopper and Pearson, 1934)."""
+        from scipy.stats import binomtest  # It takes longer to load than all the rest.
+
         found = binomtest(self.unsafe, self.rollouts).proportion_ci(0.95, method="exact")
         return float(found.low), float(found.high)
 

@@ -47,7 +47,10 @@ def make_executor(
         executor = "processes" if time_limit is not None else "serial" if alone else choose_executor(testbed)
         workers = None if executor == "serial" else workers
     if isinstance(executor, str):
-        return _by_name(executor, testbed=testbed, workers=workers, time_limit=time_limit)
+        made = _by_name(executor, testbed=testbed, workers=workers, time_limit=time_limit)
+        if isinstance(made, ProcessExecutor):
+            made.start(rollouts)
+        return made
     if isinstance(executor, Executor):
         _refuse("an Executor that is there already", workers=workers, time_limit=time_limit)
         return executor

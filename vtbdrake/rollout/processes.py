@@ -123,6 +123,14 @@ class ProcessExecutor(Executor):
         self._workers: list[_Worker] = []
         self._running = False
 
+    def start(self, rollouts: int) -> None:
+        """Start the workers that so many rollouts need, without waiting until they are ready.
+
+        `run` does so, too; but they take a second, in which one may have other things to do.
+        """
+        while len(self._workers) < min(self._count, rollouts):
+            self._workers.append(_Worker(self._kept, self._growth))
+
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
         """See `Executor.run`.
 
@@ -148,8 +156,7 @@ class ProcessExecutor(Executor):
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
         error: BaseException | None = None
-        while len(self._workers) < min(self._count, len(points)):
-            self._workers.append(_Worker(self._kept, self._growth))
+        self.start(len(points))
         try:
             self._hand_out(blob, waiting, points)
             while waiting or any(worker.jobs for worker in self._workers):
