@@ -10,49 +10,58 @@ import numpy as np
 
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.solvers.batch import BatchSolver
+from vtbdrake.optimization.solvers.bayesian import Bayesian
 from vtbdrake.optimization.solvers.cmaes_solver import CmaEs, default_population
-from vtbdrake.optimization.solvers.designs import Design, Grid, Listed, Sobol, discrete_size
+from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
 from vtbdrake.optimization.solvers.drake_solvers import NloptDerivativeFree
-from vtbdrake.optimization.solvers.optuna_samplers import OptunaSolver
 from vtbdrake.optimization.solvers.ranking import best_of, rank_key
 from vtbdrake.optimization.solvers.scipy_solvers import DifferentialEvolution
 from vtbdrake.optimization.solvers.search import SEEDS, Search
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 
+MODEL = "bayesian"
+
 # Where all parameters are whole or categorical, and there is no budget: up to so many points are all tried.
 EXHAUSTIVE = 256
-# A change of the best value is progress if it exceeds this part of the spread of the values of the first design.
+# A change of the best value is progress if it exceeds this part of the spread of the values found by the model.
 PROGRESS = 1e-6
 # So many methods in a row without progress are an end.
 PATIENCE = 5
-# The last search runs in a box around the best point, so many of the ranges to each side.
-POLISH_RADIUS = 0.02
-# Quadratic models of more parameters are not cheap any more.
-POLISH_SIZE = 20
+# A Gaussian process of more parameters is no help, and a quadratic model of more is not cheap any more.
+MODEL_SIZE = 20
+# The model takes so many points for each parameter and one more, and so many at most.
+MODEL_POINTS, MODEL_LIMIT = 25, 120
+# A local search runs in a box around the best point, so many of the ranges to each side: after the model, and last.
+LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
 
 
 class Auto(BatchSolver):
     """Chooses by the problem:
 
-    * several objectives: NSGA-II of Optuna;
-    * whole and categorical parameters only, with no more combinations than the budget (256 without one): a grid;
-    * a categorical parameter: TPE of Optuna;
-    * else a Sobol design, and from its best point CMA-ES. A budget that is too small for ten generations of CMA-ES is
-      spent on the Sobol design alone.
+    * whole and categorical parameters only, with no more combinations than the budget (256 without one), and one
+      objective: a grid;
+    * several objectives, or a categorical parameter: Bayesian optimization to the end;
+    * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most, and a local search from
+      its best point. Then CMA-ES from the best point; where less than ten generations of it are left, what is left
+      goes to Bayesian optimization instead;
+    * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
+
+    So the first points, which matter most where rollouts are expensive, are chosen with care, and thousands of points
+    are chosen quickly. Bayesian optimization asks for 4 points at a time; with less than 100 evaluations in all, for
+    fewer.
 
     CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
-    each, the best value of this start has not improved by more than 1e-6 of the spread of the first design's values.
+    each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
     Then it starts anew at a random point with twice the population (IPOP); every third start is differential evolution,
     since no global method alone is reliable. Five starts in a row that do not improve the best value by as much are the
-    end, with success. Last, a tenth of the budget at most goes into a local search (BOBYQA, or COBYLA with constraints
-    or one parameter) in a small box around the best point, if all parameters are continuous and there are at most 20.
+    end, with success. Last, a tenth of the budget at most goes into another local search.
+
+    The local searches (BOBYQA, or COBYLA with constraints or one parameter) stay in a box around the best point. They
+    take place if all parameters are continuous and there are at most 20.
 
     Args:
         search: what is searched.
         name: in the catalogue.
-
-    Raises:
-        ModuleNotFoundError: the problem needs Optuna, which is not installed.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
     """
@@ -68,6 +77,8 @@ class Auto(BatchSolver):
         self._patience = math.inf
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
+        # What was told before the model began.
+        self._before: list[Evaluation] = []
         self._plan = self._stages()
         next(self._plan)
 
@@ -85,13 +96,11 @@ class Auto(BatchSolver):
     def _stages(self) -> Iterator[None]:
         """Each stage begins a method; the caller comes back when that has ended or stalled."""
         search = self.search
-        if search.objectives > 1:
-            return self._one("NSGA-II", OptunaSolver(search, name="NSGA-II"))
         discrete = not any(parameter.is_continuous for parameter in search.space)
-        if discrete and discrete_size(search.space) <= (search.budget or EXHAUSTIVE):
+        if search.objectives == 1 and discrete and discrete_size(search.space) <= (search.budget or EXHAUSTIVE):
             return self._one("grid", Grid(replace(search, start=None), name="grid"))
-        if any(isinstance(parameter, Choice) for parameter in search.space):
-            return self._one("TPE", OptunaSolver(search, name="TPE"))
+        if search.objectives > 1 or any(isinstance(parameter, Choice) for parameter in search.space):
+            return self._one(MODEL, Bayesian(search, name=MODEL, batch=self._batch))
         return self._global_stages()
 
     def _one(self, method: str, solver: BatchSolver) -> Iterator[None]:
@@ -99,34 +108,48 @@ class Auto(BatchSolver):
         yield
         self._end(bool(solver.success), solver.message)
 
+    @property
+    def _batch(self) -> int:
+        """How many points the model asks for at a time: one where there are few, so that it learns from each."""
+        return 4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4)
+
     def _global_stages(self) -> Iterator[None]:
         search = self.search
-        design = 1 << (4 * (search.size + 1) - 1).bit_length()
-        free = replace(search, start=None, budget=None)
         if search.start is not None:
-            self._begin("start", Listed(free, name="start", points=[search.start]))
+            self._begin("start", Listed(replace(search, start=None, budget=None), name="start", points=[search.start]))
             yield
-        if search.budget is not None and search.budget < design + 10 * default_population(search.size):
-            self._begin("sobol", Sobol(replace(free, budget=self._left), name="sobol"))
-            yield
-            self._end(True, "the design is complete")
-            return
-        self._begin("sobol", Sobol(free, name="sobol", points=design))
+        self._begin_model()
         yield
-        fruitless, start = 0, 0
+        if self._best is not None and self._has_local:
+            self._begin_local(self._best.point, radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
+            yield
+        fruitless, start, polished = 0, 0, self._best
         while fruitless < PATIENCE and self._left_but_polish() > 0:
             before = self._best
             self._begin_global(start)
             yield
             start += 1
             fruitless = 0 if self._progress(before, self._best) else fruitless + 1
-        if self._best is not None and self._polishable:
-            self._begin_polish(self._best.point)
+        if self._best is not None and self._has_local and self._progress(polished, self._best):
+            self._begin_local(self._best.point, radius=POLISH_RADIUS, limit=math.inf)
             yield
         if fruitless == PATIENCE:
             self._end(True, f"{PATIENCE} starts in a row found nothing better")
         else:
             self._spent()
+
+    def _begin_model(self) -> None:
+        """The Gaussian process, or of many parameters a design."""
+        search, size, left = self.search, self.search.size, math.inf if self._left is None else self._left
+        if size > MODEL_SIZE:
+            points = int(min(2 * (size + 1), max(1, left // 2)))
+            self._begin("sobol", Sobol(replace(search, start=None, budget=None), name="sobol", points=points))
+            return
+        wanted = min(MODEL_POINTS * (size + 1), MODEL_LIMIT)
+        points = wanted if left >= wanted + 10 * default_population(size) else int(left)
+        model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
+        model.tell(self._before)
+        self._begin(MODEL, model)
 
     def _begin_global(self, start: int) -> None:
         """The start-th global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
@@ -157,26 +180,32 @@ class Auto(BatchSolver):
         )
 
     @property
-    def _polishable(self) -> bool:
+    def _has_local(self) -> bool:
         space = self.search.space
-        return len(space) <= POLISH_SIZE and all(parameter.is_continuous for parameter in space)
+        return len(space) <= MODEL_SIZE and all(parameter.is_continuous for parameter in space)
+
+    @property
+    def _local_limit(self) -> int:
+        """How many evaluations a local search takes at most."""
+        return 20 * (self.search.size + 1)
 
     def _left_but_polish(self) -> float:
         """The evaluations that are left for global methods."""
         if self._left is None or self.search.budget is None:
             return math.inf
-        reserve = min(self.search.budget // 10, 20 * (self.search.size + 1)) if self._polishable else 0
+        reserve = min(self.search.budget // 10, self._local_limit) if self._has_local else 0
         return self._left - reserve
 
-    def _begin_polish(self, best: Point) -> None:
+    def _begin_local(self, best: Point, *, radius: float, limit: float) -> None:
         u = self.search.unit(best)
-        lower = self.search.point(np.maximum(u - POLISH_RADIUS, 0.0))
-        upper = self.search.point(np.minimum(u + POLISH_RADIUS, 1.0))
+        lower = self.search.point(np.maximum(u - radius, 0.0))
+        upper = self.search.point(np.minimum(u + radius, 1.0))
         box = tuple(_between(*ends) for ends in zip(self.search.space, lower, upper, strict=True))
         # BOBYQA takes no constraints, and at least two parameters.
         name = "LN_COBYLA" if self.search.constraints or self.search.size == 1 else "LN_BOBYQA"
-        search = replace(self.search, space=box, start=best, budget=self._left)
-        self._begin(f"{name}, polish", NloptDerivativeFree(search, name=name))
+        budget = int(max(1, min(limit, self._local_limit)))
+        search = replace(self.search, space=box, start=best, budget=budget)
+        self._begin(f"{name} around the best", NloptDerivativeFree(search, name=name))
 
     # ------------------------------------------------------------------------------ its steps
 
@@ -203,7 +232,8 @@ class Auto(BatchSolver):
         self._solver.tell([*asked, *given])
         if self.search.objectives > 1:
             return
-        if self._solver.name == "sobol":
+        if not self._changes or self._solver.name in ("start", MODEL, "sobol"):
+            self._before += [*asked, *given]
             values = [evaluation.values[0] for evaluation in asked if evaluation.feasible]
             self._spread = max(self._spread, max(values, default=0.0) - min(values, default=0.0))
         best = best_of([*asked, *([self._stage_best] if self._stage_best else [])])
@@ -219,13 +249,6 @@ class Auto(BatchSolver):
             return after is not None
         (kind, cost), (kind_before, cost_before) = rank_key(after), rank_key(before)
         return kind < kind_before or (kind == kind_before and cost < cost_before - PROGRESS * self._spread)
-
-    def _spent(self) -> None:
-        # A design that is as long as the budget is complete.
-        if isinstance(self._solver, Design) and not self._solver.ask():
-            self._end(True, self._solver.message)
-        else:
-            super()._spent()
 
     def close(self) -> None:
         self._solver.close()

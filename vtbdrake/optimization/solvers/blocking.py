@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -14,6 +15,11 @@ from vtbdrake.optimization.solvers.batch import BatchSolver
 from vtbdrake.optimization.solvers.ranking import usable
 from vtbdrake.optimization.solvers.search import Search
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
+
+_log = logging.getLogger(__name__)
+
+# A method that calls so often in a row for points that it knows goes round in circles.
+CIRCLES = 10_000
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -28,12 +34,17 @@ class BlockingSolver(BatchSolver):
 
     The thread only ever waits: either the method computes its next points or the driver judges them. So what is asked
     for depends on what was told, and not on timing. When it is closed before its end, the callback raises `Stopped`,
-    which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined.
+    which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined. A method that
+    does not return within `grace` seconds is left behind in its thread, which does not keep the program from ending. One that
+    calls `CIRCLES` times in a row for points that it knows is ended, without success.
 
     Failed simulations: these methods need a number. A failed point counts as worse than the worst point so far, by the
     spread of the values so far (at least 1), and keeps that number. So does one that racing dropped, as it breaks a
     constraint, before anything was known of its value. What was given by hand is ignored.
     """
+
+    # Most methods end within milliseconds when they are closed, a few after thousands of calls (`NO_EXCEPTIONS`).
+    grace = 10.0
 
     def __init__(self, search: Search, *, name: str) -> None:
         super().__init__(search, name=name)
@@ -41,6 +52,7 @@ class BlockingSolver(BatchSolver):
         self._answers: SimpleQueue[Sequence[Evaluation] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
         self._stopping = False
+        self._circling = 0
         self._error: BaseException | None = None
         self._known: dict[bytes, tuple[Evaluation, float, np.ndarray]] = {}
         self._lowest, self._highest = np.inf, -np.inf
@@ -55,18 +67,22 @@ class BlockingSolver(BatchSolver):
     def _evaluate(self, U: np.ndarray) -> None:
         """Has the points of the unit cube judged that are not known yet, shape (k, n), as one batch."""
         new = list({u.tobytes(): u for u in U if u.tobytes() not in self._known}.values())
+        self._circling = 0 if new else self._circling + 1
+        if self._circling >= CIRCLES:
+            self._stopping = True
+        if self._stopping:
+            raise Stopped
         if not new:
             return
         for u, evaluation in zip(new, self._request([self.search.point(u) for u in new]), strict=True):
             self._known[u.tobytes()] = (evaluation, *self._numbers(evaluation))
 
     def _request(self, points: list[Point]) -> Sequence[Evaluation]:
-        if not self._stopping:
-            self._requests.put(points)
-            answer = self._answers.get()
-            if answer is not None:
-                return answer
-        raise Stopped
+        self._requests.put(points)
+        answer = self._answers.get()
+        if answer is None:
+            raise Stopped
+        return answer
 
     def _numbers(self, evaluation: Evaluation) -> tuple[float, np.ndarray]:
         """The cost and the violations that the method sees."""
@@ -104,7 +120,11 @@ class BlockingSolver(BatchSolver):
             outcome = self._solve()
         except BaseException as error:
             outcome = error
-        self._requests.put(self._error or outcome)
+        if self._circling >= CIRCLES:
+            outcome = (False, f"it called {CIRCLES} times in a row for points that it knew")
+        elif self._error is not None:
+            outcome = self._error
+        self._requests.put(outcome)
 
     # ---------------------------------------------------------------- in the driver's thread
 
@@ -127,8 +147,12 @@ class BlockingSolver(BatchSolver):
             self._answers.put(asked)
 
     def close(self) -> None:
-        """Ends the method and its thread; harmless if both have ended."""
+        """Ends the method and its thread, and an `ask` that waits in another thread; harmless if they have ended."""
         self._stopping = True
-        if self._thread is not None:
-            self._answers.put(None)
-            self._thread.join()
+        if self._thread is None:
+            return
+        self._answers.put(None)
+        self._thread.join(self.grace)
+        if self._thread.is_alive():
+            _log.warning("%s does not return: its thread is left behind", self.name)
+        self._requests.put((False, "it was closed"))

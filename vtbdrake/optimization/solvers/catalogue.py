@@ -9,6 +9,7 @@ from typing import Any
 
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers.auto import Auto
+from vtbdrake.optimization.solvers.bayesian import Bayesian
 from vtbdrake.optimization.solvers.cmaes_solver import CmaEs
 from vtbdrake.optimization.solvers.designs import Grid, LatinHypercube, RandomSearch, Sobol
 from vtbdrake.optimization.solvers.drake_solvers import Ipopt, NloptDerivativeFree, NloptWithDerivatives, Snopt
@@ -24,6 +25,7 @@ CATALOGUE: Mapping[str, Callable[..., Solver]] = {
     "sobol": Sobol,
     "latin-hypercube": LatinHypercube,
     "random": RandomSearch,
+    "bayesian": Bayesian,
     "CMA-ES": CmaEs,
     "differential-evolution": DifferentialEvolution,
     **dict.fromkeys(SAMPLERS, OptunaSolver),

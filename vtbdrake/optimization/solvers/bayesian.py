@@ -1,0 +1,357 @@
+"""Bayesian optimization: a Gaussian process says where an improvement is to be expected."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence, Set
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import log_ndtr, ndtri
+
+from vtbdrake.optimization.parameter import Choice
+from vtbdrake.optimization.solvers.batch import BatchSolver
+from vtbdrake.optimization.solvers.ranking import rank_key, usable
+from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
+# Candidates of the acquisition: over the whole space, around the best points, and around each of the best candidates, in
+# steps of decreasing widths, as parts of the ranges.
+SPREAD, AROUND, REFINED = 500, 200, 10
+BEST = 5
+WIDTHS = (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003)
+# Prior of the logarithms of the kernel's numbers (signal, length scales as parts of the ranges, noise): median, width.
+SIGNAL, LENGTH, NOISE = (1.0, 1.0), (0.5, 1.0), (1e-4, 3.0)
+# Draws of the posterior of several objectives.
+DRAWS = 64
+
+
+class Bayesian(BatchSolver):
+    """Maximizes the expected improvement (EI) over the best point, which Gaussian processes say from what was told.
+
+    The first points are a Sobol design. After each batch, one Gaussian process is fitted to every objective and to every
+    constraint, and a random search with shrinking steps looks for the point of largest EI, times the probability that
+    all constraints hold. Within a batch, the points before count as if they gave what the model expects of them.
+    Several objectives are weighed at random for every point (ParEGO), so that all of their front is looked for.
+
+    The kernel is Matern 5/2, with a length scale per parameter, and noise; its numbers are those of the largest
+    posterior density. Choices are coded one-hot. Objectives are brought near to a normal distribution (Yeo and
+    Johnson). A failed simulation counts as the worst value so far. It needs few evaluations, but each costs tens of
+    milliseconds: for evaluations that are cheap, CMA-ES is the better choice.
+
+    Args:
+        search: what is searched: any parameters, objectives and constraints; 20 parameters at most are reasonable.
+        name: in the catalogue.
+        initial: points of the design; left away: 2 (n + 1), and half of the budget at most.
+        batch: how many points it asks for at a time.
+        memory: the model is fitted to so many points, to the best ones and the latest, so that it stays quick.
+
+    Jones, D. R., Schonlau, M. and Welch, W. J. (1998): Efficient global optimization of expensive black-box functions,
+    J. Global Optimization 13. Knowles, J. (2006): ParEGO, IEEE Trans. Evolutionary Computation 10.
+    """
+
+    def __init__(
+        self, search: Search, *, name: str, initial: int | None = None, batch: int = 4, memory: int = 150
+    ) -> None:
+        super().__init__(search, name=name)
+        for option, given in (("initial", initial), ("batch", batch), ("memory", memory)):
+            if given is not None and given < 1:
+                raise SolverError(f"{option} is a number of points, at least one, not {given}")
+        most = search.budget if search.budget is None else max(1, search.budget // 2)
+        self._initial = initial or min(2 * (search.size + 1), most or 1 << 16)
+        self._batch = batch
+        self._memory = memory
+        self._told: dict[Point, Evaluation] = {}
+        self._begun = False
+        self._rng = np.random.default_rng(search.seed)
+        self._models = [_Model() for _ in range(search.objectives + search.constraints)]
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        self._told.update({evaluation.point: evaluation for evaluation in (*asked, *given)})
+
+    def _next(self) -> list[Point]:
+        if not self._begun:
+            self._begun = True
+            return self._design()
+        # With several threads, the last digits of the linear algebra would depend on their number.
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api="blas"):
+            points = self._proposals()
+        if not points:
+            self._end(True, "every point of the space is known")
+        return points
+
+    def _design(self) -> list[Point]:
+        # Imported here, since it takes long.
+        from scipy.stats import qmc
+
+        units = qmc.Sobol(self.search.size, rng=self.search.seed).random(1 << (self._initial - 1).bit_length())
+        start = [] if self.search.start is None else [self.search.start]
+        return list(dict.fromkeys([*start, *(self.search.point(u) for u in units)]))[: self._initial]
+
+    # ------------------------------------------------------------------------------ proposals
+
+    def _proposals(self) -> list[Point]:
+        remembered = self._remembered()
+        if not any(usable(evaluation) for evaluation in remembered):
+            drawn = (self.search.point(self._rng.random(self.search.size)) for _ in range(self._batch))
+            return [point for point in dict.fromkeys(drawn) if point not in self._told]
+        units = np.array([self.search.unit(evaluation.point) for evaluation in remembered])
+        targets = self._targets(remembered)
+        X = self._encoded(units)
+        for model, target in zip(self._models, targets.T, strict=True):
+            model.fit(X, target)
+        counted = np.array([evaluation.counts for evaluation in remembered])
+        centres = units[self._best_first(remembered, targets)[: 4 * BEST]]
+        points: list[Point] = []
+        while len(points) < self._batch:
+            near = centres[: self._best_count(len(centres))]
+            u = self._maximize(self._acquisition(X, targets, counted), near, known={*self._told, *points})
+            if u is None:
+                break
+            points.append(self.search.point(u))
+            for model in self._models if len(points) < self._batch else ():
+                model.believe(self._encoded(u[np.newaxis]))
+        return points
+
+    def _best_count(self, available: int) -> int:
+        return min(BEST if self.search.objectives == 1 else 4 * BEST, available)
+
+    def _remembered(self) -> list[Evaluation]:
+        """The points that the model is fitted to: all, or half of them the best, and half of them the latest."""
+        told = list(self._told.values())
+        if len(told) <= self._memory:
+            return told
+        costs = np.array([[-value for value in e.values] if usable(e) else [np.inf] * len(e.values) for e in told])
+        ranks = self._best_first(told, costs)[: self._memory // 2].tolist()
+        latest = [i for i in range(len(told) - 1, -1, -1) if i not in set(ranks)][: self._memory - len(ranks)]
+        return [told[i] for i in sorted([*ranks, *latest])]
+
+    def _best_first(self, told: Sequence[Evaluation], costs: np.ndarray) -> np.ndarray:
+        """Indices of ``told``, the best first; of several objectives, by how many others are better in all of them."""
+        if self.search.objectives == 1:
+            return np.array(sorted(range(len(told)), key=lambda i: rank_key(told[i])))
+        costs = costs[:, : self.search.objectives]
+        feasible = np.array([evaluation.feasible for evaluation in told])
+        better = [int(np.sum(np.all(costs <= row, axis=1) & np.any(costs < row, axis=1) & feasible)) for row in costs]
+        return np.lexsort((better, ~feasible))
+
+    def _targets(self, told: Sequence[Evaluation]) -> np.ndarray:
+        """What the models are fitted to, shape (k, objectives + constraints): costs, and violations around 0."""
+        rows = [
+            [*(-value for value in e.values), *e.violations] if usable(e) else [np.nan] * len(self._models)
+            for e in told
+        ]
+        table = np.array(rows)
+        table[~np.isfinite(table)] = np.nan
+        columns = []
+        for i, column in enumerate(table.T):
+            known = column[np.isfinite(column)]
+            filled = np.where(np.isfinite(column), column, known.max() if known.size else 0.0)
+            columns.append(_normal(filled) if i < self.search.objectives else _scaled(filled))
+        return np.column_stack(columns)
+
+    def _acquisition(
+        self, X: np.ndarray, targets: np.ndarray, counted: np.ndarray
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """The logarithm of what is to be maximized, as a function of places in the unit cube, shape (k, n) -> (k,)."""
+        objectives = self._models[: self.search.objectives]
+        constraints = self._models[self.search.objectives :]
+        # Where nothing is feasible yet, only that is looked for.
+        improvement = None
+        if counted.any():
+            improvement = (
+                _expected_improvement(objectives[0], X[counted])
+                if len(objectives) == 1
+                else self._weighed_improvement(objectives, targets[counted, : len(objectives)])
+            )
+
+        def acquisition(units: np.ndarray) -> np.ndarray:
+            places = self._encoded(units)
+            value = np.zeros(len(units)) if improvement is None else improvement(places)
+            for model in constraints:
+                mean, deviation = model.predict(places)
+                value = value + log_ndtr(-mean / deviation)
+            return value
+
+        return acquisition
+
+    def _weighed_improvement(
+        self, models: Sequence[_Model], costs: np.ndarray
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """The logarithm of the EI of max_i(w_i c_i) + 0.05 sum_i(w_i c_i), with weights w drawn at random."""
+        weights = self._rng.dirichlet(np.ones(len(models)))
+        front = costs[[not np.any(np.all(costs <= c, axis=1) & np.any(costs < c, axis=1)) for c in costs]]
+        lowest, width = front.min(axis=0), np.ptp(front, axis=0)
+        width = np.where(width > 1e-6, width, 1.0)
+        quantiles = ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
+        draws = np.column_stack([self._rng.permutation(quantiles) for _ in models])
+
+        def weighed(c: np.ndarray) -> np.ndarray:
+            parts = weights * (c - lowest) / width
+            return np.asarray(np.max(parts, axis=-1) + 0.05 * np.sum(parts, axis=-1))
+
+        best = weighed(costs).min()
+
+        def improvement(places: np.ndarray) -> np.ndarray:
+            means, deviations = (np.column_stack(each) for each in zip(*(m.predict(places) for m in models), strict=True))
+            gains = np.maximum(best - weighed(means[:, np.newaxis] + deviations[:, np.newaxis] * draws), 0.0)
+            # The small part leads to where a draw might improve, if none does.
+            return np.asarray(np.log(gains.mean(axis=1) + 1e-9 * np.exp(np.minimum(best - weighed(means), 0.0))))
+
+        return improvement
+
+    # ------------------------------------------------------------------------------ candidates
+
+    def _maximize(
+        self, acquisition: Callable[[np.ndarray], np.ndarray], centres: np.ndarray, *, known: Set[Point]
+    ) -> np.ndarray | None:
+        """The best place found that is not known, shape (n,); None if all are."""
+        around = [self._moved(np.repeat(centres, AROUND // len(centres), axis=0), width) for width in (0.1, 0.01)]
+        units = np.vstack([self._rng.random((SPREAD, self.search.size)), *around])
+        units = self._snapped(units)
+        values = acquisition(units)
+        for width in WIDTHS:
+            top = np.argsort(-values, kind="stable")[: 2 * BEST]
+            moved = self._moved(np.repeat(units[top], REFINED, axis=0), width)
+            units, values = np.vstack([units[top], moved]), np.concatenate([values[top], acquisition(moved)])
+        best = units[np.argsort(-values, kind="stable")]
+        spare = self._snapped(self._rng.random((SPREAD, self.search.size)))
+        return next((u for u in (*best, *spare) if self.search.point(u) not in known), None)
+
+    def _moved(self, units: np.ndarray, width: float) -> np.ndarray:
+        """Normal steps along at least half of the coordinates; steps of integers and choices may go anywhere."""
+        along = self._rng.random(units.shape) < max(0.5, 2.0 / self.search.size)
+        moved = np.clip(units + width * along * self._rng.standard_normal(units.shape), 0.0, 1.0)
+        for i, parameter in enumerate(self.search.space):
+            if parameter.is_continuous:
+                continue
+            if isinstance(parameter, Choice):
+                moved[:, i] = units[:, i]
+            anew = self._rng.random(len(units)) < 0.2
+            moved[anew, i] = self._rng.random(int(anew.sum()))
+        return self._snapped(moved)
+
+    def _snapped(self, units: np.ndarray) -> np.ndarray:
+        """Integers and choices in the middle of their shares of the unit cube."""
+        snapped = units.copy()
+        for i, parameter in enumerate(self.search.space):
+            if not parameter.is_continuous:
+                snapped[:, i] = [parameter.to_unit(parameter.from_unit(u)) for u in units[:, i]]
+        return snapped
+
+    def _encoded(self, units: np.ndarray) -> np.ndarray:
+        """What the kernel sees of places in the unit cube: numbers as they are, choices one-hot."""
+        columns = []
+        for parameter, column in zip(self.search.space, units.T, strict=True):
+            if isinstance(parameter, Choice):
+                options = len(parameter.options)
+                columns.append(0.5 * np.eye(options)[np.minimum((column * options).astype(int), options - 1)])
+            else:
+                columns.append(column[:, np.newaxis])
+        return np.hstack(columns)
+
+
+# -------------------------------------------------------------------------------------- the model
+
+
+class _Model:
+    """A Gaussian process of one number, of mean 0."""
+
+    def __init__(self) -> None:
+        self._process: GaussianProcessRegressor | None = None
+        self._fitted = 0
+
+    def fit(self, X: np.ndarray, y: np.ndarray) -> None:
+        """Fits it to ``y``, shape (k,), at ``X``, shape (k, m); the kernel's numbers only if there is enough news."""
+        from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+        if self._process is None:
+            scales = np.full(X.shape[1], LENGTH[0] * X.shape[1] ** 0.25)
+            smooth = ConstantKernel(SIGNAL[0], (0.05, 20.0)) * Matern(scales, (0.02, 20.0), nu=2.5)
+            kernel = smooth + WhiteKernel(NOISE[0], (1e-7, 0.5))
+        else:
+            kernel = self._process.kernel_
+        news = abs(len(X) - self._fitted) > 0.05 * self._fitted or len(X) < 20
+        if news:
+            self._fitted = len(X)
+        self._set(kernel, X, y, optimizer=_most_probable if news else None)
+
+    def _set(self, kernel: Any, X: np.ndarray, y: np.ndarray, *, optimizer: Any) -> None:
+        from sklearn.gaussian_process import GaussianProcessRegressor
+
+        with warnings.catch_warnings():
+            # Of numbers at their bounds.
+            warnings.filterwarnings("ignore", module="sklearn")
+            self._process = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=optimizer).fit(X, y)
+
+    def believe(self, x: np.ndarray) -> None:
+        """Takes what it expects at ``x``, shape (1, m), for known."""
+        process = self._process
+        assert process is not None
+        X, y = np.vstack([process.X_train_, x]), np.append(process.y_train_, process.predict(x))
+        self._set(process.kernel_, X, y, optimizer=None)
+
+    def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation without the noise, both of shape (k,)."""
+        assert self._process is not None
+        mean, deviation = self._process.predict(X, return_std=True)
+        noise = self._process.kernel_.k2.noise_level
+        return mean, np.sqrt(np.maximum(deviation**2 - noise, 1e-12))
+
+
+def _most_probable(objective: Any, start: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float]:
+    """Minimizes the negative logarithm of the posterior density of a kernel's numbers, which are logarithms too."""
+    from scipy.optimize import minimize
+
+    lengths = len(start) - 2
+    centre = np.log([SIGNAL[0], *[LENGTH[0] * lengths**0.25] * lengths, NOISE[0]])
+    width = np.array([SIGNAL[1], *[LENGTH[1]] * lengths, NOISE[1]])
+
+    def density(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = objective(theta, eval_gradient=True)
+        z = (theta - centre) / width
+        return value + 0.5 * float(z @ z), gradient + z / width
+
+    found = minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15})
+    return found.x, float(found.fun)
+
+
+def _expected_improvement(model: _Model, known: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """The logarithm of the EI over the least mean at the ``known`` places."""
+    best = model.predict(known)[0].min()
+
+    def improvement(places: np.ndarray) -> np.ndarray:
+        mean, deviation = model.predict(places)
+        return np.log(deviation) + _log_h((best - mean) / deviation)
+
+    return improvement
+
+
+def _log_h(z: np.ndarray) -> np.ndarray:
+    """log(phi(z) + z Phi(z)) of the standard normal distribution, by its asymptote phi(z) / z^2 where that is tiny."""
+    log_phi = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
+    near = np.maximum(z, -6.0)
+    exact = np.log(np.exp(-0.5 * near**2) / np.sqrt(2.0 * np.pi) + near * np.exp(log_ndtr(near)))
+    return np.where(z > -6.0, exact, log_phi - 2.0 * np.log(np.maximum(-z, 1.0)))
+
+
+def _normal(costs: np.ndarray) -> np.ndarray:
+    """Costs brought near to a standard normal distribution, in their order; shape (k,)."""
+    from scipy.stats import yeojohnson
+
+    deviation = costs.std()
+    if not deviation > 1e-12 * np.abs(costs).max():
+        return np.zeros_like(costs)
+    bent, _ = yeojohnson((costs - np.median(costs)) / deviation)
+    return np.asarray((bent - bent.mean()) / (bent.std() or 1.0))
+
+
+def _scaled(violations: np.ndarray) -> np.ndarray:
+    """Violations on a scale that is linear near 0, where they change their sign, and logarithmic far from it."""
+    scale = np.median(np.abs(violations)) or 1.0
+    return np.asarray(np.sign(violations) * np.log1p(np.abs(violations) / scale))
