@@ -34,6 +34,7 @@ BENCHMARKS: Registry = {
     "study_overhead_threads": "benchmarks.study:study_overhead_threads",
     "study_overhead_processes": "benchmarks.study:study_overhead_processes",
     "study_against_optuna": "benchmarks.study:study_against_optuna",
+    "auto_regret": "benchmarks.auto_regret:auto_regret",
     "racing_savings": "benchmarks.study:racing_savings",
     "time_to_target": "benchmarks.gait:time_to_target",
 }

@@ -4,12 +4,13 @@ import itertools
 import logging
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydrake.solvers import MathematicalProgram, NloptSolver, SolverOptions
 
-from tests.optimization.solvers.driver import ACKLEY, ROSENBROCK, SPHERE, drive, evaluation
+from tests.optimization.solvers.driver import ACKLEY, ROSENBROCK, SPHERE, box, drive, evaluation
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import SolverError, known_solvers, make_solver
 from vtbdrake.optimization.solvers.nlopt_algorithms import DERIVATIVE_FREE, WITH_DERIVATIVES
@@ -65,6 +66,10 @@ def test_an_unknown_option_is_never_ignored():
         ("LN_BOBYQA", {"constraints": 1}, "LN_BOBYQA knows no constraints, and there are 1; CMA-ES"),
         ("LD_MMA", {"constraints": 1}, "LD_MMA knows no constraints"),
         ("QMC", {"constraints": 2}, "QMC knows no constraints"),
+        ("LN_PRAXIS", {}, "LN_PRAXIS needs at least two parameters, and there is one; LN_COBYLA can do that"),
+        ("LN_NEWUOA", {}, "at least two parameters"),
+        ("LN_NEWUOA_BOUND", {}, "at least two parameters"),
+        ("bayesian", {"batch": 0}, "batch is a number of points, at least one, not 0"),
         ("sobol", {"start": (0.5,)}, "sobol does not start at a point"),
         ("SNOPT", {"start": (0.5, 0.5)}, "one value per parameter, 1, not 2"),
         ("SNOPT", {"start": (7.0,)}, "x = 7 lies outside its range"),
@@ -89,7 +94,14 @@ def test_a_missing_optuna_names_the_extra(monkeypatch):
     # None in sys.modules is how Python itself marks a module that cannot be imported.
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ModuleNotFoundError, match=re.escape("pip install 'vtbdrake[optuna]'")):
-        make_solver("auto", [KIND, X])
+        make_solver("TPE", [KIND, X])
+
+
+@pytest.mark.parametrize(("space", "objectives"), [([KIND, X], 1), ([X], 2)])
+def test_auto_needs_no_extra(space, objectives, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    solver = make_solver("auto", space, objectives=objectives, budget=6)
+    assert len(drive(solver, lambda p: (p[-1], -p[-1])[:objectives])) == 6
 
 
 def test_every_algorithm_that_drake_lists_is_offered_or_known_to_be_of_no_use():
@@ -165,12 +177,13 @@ def test_a_latin_hypercube_has_one_point_in_each_slice():
 @pytest.mark.parametrize(
     ("space", "arguments", "method"),
     [
-        ([X, KIND], {}, "TPE"),
-        ([X], {"objectives": 2}, "NSGA-II"),
+        ([X, KIND], {}, "bayesian"),
+        ([X], {"objectives": 2}, "bayesian"),
         ([COUNT, KIND], {}, "grid"),
         ([COUNT, KIND], {"budget": 12}, "grid"),
-        ([COUNT, KIND], {"budget": 11}, "TPE"),
-        ([X, COUNT], {"budget": 10_000}, "sobol"),
+        ([COUNT, KIND], {"budget": 11}, "bayesian"),
+        ([X, COUNT], {"budget": 10_000}, "bayesian"),
+        ([Parameter(f"x{i}", 0.0, 1.0) for i in range(21)], {"budget": 1000}, "sobol"),
     ],
 )
 def test_auto_chooses_by_the_problem(space, arguments, method):
@@ -179,41 +192,58 @@ def test_auto_chooses_by_the_problem(space, arguments, method):
     assert solver.method == method
 
 
-def test_auto_spends_a_tiny_budget_on_the_design_alone():
-    solver = make_solver("auto", SPHERE.space, budget=40)
-    assert len(drive(solver, SPHERE.cost)) == 40
-    assert solver.changes == ((0, "sobol"),)
-    assert solver.success is True
+@pytest.mark.parametrize(
+    ("size", "budget", "methods"),
+    [
+        (2, 30, ["bayesian"]),
+        (21, 100, ["sobol", "CMA-ES, start 1, population 13"]),
+        (2, 400, ["bayesian", "LN_BOBYQA around the best", "CMA-ES, start 1, population 6"]),
+    ],
+)
+def test_auto_has_a_plan_for_every_budget(size, budget, methods):
+    space = box(size, -3.0, 4.0)
+    solver = make_solver("auto", space, budget=budget)
+    log = drive(solver, lambda p: float(np.sum((np.array(p) - 1.0) ** 2)))
+    assert len(log) <= budget
+    assert [method for _, method in solver.changes][: len(methods)] == methods
+
+
+def test_what_racing_saves_goes_to_the_later_phases_of_auto():
+    # Every point takes a quarter of what its conditions would take: there are four times as many points.
+    solver = make_solver("auto", SPHERE.space, budget=100)
+    asked = 0
+    while points := solver.ask():
+        asked += len(points)
+        solver.tell([replace(evaluation(p, ACKLEY.cost), effort=0.25) for p in points])
+    assert 150 <= asked <= 400
+    assert [method for _, method in solver.changes][:2] == ["bayesian", "LN_BOBYQA around the best"]
 
 
 def test_auto_starts_anew_with_larger_populations_and_another_method():
-    solver = make_solver("auto", ACKLEY.space, budget=4000)
+    solver = make_solver("auto", ACKLEY.space, budget=2500)
     methods = []
     while points := solver.ask():
         if solver.method not in methods:
             methods.append(solver.method)
         solver.tell([evaluation(p, ACKLEY.cost) for p in points])
-    assert [method for _, method in solver.changes] == methods
-    assert methods[:4] == [
-        "sobol",
+    assert methods[:5] == [
+        "bayesian",
+        "LN_BOBYQA around the best",
         "CMA-ES, start 1, population 7",
         "CMA-ES, start 2, population 14",
         "differential-evolution, start 3",
     ]
-    assert methods[-1] == "LN_BOBYQA, polish"
 
 
 def test_auto_leaves_a_search_that_stalls():
     # A plateau with noise below the criterion: CMA-ES alone would go on.
-    spread = 1.0
     solver = make_solver("auto", ROSENBROCK.space)
 
     def cost(p):
-        return spread * (p[0] > 0.2) + 1e-9 * np.sin(1e6 * p[0] + 3e6 * p[1])
+        return 1.0 * (p[0] > 0.2) + 1e-9 * np.sin(1e6 * p[0] + 3e6 * p[1])
 
     drive(solver, cost)
-    (_, _), (begin, first), (end, _) = solver.changes[:3]
-    assert first.startswith("CMA-ES, start 1")
+    (begin, _), (end, _) = [change for change in solver.changes if "start" in change[1]][:2]
     # 20 generations of 6 and 30 n, from the first value of the plateau.
     assert 20 * 6 + 30 * 2 <= end - begin <= 20 * 6 + 30 * 2 + 5 * 6
     assert solver.success is True

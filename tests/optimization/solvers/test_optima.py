@@ -107,10 +107,35 @@ def test_a_categorical_parameter_is_chosen_rightly():
         return {"up": 2.0, "down": 0.0, "left": 1.0}[kind] + (x - 0.25) ** 2 + (0.0 if flag is True else 0.7)
 
     solver = make_solver("auto", space, budget=120)
-    assert solver.method == "TPE"
+    assert solver.method == "bayesian"
     best = max(drive(solver, cost), key=lambda e: e.values[0])
     assert best.point[0] == "down" and best.point[2] is True
     assert best.point[1] == pytest.approx(0.25, abs=0.1)
+
+
+def test_few_evaluations_are_enough_for_a_model():
+    # The best of 40 random points is about 1 above it.
+    _, best = solve("bayesian", BRANIN, budget=40, batch=1)
+    assert -best.values[0] == pytest.approx(BRANIN.lowest, abs=1e-2)
+
+
+def test_a_model_finds_the_optimum_under_a_constraint_with_few_evaluations():
+    _, best = solve("bayesian", CONSTRAINED, violations=half_plane, budget=40)
+    assert -best.values[0] == pytest.approx(CONSTRAINED.lowest, abs=2e-2)
+
+
+def test_a_model_remembers_only_so_many_points():
+    solver, best = solve("bayesian", SPHERE, budget=80, memory=15)
+    np.testing.assert_allclose(best.point, SPHERE.best, atol=1e-2)
+
+
+def test_a_model_of_a_space_of_which_every_point_is_known_ends_with_success():
+    space = (Parameter("i", 1, 3, integer=True), Choice("c", ["a", "b"]))
+    solver = make_solver("bayesian", space)
+    log = drive(solver, lambda p: p[0])
+    assert sorted({told.point for told in log}) == sorted(itertools.product((1, 2, 3), "ab"))
+    assert len(log) == 6
+    assert (solver.success, solver.message) == (True, "every point of the space is known")
 
 
 def test_one_parameter_is_enough_for_every_method_of_auto():
@@ -156,7 +181,7 @@ def test_a_pareto_front_is_covered_better_than_by_chance(name):
     ideal = np.trapezoid(1.0 - second[::-1], first[::-1])
     volumes = {}
     for solver in (name, "random"):
-        made = make_solver(solver, space, objectives=2, budget=1000, seed=1)
+        made = make_solver(solver, space, objectives=2, budget=1000 if name == "NSGA-II" else 60, seed=1)
         volumes[solver] = _hypervolume(drive(made, _two_costs))
     # The hypervolume of the front cannot be exceeded (1e-3: of the trapezoids).
     assert 0.9 * ideal < volumes[name] < ideal + 1e-3

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.optimization.solvers.driver import CONSTRAINED, ROSENBROCK, SPHERE, drive, evaluation, half_plane, solve
-from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import Evaluation, Solver, SolverError, known_solvers, make_solver
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
 from vtbdrake.optimization.solvers.search import Search
@@ -19,7 +19,18 @@ from vtbdrake.optimization.solvers.search import Search
 INSTALLED = [name for name in known_solvers() if name != "GP" or importlib.util.find_spec("torch")]
 REPRODUCIBLE = [name for name in INSTALLED if make_solver(name, SPHERE.space).reproducible]
 BLOCKING = [name for name in INSTALLED if isinstance(make_solver(name, SPHERE.space), BlockingSolver)]
-SEEDED = ["sobol", "latin-hypercube", "random", "CMA-ES", "differential-evolution", "TPE", "NSGA-II", "QMC", "auto"]
+SEEDED = [
+    "sobol",
+    "latin-hypercube",
+    "random",
+    "bayesian",
+    "CMA-ES",
+    "differential-evolution",
+    "TPE",
+    "NSGA-II",
+    "QMC",
+    "auto",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -40,6 +51,45 @@ def test_it_asks_for_points_of_the_space_within_its_budget(name):
         ]
     assert solver.success is not None and solver.message
     assert solver.ask() == []
+
+
+# Spaces at the edge of what is allowed, with (objectives, constraints).
+EDGES = {
+    "one number": ([Parameter("x", -1.0, 2.0)], 1, 0),
+    "one number, constrained": ([Parameter("x", -1.0, 2.0)], 1, 1),
+    "two numbers": ([Parameter("x", -1.0, 2.0), Parameter("y", 1e-3, 2.0, log=True)], 1, 0),
+    "two integers of few values": ([Parameter("i", 1, 2, integer=True), Parameter("j", 1, 3, integer=True)], 1, 0),
+    "an integer on a logarithmic scale": ([Parameter("i", 1, 1000, integer=True, log=True)], 1, 0),
+    "one choice": ([Choice("c", [1.0, 0.5])], 1, 0),
+    "all kinds": ([Choice("c", [1.0, 0.5]), Parameter("i", 1, 3, integer=True), Parameter("x", -1.0, 2.0)], 1, 0),
+    "all kinds, constrained": ([Choice("c", [1.0, 0.5]), Parameter("x", -1.0, 2.0)], 1, 1),
+    "a range without room": ([Parameter("x", 1.0, np.nextafter(1.0, 2.0)), Parameter("y", 0.0, 1.0)], 1, 0),
+    "two objectives": ([Parameter("x", -1.0, 2.0)], 2, 0),
+    "two objectives of integers, constrained": ([Parameter("i", 1, 9, integer=True)], 2, 1),
+}
+
+
+@pytest.mark.parametrize("edge", EDGES)
+@pytest.mark.parametrize("name", INSTALLED)
+def test_at_the_edge_of_what_is_allowed_it_works_or_refuses_before_the_first_point(name, edge):
+    space, objectives, constraints = EDGES[edge]
+    for budget in (1, 9):
+        try:
+            solver = make_solver(name, space, objectives=objectives, constraints=constraints, budget=budget)
+        except SolverError as refusal:
+            assert name in str(refusal) and len(str(refusal)) > 30
+            continue
+        log = drive(
+            solver,
+            lambda p: tuple(sum((float(x) - at) ** 2 for x in p) for at in (0.3, 1.2)[:objectives]),
+            violations=(lambda p: (0.5 - float(p[0]),)) if constraints else None,
+        )
+        assert 1 <= len(log) <= budget
+        for told in log:
+            assert tuple(parameter.check(value) for parameter, value in zip(space, told.point, strict=True)) == (
+                told.point
+            )
+        assert solver.success is not None and solver.message
 
 
 @pytest.mark.parametrize("name", REPRODUCIBLE)
@@ -118,30 +168,18 @@ def test_points_given_by_hand_are_taken_and_change_nothing_that_was_asked(name):
     solver.close()
 
 
-def test_tpe_learns_from_points_given_by_hand():
+@pytest.mark.parametrize("name", ["TPE", "bayesian", "auto"])
+def test_it_learns_from_points_given_by_hand(name):
     space = SPHERE.space
     spread = [told.point for told in drive(make_solver("sobol", space, points=60), SPHERE.cost)]
     near = [(1.0 + 0.02 * i, -0.5 - 0.02 * i) for i in range(-5, 6)]
 
     def typical_cost(given):
-        solver = make_solver("TPE", space, seed=4)
+        solver = make_solver(name, space, seed=4)
         solver.tell([evaluation(point, SPHERE.cost) for point in given])
         return np.median([SPHERE.cost(told.point) for told in drive(solver, SPHERE.cost, limit=20)])
 
     assert typical_cost([*spread, *near]) < 0.3 * typical_cost([])
-
-
-def test_auto_begins_its_search_at_a_good_point_given_by_hand():
-    solver = make_solver("auto", ROSENBROCK.space)
-    solver.tell([evaluation((1.0, 1.0), ROSENBROCK.cost)])
-    points = solver.ask()
-    solver.tell([evaluation(p, ROSENBROCK.cost) for p in points])
-    generation = solver.ask()
-    assert solver.method.startswith("CMA-ES, start 1")
-    # The normal distribution has its mean there, and a width of 0.3 of the range.
-    near = np.mean(generation, axis=0) - 1.0
-    assert np.all(np.abs(near) < 0.3 * 4.5 * 2.0 / np.sqrt(len(generation)))
-    solver.close()
 
 
 @pytest.mark.parametrize("name", SEEDED)
@@ -208,6 +246,81 @@ def test_an_exception_in_the_solvers_thread_reaches_ask_as_itself(name):
     with pytest.raises(SolverError, match="was told of no gradient"):
         solver.ask()
     assert solver.success is False
+
+
+class Stuck(BlockingSolver):
+    """A method that asks once, and never returns, whatever it is told."""
+
+    grace = 0.05
+
+    def _solve(self):
+        self._at(np.array([0.5, 0.5]))
+        STUCK.wait()
+        return True, "released"
+
+
+STUCK = threading.Event()
+
+
+@pytest.fixture
+def stuck():
+    """A method that has begun to be stuck, and is released after the test."""
+    solver = Stuck(Search(SPHERE.space), name="stuck")
+    solver.tell([evaluation(p, SPHERE.cost) for p in solver.ask()])
+    yield solver
+    STUCK.set()
+    for thread in threading.enumerate():
+        if thread.name == "solver stuck":
+            thread.join()
+    STUCK.clear()
+
+
+def test_a_method_that_never_returns_is_left_behind_with_a_warning(stuck, caplog):
+    stuck.close()
+    assert "stuck does not return: its thread is left behind" in caplog.text
+
+
+def test_who_waits_for_a_method_that_never_returns_is_released_when_it_is_closed(stuck):
+    asked = []
+    waiting = threading.Thread(target=lambda: asked.append(stuck.ask()))
+    waiting.start()
+    stuck.close()
+    waiting.join()
+    assert asked == [[]]
+    assert (stuck.success, stuck.message) == (False, "it was closed")
+
+
+def test_a_program_ends_although_a_method_never_returns():
+    program = (
+        "import threading\n"
+        "import numpy as np\n"
+        "from vtbdrake.optimization.solvers import Evaluation\n"
+        "from vtbdrake.optimization.parameter import Parameter\n"
+        "from vtbdrake.optimization.solvers.blocking import BlockingSolver\n"
+        "from vtbdrake.optimization.solvers.search import Search\n"
+        "class Stuck(BlockingSolver):\n"
+        "    grace = 0.05\n"
+        "    def _solve(self):\n"
+        "        self._at(np.array([0.5]))\n"
+        "        threading.Event().wait()\n"
+        "solver = Stuck(Search((Parameter('x', 0, 1),)), name='stuck')\n"
+        "solver.tell([Evaluation(p, (0.0,)) for p in solver.ask()])\n"
+        "solver.close()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.returncode, ended.stderr.strip()) == (0, "stuck does not return: its thread is left behind")
+
+
+def test_a_method_that_goes_round_in_circles_is_ended():
+    class Circling(BlockingSolver):
+        def _solve(self):
+            while True:
+                self._at(np.array([0.5, 0.5]))
+
+    solver = Circling(Search(SPHERE.space), name="circling")
+    log = drive(solver, SPHERE.cost)
+    assert len(log) == 1
+    assert (solver.success, solver.message) == (False, "it called 10000 times in a row for points that it knew")
 
 
 def test_an_exception_of_any_kind_reaches_ask_as_itself():

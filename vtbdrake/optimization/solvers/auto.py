@@ -75,6 +75,7 @@ class Auto(BatchSolver):
         self._changes: list[tuple[int, str]] = []
         self._solver: BatchSolver
         self._patience = math.inf
+        self._limit = math.inf
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
         # What was told before the model began.
@@ -145,11 +146,13 @@ class Auto(BatchSolver):
             points = int(min(2 * (size + 1), max(1, left // 2)))
             self._begin("sobol", Sobol(replace(search, start=None, budget=None), name="sobol", points=points))
             return
-        wanted = min(MODEL_POINTS * (size + 1), MODEL_LIMIT)
-        points = wanted if left >= wanted + 10 * default_population(size) else int(left)
+        points = min(MODEL_POINTS * (size + 1), MODEL_LIMIT)
+        if left < points + 10 * default_population(size):
+            points = int(left)
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
         model.tell(self._before)
-        self._begin(MODEL, model)
+        # With racing, the budget may allow for many more points.
+        self._begin(MODEL, model, limit=points)
 
     def _begin_global(self, start: int) -> None:
         """The start-th global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
@@ -209,18 +212,29 @@ class Auto(BatchSolver):
 
     # ------------------------------------------------------------------------------ its steps
 
-    def _begin(self, method: str, solver: BatchSolver, *, generation: int | None = None) -> None:
-        """``generation``: the points of each, of a method that may stall."""
+    def _begin(
+        self, method: str, solver: BatchSolver, *, generation: int | None = None, limit: float = math.inf
+    ) -> None:
+        """Begin a method.
+
+        Args:
+            method: its name, for the user.
+            solver: works by it.
+            generation: points per generation, of a method that may stall.
+            limit: after how many points it ends.
+        """
         self._method = method
         self._changes.append((self._count, method))
         self._solver = solver
         self._stage_best = None
         self._without_progress = 0
+        self._limit = self._count + limit
         self._patience = math.inf if generation is None else 20.0 * generation + 30.0 * self.search.size
 
     def _next(self) -> list[Point]:
         while self._success is None:
-            points = [] if self._without_progress > self._patience else self._solver.ask()
+            ended = self._without_progress > self._patience or self._count >= self._limit
+            points = [] if ended else self._solver.ask()
             if points:
                 self._count += len(points)
                 return points

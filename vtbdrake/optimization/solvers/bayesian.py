@@ -18,8 +18,8 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
-# Candidates of the acquisition: over the whole space, around the best points, and around each of the best candidates, in
-# steps of decreasing widths, as parts of the ranges.
+# Candidates of the acquisition: over the whole space, around the best points, and around each of the best candidates,
+# in steps of decreasing widths, as parts of the ranges.
 SPREAD, AROUND, REFINED = 500, 200, 10
 BEST = 5
 WIDTHS = (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003)
@@ -30,22 +30,23 @@ DRAWS = 64
 
 
 class Bayesian(BatchSolver):
-    """Maximizes the expected improvement (EI) over the best point, which Gaussian processes say from what was told.
+    """Asks for the points of the largest expected improvement (EI), as Gaussian processes predict it.
 
-    The first points are a Sobol design. After each batch, one Gaussian process is fitted to every objective and to every
-    constraint, and a random search with shrinking steps looks for the point of largest EI, times the probability that
-    all constraints hold. Within a batch, the points before count as if they gave what the model expects of them.
-    Several objectives are weighed at random for every point (ParEGO), so that all of their front is looked for.
+    The first points are a Sobol design. After each batch, a Gaussian process is fitted to every objective and to every
+    constraint. A random search with shrinking steps then looks for the point of the largest EI, times the probability
+    that all constraints hold. Within a batch, the model takes its own prediction of the earlier points for known.
+    Several objectives are weighed at random for every point (ParEGO), so that the whole Pareto front is looked for.
 
     The kernel is Matern 5/2, with a length scale per parameter, and noise; its numbers are those of the largest
     posterior density. Choices are coded one-hot. Objectives are brought near to a normal distribution (Yeo and
-    Johnson). A failed simulation counts as the worst value so far. It needs few evaluations, but each costs tens of
-    milliseconds: for evaluations that are cheap, CMA-ES is the better choice.
+    Johnson). A failed simulation counts as the worst value so far. To choose a point takes tens of milliseconds: where
+    a rollout takes less, CMA-ES may be the better choice.
 
     Args:
         search: what is searched: any parameters, objectives and constraints; 20 parameters at most are reasonable.
         name: in the catalogue.
-        initial: points of the design; left away: 2 (n + 1), and half of the budget at most.
+        initial: points of the design; left away: 2 (n + 1), and half of the budget at most. If as many points were
+            given by hand before, there is no design.
         batch: how many points it asks for at a time.
         memory: the model is fitted to so many points, to the best ones and the latest, so that it stays quick.
 
@@ -73,8 +74,8 @@ class Bayesian(BatchSolver):
         self._told.update({evaluation.point: evaluation for evaluation in (*asked, *given)})
 
     def _next(self) -> list[Point]:
-        if not self._begun:
-            self._begun = True
+        begun, self._begun = self._begun, True
+        if not begun and len(self._told) < self._initial:
             return self._design()
         # With several threads, the last digits of the linear algebra would depend on their number.
         from threadpoolctl import threadpool_limits
@@ -180,9 +181,7 @@ class Bayesian(BatchSolver):
 
         return acquisition
 
-    def _weighed_improvement(
-        self, models: Sequence[_Model], costs: np.ndarray
-    ) -> Callable[[np.ndarray], np.ndarray]:
+    def _weighed_improvement(self, models: Sequence[_Model], costs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """The logarithm of the EI of max_i(w_i c_i) + 0.05 sum_i(w_i c_i), with weights w drawn at random."""
         weights = self._rng.dirichlet(np.ones(len(models)))
         front = costs[[not np.any(np.all(costs <= c, axis=1) & np.any(costs < c, axis=1)) for c in costs]]
@@ -198,7 +197,9 @@ class Bayesian(BatchSolver):
         best = weighed(costs).min()
 
         def improvement(places: np.ndarray) -> np.ndarray:
-            means, deviations = (np.column_stack(each) for each in zip(*(m.predict(places) for m in models), strict=True))
+            means, deviations = (
+                np.column_stack(each) for each in zip(*(m.predict(places) for m in models), strict=True)
+            )
             gains = np.maximum(best - weighed(means[:, np.newaxis] + deviations[:, np.newaxis] * draws), 0.0)
             # The small part leads to where a draw might improve, if none does.
             return np.asarray(np.log(gains.mean(axis=1) + 1e-9 * np.exp(np.minimum(best - weighed(means), 0.0))))

@@ -35,8 +35,8 @@ class BlockingSolver(BatchSolver):
     The thread only ever waits: either the method computes its next points or the driver judges them. So what is asked
     for depends on what was told, and not on timing. When it is closed before its end, the callback raises `Stopped`,
     which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined. A method that
-    does not return within `grace` seconds is left behind in its thread, which does not keep the program from ending. One that
-    calls `CIRCLES` times in a row for points that it knows is ended, without success.
+    does not return within `grace` seconds is left behind in its thread, which does not keep the program from ending.
+    A method that calls `CIRCLES` times in a row for points that it knows is ended, without success.
 
     Failed simulations: these methods need a number. A failed point counts as worse than the worst point so far, by the
     spread of the values so far (at least 1), and keeps that number. So does one that racing dropped, as it breaks a

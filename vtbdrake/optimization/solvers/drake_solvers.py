@@ -13,6 +13,7 @@ from vtbdrake.optimization.solvers.nlopt_algorithms import (
     NO_EXCEPTIONS,
     RESULTS,
     SEEDED_BY_CLOCK,
+    SEVERAL_PARAMETERS,
     UNTIL_LIMIT,
     WITH_CONSTRAINTS,
 )
@@ -62,6 +63,7 @@ class _Nlopt(ProgramSolver):
     def _choose(self) -> None:
         if self.name not in WITH_CONSTRAINTS:
             self.search.require(self.name, no_constraints=True)
+        self.search.require(self.name, several=self.name in SEVERAL_PARAMETERS)
         self.local = self.name.startswith("L")
         self._survives_exceptions = self.name not in NO_EXCEPTIONS
         self.reproducible = self.name not in SEEDED_BY_CLOCK

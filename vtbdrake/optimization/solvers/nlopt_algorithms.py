@@ -64,6 +64,9 @@ WITH_CONSTRAINTS = frozenset(
     }
 )
 
+# PRAXIS goes round in circles on one parameter, and the NEWUOAs refuse it.
+SEVERAL_PARAMETERS = frozenset({"LN_NEWUOA", "LN_NEWUOA_BOUND", "LN_PRAXIS"})
+
 # NLopt seeds its random numbers from the clock, and Drake has no way to seed them.
 SEEDED_BY_CLOCK = frozenset(
     {

@@ -87,8 +87,9 @@ class Search:
         one_objective: bool = False,
         no_constraints: bool = False,
         no_start: bool = False,
+        several: bool = False,
     ) -> None:
-        """Refuses what the method ``name`` cannot do.
+        """Refuse what the method ``name`` cannot do.
 
         Args:
             name: of the method, for the message.
@@ -97,6 +98,7 @@ class Search:
             one_objective: it maximizes one value.
             no_constraints: it knows none.
             no_start: it does not start at a point.
+            several: it needs at least two parameters.
 
         Raises:
             SolverError: names what it cannot do, and a solver that can.
@@ -115,6 +117,8 @@ class Search:
             raise SolverError(f"{name} takes one objective, not {self.objectives}; NSGA-II can do that")
         if no_constraints and self.constraints:
             raise SolverError(f"{name} knows no constraints, and there are {self.constraints}; CMA-ES can do that")
+        if several and self.size < 2:
+            raise SolverError(f"{name} needs at least two parameters, and there is one; LN_COBYLA can do that")
         if no_start and self.start is not None:
             raise SolverError(f"{name} does not start at a point; leave start away, or tell it of that point")
 
