@@ -218,7 +218,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "integers": lambda: Case(_ackley, _INTEGERS, 0.0),
     "two_qualities_fonseca": lambda: Case(_fonseca, _box(3, -4.0, 4.0), -_FONSECA, corner=(1.0, 1.0)),
     "two_qualities_zdt1": lambda: Case(_zdt1, _box(4, 0.0, 1.0), -2.0 / 3.0, corner=(1.0, 1.0)),
-    STUDY: lambda: Case(_swing, pendulum().parameters, 0.0, rollouts=len(DAMPINGS)),
+    STUDY: lambda: Case(_swing, pendulum().parameters, 0.0964906, rollouts=len(DAMPINGS)),
 }
 
 

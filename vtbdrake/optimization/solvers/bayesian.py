@@ -65,17 +65,17 @@ class Bayesian(BatchSolver):
         self._initial = initial or min(2 * (search.size + 1), most or 1 << 16)
         self._batch = batch
         self._memory = memory
-        self._told: dict[Point, Evaluation] = {}
+        self._evaluations: dict[Point, Evaluation] = {}
         self._begun = False
         self._rng = np.random.default_rng(search.seed)
         self._models = [_Model() for _ in range(search.objectives + search.constraints)]
 
     def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        self._told.update({evaluation.point: evaluation for evaluation in (*asked, *given)})
+        self._evaluations.update({evaluation.point: evaluation for evaluation in (*asked, *given)})
 
     def _next(self) -> list[Point]:
         begun, self._begun = self._begun, True
-        if not begun and len(self._told) < self._initial:
+        if not begun and len(self._evaluations) < self._initial:
             return self._design()
         # With several threads, the last digits of the linear algebra would depend on their number.
         from threadpoolctl import threadpool_limits
@@ -100,7 +100,7 @@ class Bayesian(BatchSolver):
         remembered = self._remembered()
         if not any(usable(evaluation) for evaluation in remembered):
             drawn = (self.search.point(self._rng.random(self.search.size)) for _ in range(self._batch))
-            return [point for point in dict.fromkeys(drawn) if point not in self._told]
+            return [point for point in dict.fromkeys(drawn) if point not in self._evaluations]
         units = np.array([self.search.unit(evaluation.point) for evaluation in remembered])
         targets = self._targets(remembered)
         X = self._encoded(units)
@@ -111,7 +111,7 @@ class Bayesian(BatchSolver):
         points: list[Point] = []
         while len(points) < self._batch:
             near = centres[: self._best_count(len(centres))]
-            u = self._maximize(self._acquisition(X, targets, counted), near, known={*self._told, *points})
+            u = self._maximize(self._acquisition(X, targets, counted), near, known={*self._evaluations, *points})
             if u is None:
                 break
             points.append(self.search.point(u))
@@ -124,7 +124,7 @@ class Bayesian(BatchSolver):
 
     def _remembered(self) -> list[Evaluation]:
         """The points that the model is fitted to: all, or half of them the best, and half of them the latest."""
-        told = list(self._told.values())
+        told = list(self._evaluations.values())
         if len(told) <= self._memory:
             return told
         costs = np.array([[-value for value in e.values] if usable(e) else [np.inf] * len(e.values) for e in told])
@@ -139,7 +139,7 @@ class Bayesian(BatchSolver):
         costs = costs[:, : self.search.objectives]
         feasible = np.array([evaluation.feasible for evaluation in told])
         better = [int(np.sum(np.all(costs <= row, axis=1) & np.any(costs < row, axis=1) & feasible)) for row in costs]
-        return np.lexsort((better, ~feasible))
+        return np.lexsort((np.array(better), ~feasible))
 
     def _targets(self, told: Sequence[Evaluation]) -> np.ndarray:
         """What the models are fitted to, shape (k, objectives + constraints): costs, and violations around 0."""
