@@ -84,10 +84,9 @@ class Variables(Mapping[str, Variable]):
         Raises:
             VariableError: a value is refused, or an array is given both whole and by entries.
         """
-        for address, value in values.items():
-            self[address].check(value)
+        checked = {address: self[address].check(value) for address, value in values.items()}
         whole: dict[str, Any] = {}
-        for address, value in values.items():
+        for address, value in checked.items():
             entry = _ENTRY.fullmatch(address)
             if entry is None:
                 whole[address] = value
@@ -95,9 +94,13 @@ class Variables(Mapping[str, Variable]):
                 raise VariableError(f"{entry[1]} is set both whole and by its entry {address}")
             else:
                 array = whole.setdefault(entry[1], np.array(self[entry[1]].get(context)))
-                array.flat[int(entry[2])] = float(np.asarray(value))
-        for address in sorted(whole, key=lambda address: self[address].order):
-            self[address].set(context, whole[address])
+                array.flat[int(entry[2])] = float(value)
+        for variable in sorted(map(self.__getitem__, whole), key=lambda variable: variable.order):
+            if variable.address in checked:
+                assert variable.write is not None
+                variable.write(context, checked[variable.address])
+            else:
+                variable.set(context, whole[variable.address])
 
     def complement(self, addresses: Sequence[str]) -> list[str]:
         """Equation (9): the addresses of all that is held constant when ``addresses`` are varied."""
