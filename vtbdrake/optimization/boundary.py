@@ -199,6 +199,8 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
     beyond = {
         v for outcomes, start in zip(own, first, strict=True) for v, share in outcomes if share == 0.0 and v > start
     }
+    sweeps = [sweep] if repeated is None else [sweep, repeated]
+    rows = [(float(v), r) for each in sweeps for v, r in zip(each.points[:, 0], each.rollouts, strict=True)]
     # Between two conditions' examined values lies nothing that is known of both: the least of each end holds.
     lower, upper = float(by_condition[:, 0].min()), float(by_condition[:, 1].min())
     return Boundary(
@@ -212,9 +214,9 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
         step=float(np.diff(np.unique(values)).min(initial=inf)),
         chances=tuple(sorted(chances, key=lambda chance: (chance.value, chance.condition))),
         safe_beyond=_distinct(beyond),
-        ended_at=_distinct(v for v, r in zip(values, sweep.rollouts, strict=True) if r.end == TERMINATED),
-        failed_at=_distinct(values[sweep.failed]),
-        failure=next((rollout.message for rollout in sweep.rollouts if rollout.failed), ""),
+        ended_at=_distinct(value for value, rollout in rows if rollout.end == TERMINATED),
+        failed_at=_distinct(value for value, rollout in rows if rollout.failed),
+        failure=next((rollout.message for _, rollout in rows if rollout.failed), ""),
         sweep=sweep,
         repeated=repeated,
     )

@@ -89,7 +89,7 @@ class AddressedDiagram:
         equal, to the last bit, to a rollout from the snapshot (``Problem(start=...)``), or to a simulation by
         ``simulator(context, restored=True)`` of a restored context, if it is advanced to the same instants: where a
         call of AdvanceTo ends, a step ends. For a rollout these are `RolloutTask.instants`. With a discrete plant or
-        fixed steps, a plain snapshot gives the same, but costs nothing.
+        fixed steps, a plain snapshot does.
 
         Args:
             simulator: one of this testbed; between two calls of its AdvanceTo.
