@@ -394,6 +394,20 @@ def test_refusals_of_ones_own_commands_and_those_before_are_no_attempts_of_other
     assert ownership.contended(60.0) == ["C"] and ownership.contended(0.0) == []
 
 
+def test_on_a_protected_channel_the_hub_tells_who_commands() -> None:
+    with (
+        Hub(port=0, protect=["IIWA_COMMAND"]) as hub,
+        closing(bridge(hub.url)) as commander,
+        closing(bridge(hub.url)) as listener,
+    ):
+        commander.open()
+        listener.open()
+        in_step(listener, Peer(hub.url))
+        commander.publish({"position": np.zeros(7)})
+        assert wait(listener, lambda: listener.foreign == 1 and listener.hindrance is not None)
+        assert listener.contention is None
+
+
 def test_own_commands_that_come_back_late_all_at_once_or_not_in_order_are_no_alarm() -> None:
     watch = CommandWatch(None)
     own = [str(number).encode() for number in range(3000)]

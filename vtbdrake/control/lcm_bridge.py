@@ -151,8 +151,9 @@ class LcmBridge(Bridge):
 
     @property
     def contention(self) -> str | None:
+        # Of a channel that a hub protects, the hub tells who may command; see `hindrance`.
         since = time.monotonic() - CONTENTION
-        found = {channel for channel, watch in self._watches.items() if watch.last > since}
+        found = {c for c, watch in self._watches.items() if watch.last > since} - self._ownership.protected
         found.update(self._ownership.contended(CONTENTION))
         if not found:
             return None

@@ -21,12 +21,14 @@ class Ownership:
         name: under which the hub knows the connection at present; None while there is none.
 
     Attributes:
-        foreign: the channels among them that belong to somebody else.
+        protected: the channels among them that the hub protects: only one client at a time gets through there.
+        foreign: those of them that belong to somebody else.
         attempts: how often the hub has refused somebody else on a channel that is one's own.
         last: by channel, when it did so last, in seconds by `time.monotonic`.
     """
 
     def __init__(self, channels: Iterable[str], name: Callable[[], str | None]) -> None:
+        self.protected: frozenset[str] = frozenset()
         self.foreign: frozenset[str] = frozenset()
         self.attempts = 0
         self.last: dict[str, float] = {}
@@ -50,6 +52,7 @@ class Ownership:
                     _log.error("commands on %s are refused by the hub: the channel belongs to %s", channel, owner)
             if channel in protected:
                 self._count(channel, protected[channel], own)
+        self.protected = frozenset(channel for channel in self._channels if channel in protected)
         self.foreign = frozenset(foreign)
 
     def _count(self, channel: str, state: ChannelStatistics, own: str | None) -> None:

@@ -61,8 +61,9 @@ class Runtime(Stepped):
         statistics: of the loop's timing.
         watchers: called with every `Cycle`; one that raises is left out from then on, and the loop goes on.
 
-    Somebody else who commands the same machine is an alarm: it is logged and counted in the statistics, and no signal
-    is switched to real meanwhile. Guards cannot keep him from it; a hub can, by protected channels.
+    Somebody else who commands the same machine as this loop is an alarm: it is logged and counted in the statistics. No
+    signal is switched to real while somebody else is heard to command. Guards cannot keep him from it; a hub can, by
+    protected channels.
 
     Attributes:
         cycles: how many there were.
@@ -257,14 +258,16 @@ class Runtime(Stepped):
         return int((lateness + worked) / self.period)
 
     def _tell_foreign(self) -> None:
-        """Counts commands of somebody else, and logs them once per second at most."""
+        """Counts commands of somebody else while this loop commands, and logs them once per second at most."""
         foreign, now = self.bridge.foreign, self.clock.now()
-        self.statistics.foreign += foreign - self._foreign
-        self._foreign = foreign
+        new, self._foreign = foreign - self._foreign, foreign
+        if not self.active:
+            return  # Who only listens hears the one who commands.
+        self.statistics.foreign += new
         if now - self._told_foreign >= _TELL_EVERY:
             self._told_foreign = now
             who = self.bridge.contention or "somebody else publishes commands"
-            _log.error("ALARM: %s (%d messages so far)", who, self.statistics.foreign)
+            _log.error("ALARM: %s (heard so far: %d)", who, self.statistics.foreign)
 
     def send_fallback(self, reason: str) -> None:
         """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""

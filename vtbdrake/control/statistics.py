@@ -145,7 +145,7 @@ class LoopStatistics:
         misses: deadlines that passed while the loop was at work on an earlier cycle.
         run: how many of them in a row, up to now.
         longest_run: the longest such run.
-        foreign: commands of somebody else that were heard.
+        foreign: commands of somebody else that were heard while the loop commanded.
     """
 
     def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
@@ -252,7 +252,7 @@ class LoopStatistics:
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
         lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}")
         if self.foreign:
-            lines.append(f"ALARM: somebody else published {self.foreign} commands to the machine")
+            lines.append(f"ALARM: somebody else published commands to the machine, too: {self.foreign} were heard")
         return "\n".join(lines)
 
     def _shape(self) -> tuple[Any, ...]:

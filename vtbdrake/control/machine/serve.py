@@ -48,7 +48,8 @@ def serve(
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, lambda *_: loop.stop())
     ready()
-    real_time = RealTime(priority=priority) if priority else nullcontext()
+    # A simulated world that cannot keep up computes without a pause.
+    real_time = RealTime(priority=priority, longest_step=None) if priority else nullcontext()
     try:
         with real_time:
             if isinstance(real_time, RealTime):
