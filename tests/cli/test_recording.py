@@ -42,7 +42,8 @@ def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path
 
 
 def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
-    assert "identical" in run("replay", path, *SCENARIO, "--on", "testbed").stdout
+    by_another_module = ("--scenario", "tests.control.recording.servo:ServoScenario")
+    assert "identical" in run("replay", path, *by_another_module, "--on", "testbed").stdout
     program = run("replay", path, *SCENARIO, "--set", "dps.gain=1.5")
     assert program.returncode == 0 and "not compared" in program.stdout
 

@@ -63,6 +63,11 @@ def test_the_user_may_name_the_class_of_a_file(tmp_path):
         load_scenario(f"tests.testbeds:PendulumScenario@{tmp_path / 's.yaml'}")
 
 
+def test_a_class_may_be_named_by_any_module_that_has_it(tmp_path):
+    AcrobotScenario(period=0.05).save(tmp_path / "s.yaml")
+    assert load_scenario(f"{__name__}:AcrobotScenario@{tmp_path / 's.yaml'}") == AcrobotScenario(period=0.05)
+
+
 def test_a_module_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     (tmp_path / "broken_module.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -14,7 +14,7 @@ from vtbdrake.control.recording.log_reader import read_log
 from vtbdrake.control.recording.replay import replay
 from vtbdrake.control.recording.replay_report import DIFFERENT
 from vtbdrake.testbed import DpsAlone
-from vtbdrake.testbed.scenario import scenario_class
+from vtbdrake.testbed.scenario import class_name, scenario_class
 
 
 @click.command("replay")
@@ -61,10 +61,8 @@ def replay_log(
             f"{log} is of the scenario {recorded}, and to import it runs its code: if you trust it, say "
             f"--scenario {recorded}"
         )
-    if scenario is not None:
-        if scenario != recorded:
-            raise click.UsageError(f"{log} is of the scenario {recorded or 'that nobody knows'}, not of {scenario}")
-        scenario_class(scenario)
+    if scenario is not None and (given := class_name(scenario_class(scenario))) != recorded:
+        raise click.UsageError(f"{log} is of the scenario {recorded or 'that nobody knows'}, not of {given}")
     target = None if on == "recorded" else DpsAlone(found.scenario) if on == "dps" else found.scenario.build()
     report = replay(found, target, values=settings(values), record=record)
     if out is not None:

@@ -115,7 +115,7 @@ class Scenario(ABC):
 
     def name(self) -> str:
         """``package.module:Class``."""
-        return f"{type(self).__module__}:{type(self).__qualname__}"
+        return class_name(type(self))
 
     def record(self) -> dict[str, Any]:
         """What identifies it, as plain data: its name and all fields, nested ones by dotted names."""
@@ -203,6 +203,11 @@ def scenario_class(name: str) -> type[Scenario]:
     return found
 
 
+def class_name(scenario: type[Scenario]) -> str:
+    """Return ``package.module:Class``, where the module is the one that defines the class."""
+    return f"{scenario.__module__}:{scenario.__qualname__}"
+
+
 def is_imported(name: str) -> bool:
     """Return whether the module of the scenario ``package.module:Class`` is imported in this process."""
     return name.partition(":")[0] in sys.modules
@@ -226,15 +231,15 @@ def _load_yaml(path: Path, named: str) -> Scenario:
         raise ScenarioError(f"{path} must have one key, package.module:Class, with the scenario's fields below it")
     _check_nodes(document, path)
     name = document.value[0][0].value
-    if named and name != named:
-        raise ScenarioError(f"{path} is of the scenario {name}, not of {named}")
+    if named and name not in (named, class_name(found := scenario_class(named))):
+        raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(found)}")
     if not named and ":" in name and not is_imported(name):
         raise ScenarioError(
             f"{path} names the scenario {name}, and to import its module runs its code: if that is what you want, "
             f"name it as {name}@{path}, or import it first"
         )
     try:
-        schema = scenario_class(name)
+        schema = scenario_class(named or name)
         _resolve_types(schema)
         return yaml_load_typed(schema=schema, filename=path, child_name=name)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:

@@ -27,7 +27,7 @@ class HubConfig:
     max_message: int = 16 * MEBIBYTE  # largest data of a message, in bytes
     max_queue: int = 32 * MEBIBYTE  # largest backlog of a client, in bytes
     max_memory: int = 512 * MEBIBYTE  # largest sum of all backlogs and of all incomplete messages, in bytes
-    max_clients: int = 128  # of them, other users than the hub's own and root have a quarter each, three together
+    max_clients: int = 128  # of another user at most a quarter, of all others three quarters
     users: Sequence[str | int] = ()  # who may connect besides the hub's own user and root, by name or number
     all_users: bool = False  # whether every user of this machine may connect
     # s after which a client that does not greet or does not read is disconnected, and one that does not complete a
