@@ -9,9 +9,10 @@ from typing import Any
 import lcm
 import numpy as np
 import pytest
-from drake import lcmt_scope
+from drake import lcmt_force_torque, lcmt_iiwa_command, lcmt_iiwa_status, lcmt_scope
 
 from diagrams.manipulator import ManipulatorScenario
+from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, HOME
 from tests.control.scripted import ScriptedBridge
@@ -93,3 +94,78 @@ def test_the_motion_is_chosen_over_lcm() -> None:
     assert (before, refused) == (HOME, HOME)
     assert reception.rejected == {"limits": 1}
     assert testbed.read(runtime.context, "dps.impl.motion") == CIRCLE
+
+
+class FakeArm:
+    """An arm on the bus that does not move: it reports a torque, and keeps the torques that are commanded."""
+
+    def __init__(self, url: str) -> None:
+        self.commanded: list[np.ndarray] = []
+        self._lcm = lcm.LCM(url)
+        self._lcm.subscribe("IIWA_COMMAND", self._obey)
+        self._ready = False
+        self._lcm.subscribe("READY", self._get_ready)
+        self._lcm.publish("READY", b"")
+        while not self._ready:
+            assert self._lcm.handle_timeout(round(1e3 * PATIENCE))
+
+    def _get_ready(self, channel: str, data: bytes) -> None:
+        self._ready = True
+
+    def _obey(self, channel: str, data: bytes) -> None:
+        self.commanded.append(np.array(lcmt_iiwa_command.decode(data).joint_torque))
+
+    def tell(self, torque: np.ndarray) -> None:
+        """Publishes its state."""
+        status = lcmt_iiwa_status()
+        status.utime, status.num_joints = time.time_ns() // 1000, 7
+        for name in status.__slots__[2:]:
+            setattr(status, name, [0.0] * 7)
+        status.joint_position_measured, status.joint_torque_measured = list(Arm().home), torque.tolist()
+        wrench = lcmt_force_torque()
+        wrench.timestamp = status.utime
+        self._lcm.publish("IIWA_STATUS", status.encode())
+        self._lcm.publish("WRENCH", wrench.encode())
+
+    def listen(self) -> None:
+        while self._lcm.handle_timeout(0):
+            pass
+
+
+def test_first_command_after_a_restart_of_the_hub_departs_from_the_torque_that_the_arm_reports() -> None:
+    scenario = ManipulatorScenario(law="joint_impedance")
+    carried, braked = np.array([0.0, -45.2, 0.0, 22.4, 0.0, -2.1, 0.0]), np.zeros(7)
+    with Hub(port=0) as first:
+        port = int(first.url.rpartition(":")[2])
+        bridge = protocol_of(scenario).bridge(scenario.interface(), first.url)
+        bridge.open()
+        runtime: Runtime = operation_of(scenario).runtime(DpsAlone(scenario), bridge)
+        arm, limit = FakeArm(first.url), time.monotonic() + PATIENCE
+        while runtime.prepare("real").reasons:
+            arm.tell(carried)
+            bridge.poll(0.01)
+            assert time.monotonic() < limit
+        runtime.switch("real")
+        while len(arm.commanded) < 30:
+            arm.tell(carried)
+            runtime.cycle()
+            arm.listen()
+            assert time.monotonic() < limit
+        assert np.abs(arm.commanded[-1] - carried).max() < 5.0
+    while bridge.connected:
+        runtime.cycle()
+    for _ in range(50):
+        runtime.cycle()
+    with Hub(port=port) as second:
+        arm = FakeArm(second.url)
+        while not bridge.connected:
+            bridge.poll(0.01)
+        while not arm.commanded:
+            arm.tell(braked)
+            runtime.cycle()
+            arm.listen()
+            assert time.monotonic() < limit
+        bridge.close()
+    step = np.array(Arm().torque_rates) * scenario.period
+    assert (np.abs(arm.commanded[0] - braked) <= step * (1 + 1e-9)).all()
+    assert runtime.guards.latched
