@@ -270,6 +270,7 @@ def test_points_of_others_are_judged_by_our_rollouts(url):
     study = problem.study(solver="TPE")
     # The one that was started waits in the queue no longer; it is the enqueued one.
     assert study.import_optuna(url, "theirs") == 2
+    assert study.import_optuna(url, "theirs") == 0, "they wait already"
     run(study, 16)
     judged = {tuple(t.parameters.values()): t.value for t in study.trials if t.origin == "user"}
     assert judged == {at: problem.rollout(at).value for at in [(0.25, -1.0), (0.5, 0.5)]}

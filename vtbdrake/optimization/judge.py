@@ -66,7 +66,7 @@ class Judge:
         self._news: Counter[Point] = Counter()
 
     def judge(self, points: Sequence[Point]) -> list[Evaluation]:
-        """One evaluation per point, in their order."""
+        """Return one evaluation per point, in their order."""
         evaluations: dict[Point, Evaluation] = {}
         waiting = list(dict.fromkeys(points))
         while waiting:
@@ -76,11 +76,11 @@ class Judge:
         return [replace(evaluations[point], effort=self._effort(point)) for point in points]
 
     def _effort(self, point: Point) -> float:
-        """The `Evaluation.effort` of a point that is going to be told."""
+        """Return the `Evaluation.effort` of a point that is going to be told."""
         return self._news.pop(point, 0) / len(self._conditions)
 
     def _affordable(self, count: int) -> int:
-        """How many of ``count`` points are judged together."""
+        """Return how many of ``count`` points are judged together."""
         left = (self._budget - len(self._needed)) / len(self._conditions)
         return max(1, int(min(left, count))) if self._racing else count
 
@@ -103,7 +103,10 @@ class Judge:
             self._run(missing)
 
     def _race(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
-        """In each round, only the conditions of the rounds so far count: an interrupted study may know more."""
+        """Judge points in rounds, and drop those that have lost.
+
+        Only the conditions of the rounds so far count: an interrupted study may know more.
+        """
         if self.best is None and len(points) > 1:
             self._find_incumbent(points)
         order = self._order()
@@ -119,7 +122,7 @@ class Judge:
         return evaluations
 
     def _find_incumbent(self, points: Sequence[Point]) -> None:
-        """Lets the point that does best in the first condition meet the others too: the rest is held against it."""
+        """Run the point that does best in the first condition under the others too: the rest is held against it."""
         first = list(self._conditions)[:1]
         self._complete([(point, condition) for point in points for condition in first])
         leads = [point for point in points if self.evaluation(point, first).feasible]
@@ -129,14 +132,14 @@ class Judge:
             self._remember(self.evaluation(leader))
 
     def _order(self) -> list[int]:
-        """The conditions, those first in which the best point fares worst: they tell most."""
+        """Return the conditions, those first in which the best point fares worst: they tell most."""
         if self.best is None:
             return list(self._conditions)
         h = [self._known[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
         return sorted(self._conditions, key=lambda condition: h[condition])
 
     def _lost(self, evaluation: Evaluation) -> bool:
-        """Whether a point, judged by a bound from above, cannot become the best."""
+        """Return whether a point, judged by a bound from above, cannot become the best."""
         if evaluation.failed:
             return True
         if self.best is None or evaluation.point == self.best.point:
@@ -144,7 +147,12 @@ class Judge:
         return not evaluation.feasible or evaluation.values[0] <= self.best.values[0]
 
     def evaluation(self, point: Point, conditions: Collection[int] | None = None) -> Evaluation:
-        """What the known outcomes of a point say, or those under some conditions; others count as the best possible."""
+        """Return what the known outcomes of a point say together.
+
+        Args:
+            point: s^0.
+            conditions: which of them count; None: all. The others, and those not known, count as the best possible.
+        """
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
         seen = [outcome for outcome in outcomes if outcome is not None]
@@ -163,7 +171,7 @@ class Judge:
         return Evaluation(point, values, violations, exact=exact)
 
     def in_the_users_terms(self, evaluation: Evaluation) -> tuple[float, ...]:
-        """The values, a cost as a cost."""
+        """Return the values in the user's terms: a cost as a cost."""
         # Adding 0 makes 0 of -0.
         return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
 

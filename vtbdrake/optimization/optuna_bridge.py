@@ -65,7 +65,9 @@ def to_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> o
 
 
 def points_from_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> list[Point]:
-    """The points of a study in Optuna's storage that ``study`` has not judged. See `Study.import_optuna`.
+    """The points of a study in Optuna's storage that ``study`` has not judged, nor in its queue.
+
+    See `Study.import_optuna`.
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
@@ -82,7 +84,8 @@ def points_from_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: 
             raise StudyError(f"Optuna's storage has no study {name!r}; it has {names}") from error
         trials = found.get_trials(deepcopy=False)
     # By their text: 1 and True are equal as numbers.
-    known = {encode(tuple(trial.parameters.values())) for trial in study.trials}
+    judged = [trial.parameters for trial in study.trials]
+    known = {encode(tuple(parameters.values())) for parameters in (*judged, *study.queue.values())}
     points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
     return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
 

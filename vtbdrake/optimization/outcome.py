@@ -31,7 +31,7 @@ class Outcome:
 
     @classmethod
     def of(cls, result: RolloutResult) -> Outcome:
-        """Without its trajectories."""
+        """Return what is kept of a result: all but its trajectories."""
         return cls(**{name: getattr(result, name) for name in cls.__dataclass_fields__})
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vtbdrake.optimization.problem import Problem
 
 
-# Is told of a trial of a study.
+# What is called with a study and each of its new trials.
 Callback = Callable[["Study", Trial], Any]
 
 
@@ -52,7 +52,7 @@ class Study(StudyRecord):
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
-        """Opens a study file to be read and to be given points.
+        """Open a study file to be read and to be given points.
 
         Raises:
             StudyError: there is none, it is damaged, or of another version.
@@ -70,7 +70,7 @@ class Study(StudyRecord):
         options: Mapping[str, Any] | None = None,
         allow_changed_code: bool = False,
     ) -> Self:
-        """See `Problem.study`."""
+        """Begin or resume the study of a problem; see `Problem.study`."""
         meta: dict[str, Any] = {
             "problem": describe(problem),
             "solver": "auto" if solver is None else solver,
@@ -129,17 +129,17 @@ class Study(StudyRecord):
         callbacks: Sequence[Callback] = (),
         progress: bool = True,
     ) -> Self:
-        """Goes on until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
+        """Run rollouts until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
 
         Args:
             rollouts: how many the study has in the end, those of former runs included.
-            seconds: of wall time, in this run.
+            seconds: the wall time of this run.
             target: ends as soon as a point is at least as good: a quality as large, a cost as small. With several
                 workers, others may be finished by then.
             racing: drop points that can no longer win before all their conditions have run (see `Judge`). By default,
                 where there are several conditions and one quality.
             executor, workers: see `Problem.sweep`.
-            time_limit: of one rollout, in seconds; one that takes longer fails.
+            time_limit: in seconds; a rollout that takes longer fails.
             on_error: what becomes of a rollout in which a quality or constraint function raises, is negative or NaN.
                 ``record``: it counts as failed, with the message, and the first of a run is logged; ``raise``: the run
                 ends there.
@@ -199,7 +199,10 @@ class Study(StudyRecord):
         return self
 
     def stop(self) -> None:
-        """Ends the run when the batch of points that is being judged is complete; of a callback, or another thread."""
+        """End the run when the batch of points that is being judged is complete.
+
+        It may be called by a callback, or in another thread.
+        """
         self._stopped = True
 
     def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
@@ -213,9 +216,10 @@ class Study(StudyRecord):
         return _solver(problem, self._meta, rollouts=self._meta["budget"])
 
     def add(self, *points: Any) -> None:
-        """Gives points by hand, each a mapping address -> value or values in the order of the parameters.
+        """Give points by hand, each a mapping address -> value or values in the order of the parameters.
 
-        They are judged with the next batch of the study, in whatever process runs it, and the solver is told of them.
+        They are judged before anything else that the study asks for next, in whatever process runs it, and the solver
+        is told of them.
 
         Raises:
             ValueError: a point has other entries than the study, or one lies outside its range.
@@ -223,7 +227,7 @@ class Study(StudyRecord):
         self._file.give([self._checked(point) for point in points])
 
     def edit(self, number: int, point: Any) -> None:
-        """Puts another point in the place of one of the `queue`.
+        """Put another point in the place of one of the `queue`.
 
         Raises:
             StudyError: no point of that number waits: it was judged, removed, or never given.
@@ -232,7 +236,7 @@ class Study(StudyRecord):
         self._file.change_queue(as_whole("the number of a point in the queue", number), self._checked(point))
 
     def remove(self, number: int) -> None:
-        """Takes a point out of the `queue`: it is not judged.
+        """Take a point out of the `queue`: it is not judged.
 
         Raises:
             StudyError: no point of that number waits: it was judged, removed, or never given.
@@ -240,7 +244,7 @@ class Study(StudyRecord):
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
-        """Sets an attribute of the study, or of a point: who ran it, why the point looks odd. It changes no result.
+        """Set an attribute of the study, or of a point: who ran it, why the point looks odd. It changes no result.
 
         Args:
             key: its name; an attribute of the same name is replaced.
@@ -262,7 +266,8 @@ class Study(StudyRecord):
         """Gives the points of a study in Optuna's storage, as `add` does: evaluated by whomever, or only enqueued.
 
         They are judged by rollouts of this problem: a value from elsewhere says nothing about it. Points that are
-        judged already are left out, so that what `to_optuna` wrote costs nothing when it comes back.
+        judged already, or wait in the queue, are left out, so that what `to_optuna` wrote costs nothing when it comes
+        back.
 
         Args:
             storage: an URL or a storage of Optuna's, see `to_optuna`.

@@ -104,7 +104,7 @@ class StudyFile:
         return bool(tables == 0)
 
     def _refuse_others(self, *, new: bool) -> None:
-        """Only reads: a file that is not ours stays as it is."""
+        """Refuse a file of another kind or version. It only reads: a file that is not ours stays as it is."""
         (application,) = self._db.execute("PRAGMA application_id").fetchone()
         (version,) = self._db.execute("PRAGMA user_version").fetchone()
         if application == 0 and self._is_empty():
@@ -155,14 +155,14 @@ class StudyFile:
             self._db.execute("COMMIT")
 
     def _insert(self, table: str, rows: Iterable[tuple[Any, ...]], *, instead: str = "ABORT") -> None:
-        """Adds rows, sealed by their checksums; ``instead`` is what is done where there is one of the same key."""
+        """Add rows with their checksums; ``instead`` is what SQLite does where there is a row of the same key."""
         sealed = [(*row, _checksum(table, row)) for row in rows]
         if sealed:
             marks = ", ".join("?" * len(sealed[0]))
             self._db.executemany(f"INSERT OR {instead} INTO {table} VALUES ({marks})", sealed)
 
     def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
-        """The rows of a table, without their checksums, which are right; ``more`` says which, and in which order."""
+        """Yield the rows of a table, checked and without their checksums; ``more`` says which, and in which order."""
         with self._lock, explained(self.path):
             found = self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall()
         for *row, checksum in found:
@@ -180,7 +180,7 @@ class StudyFile:
 
     @contextmanager
     def running(self, *, versions: Mapping[str, str], revision: str) -> Iterator[list[str]]:
-        """Claims the file for one process that runs the study. What is put into the list is why it ended.
+        """Claim the file for this process, which runs the study. What it puts into the list is why the run ended.
 
         Raises:
             StudyError: another process has it.
@@ -204,7 +204,7 @@ class StudyFile:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What the study is about."""
+        """What the study is about: the problem, the solver, the seed and so on, by name."""
         return {key: json.loads(value) for key, value in self._rows("meta")}
 
     def sessions(self) -> list[tuple[str, str | None, str | None, dict[str, str], str]]:
@@ -213,7 +213,7 @@ class StudyFile:
         return [(a, b, c, json.loads(d), e) for _, a, b, c, d, e in rows]
 
     def add(self, point: Point, condition: int, outcome: Outcome) -> None:
-        """Records a finished rollout, whole or not at all; one that is there already stays."""
+        """Record a finished rollout, whole or not at all; one that is there already stays."""
         row = (
             encode(point),
             condition,
@@ -231,7 +231,7 @@ class StudyFile:
             self._insert("rollouts", [row], instead="IGNORE")
 
     def outcomes(self) -> dict[tuple[Point, int], Outcome]:
-        """All finished rollouts."""
+        """Return all finished rollouts by (point, number of the condition)."""
         return {
             (decode(point), condition): Outcome(
                 _number(h), _number(value), tuple(json.loads(measures)), _number(t), end, message, _number(wall)
@@ -242,16 +242,16 @@ class StudyFile:
         }
 
     def finished(self) -> dict[tuple[Point, int], datetime]:
-        """When each rollout was finished, in UTC."""
+        """Return when each rollout was finished, in UTC."""
         return {(decode(row[0]), row[1]): datetime.fromisoformat(row[-1]) for row in self._rows("rollouts")}
 
     def count(self) -> int:
-        """How many rollouts there are."""
+        """Return the number of finished rollouts."""
         with self._lock, explained(self.path):
             return int(self._db.execute("SELECT count(*) FROM rollouts").fetchone()[0])
 
     def set(self, key: str, value: Any) -> None:
-        """Adds to what the study is about."""
+        """Set one entry of `meta`."""
         with self._transaction():
             self._set({key: value})
 
@@ -259,11 +259,11 @@ class StudyFile:
         self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
 
     def told(self) -> int:
-        """How many batches the solver was told of."""
+        """Return the number of batches that the solver was told of."""
         return int(self.meta.get("told", 0))
 
     def save_trials(self, rows: Sequence[TrialRow], *, told: int | None) -> None:
-        """Records judged points.
+        """Record judged points.
 
         Args:
             rows: the points.
@@ -283,7 +283,7 @@ class StudyFile:
                 self._set({"told": told})
 
     def begin_anew(self, *, budget: int | None, racing: bool) -> None:
-        """The solver is told from the start, for another budget of rollouts, or with racing where there was none, say.
+        """Have a new solver told from the start: it is made for another budget of rollouts, or racing is another.
 
         Trials so far stay, at positions below 0.
         """
@@ -292,7 +292,7 @@ class StudyFile:
             self._set({"budget": budget, "racing": racing})
 
     def _withdraw(self) -> None:
-        """The solver was told nothing yet; the trials stay, at positions below 0."""
+        """Note that no solver was told of the trials so far; they stay, at positions below 0."""
         rows = list(self._rows("trials"))
         if rows:
             positions = [position for _, position, *_ in rows]
@@ -304,7 +304,7 @@ class StudyFile:
     def change_code(
         self, problem: Mapping[str, Any], what: Sequence[str], *, versions: Mapping[str, str], revision: str
     ) -> None:
-        """Notes that the code of the problem has changed, and forgets the rollouts in which the old quality failed.
+        """Note that the code of the problem has changed, and forget the rollouts in which a quality function failed.
 
         Raises:
             StudyError: another process runs the study.
@@ -322,11 +322,11 @@ class StudyFile:
             self._set({"problem": problem, "changes": [*self.meta.get("changes", []), change]})
 
     def trials(self) -> list[TrialRow]:
-        """All judged points, in the order of the study."""
+        """Return all judged points, in the order of the study."""
         return [_trial(row) for row in self._rows("trials", "ORDER BY batch, position")]
 
     def trials_of(self, batch: int) -> tuple[int, list[TrialRow]]:
-        """The number of the first trial of a batch, among all of them, and those trials; without withdrawn ones."""
+        """Return the number of the first trial of a batch among all trials, and the trials of that batch."""
         rows = self._rows("trials", "WHERE batch = ? AND position >= 0 ORDER BY position", (batch,))
         with self._lock, explained(self.path):
             (before,) = self._db.execute(
@@ -335,24 +335,24 @@ class StudyFile:
         return before, [_trial(row) for row in rows]
 
     def add_gradient(self, point: Point, gradient: Sequence[float]) -> None:
-        """Records the gradient at a point."""
+        """Record the gradient at a point."""
         with self._transaction():
             self._insert("gradients", [(encode(point), json.dumps(list(gradient)))], instead="IGNORE")
 
     def gradients(self) -> dict[Point, tuple[float, ...]]:
-        """All gradients."""
+        """Return all gradients by point."""
         return {decode(point): tuple(json.loads(gradient)) for point, gradient in self._rows("gradients")}
 
     # -- points given by hand
 
     def give(self, points: Sequence[Point]) -> None:
-        """Puts points into the queue, to be judged with the next batch."""
+        """Put points into the queue, to be judged with the next batch."""
         with self._transaction():
             first = self._next_number("given")
             self._insert("given", [(first + k, encode(point), None) for k, point in enumerate(points)])
 
     def take(self, batch: int, *, new: bool) -> list[Point]:
-        """The points given by hand that belong to a batch; with ``new``, those that belong to none yet join it."""
+        """Return the points given by hand that belong to a batch; with ``new``, those in the queue join it first."""
         if new and self.queue():
             with self._transaction():
                 waiting = [(number, point, batch) for number, point, _ in self._rows("given", "WHERE batch IS NULL")]
@@ -361,12 +361,12 @@ class StudyFile:
         return [decode(point) for _, point, _ in rows]
 
     def queue(self) -> dict[int, Point]:
-        """The points given by hand that wait to be judged, by their numbers."""
+        """Return the points given by hand that wait to be judged, by their numbers."""
         rows = self._rows("given", "WHERE batch IS NULL ORDER BY number")
         return {number: decode(point) for number, point, _ in rows}
 
     def change_queue(self, number: int, point: Point | None) -> None:
-        """Puts another point in the place of one that waits, or none.
+        """Put another point in the place of one that waits, or none.
 
         Raises:
             StudyError: none of that number waits.
@@ -384,13 +384,13 @@ class StudyFile:
     # -- attributes
 
     def set_attribute(self, point: Point | None, key: str, value: Any) -> None:
-        """Sets an attribute of a point, or of the study."""
+        """Set an attribute of a point, or of the study."""
         with self._transaction():
             row = ("" if point is None else encode(point), key, json.dumps(value))
             self._insert("attributes", [row], instead="REPLACE")
 
     def attributes(self) -> dict[Point | None, dict[str, Any]]:
-        """All attributes by point; those of the study by None."""
+        """Return all attributes by point; those of the study under None."""
         found: dict[Point | None, dict[str, Any]] = {}
         for point, key, value in self._rows("attributes", "ORDER BY rowid"):
             found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
@@ -412,12 +412,12 @@ def _now() -> str:
 
 
 def encode(point: Point) -> str:
-    """Exact: JSON writes the shortest digits that lead back to the same number."""
+    """Return a point as text; exact, as JSON writes the shortest digits that lead back to the same number."""
     return json.dumps(list(point))
 
 
 def decode(text: str) -> Point:
-    """The inverse of `encode`."""
+    """Return the point of a text, the inverse of `encode`."""
     return tuple(json.loads(text))
 
 
@@ -427,5 +427,5 @@ def _real(value: float) -> float | None:
 
 
 def _number(value: float | None) -> float:
-    """The inverse of `_real`."""
+    """Return a number of SQLite, the inverse of `_real`."""
     return float("nan") if value is None else value

@@ -52,8 +52,8 @@ class StudyRecord:
         Writing it again adds the points that are new.
 
         Args:
-            storage: an URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
-            name: of the study there.
+            storage: a URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
+            name: the name of the study there.
 
         Raises:
             ModuleNotFoundError: Optuna is not installed.
@@ -65,17 +65,17 @@ class StudyRecord:
 
     @property
     def path(self) -> Path | None:
-        """Of the file; None of a study in memory."""
+        """The path of the file; None if the study is in memory."""
         return self._file.path
 
     @property
     def parameters(self) -> tuple[Dimension, ...]:
-        """What is varied."""
+        """The parameters that are varied."""
         return dimensions(self._meta["problem"])
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the parameters, see `Problem.units`."""
+        """The units of the parameters, see `Problem.units`."""
         return tuple(self._meta["units"])
 
     @property
@@ -87,7 +87,7 @@ class StudyRecord:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the qualities."""
+        """The names of the qualities."""
         return tuple(quality["name"] for quality in self._meta["problem"]["qualities"])
 
     @property
@@ -137,7 +137,7 @@ class StudyRecord:
         return self._file.finished()
 
     def __len__(self) -> int:
-        """How many rollouts there are."""
+        """Return the number of finished rollouts."""
         return self._file.count()
 
     @property

@@ -98,7 +98,7 @@ class StudyRun:
         self._target: float | None = None
 
     def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
-        """Runs; returns why it ended, in a word and in a sentence."""
+        """Run, and return why it ended, in a word and in a sentence."""
         self._limit = inf if rollouts is None else rollouts
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         if target is not None:
@@ -135,7 +135,7 @@ class StudyRun:
         return SOLVER, f"{self._solver.name} asks only for points that are known"
 
     def _one_batch(self, batch: int) -> bool:
-        """Judges the points given by hand, then what the solver asks for; returns whether there were any."""
+        """Judge the points given by hand, then what the solver asks for; return whether there were any."""
         # A batch that was told before gets no new points by hand: it is to be what it was.
         given = self._file.take(batch, new=batch >= self._new_from)
         asked: list[Point] = []
@@ -155,7 +155,7 @@ class StudyRun:
         return bool(given or asked)
 
     def _roll_out_queue(self) -> None:
-        """Runs the points given by hand before a solver that was made anew comes to what is new.
+        """Run the points given by hand before a solver that was made anew comes to what is new.
 
         It is told of them where the study goes on. Until then it would ask for what is known and, in the same batch,
         for more than the budget allows.
@@ -184,7 +184,7 @@ class StudyRun:
         return evaluations
 
     def _ask(self) -> list[Point]:
-        """What the solver asks for. It is not waited for beyond the time limit, however long it thinks."""
+        """Return what the solver asks for. It is not waited for beyond the time limit, however long it thinks."""
         if self._deadline == inf:
             return self._solver.ask()
         answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
@@ -199,7 +199,7 @@ class StudyRun:
         return points
 
     def _resume(self) -> int:
-        """The batch to begin with: the first for a solver that can be told again, else the one where the study is."""
+        """Return the batch to begin with: the first, or where the study is if its solver cannot be told again."""
         if self._solver.reproducible or not self._told:
             return 0
         # Of those that racing has dropped, more would have to be rolled out.
@@ -244,7 +244,7 @@ class StudyRun:
         return f"the budget of {self._limit:g} rollouts is spent"
 
     def _warn(self, outcome: Outcome) -> None:
-        """Says once in a run that the quality function fails: it may be wrong, and all that follows in vain."""
+        """Log once in a run that the quality function fails: it may be wrong, and all that follows in vain."""
         if outcome.message.startswith(QUALITY_FAILED) and not self._warned:
             self._warned = True
             _log.warning(
@@ -268,7 +268,7 @@ class StudyRun:
         return filled
 
     def _refuse_success(self, points: Sequence[Point]) -> None:
-        """Ends the run as soon as a point is good enough."""
+        """End the run as soon as a point is good enough."""
         if self._target is None:
             return
         for point in points:
@@ -282,7 +282,7 @@ class StudyRun:
             raise _SpentError(TIME, "the time is over")
 
     def _record(self, batch: int, given: Sequence[Evaluation], asked: Sequence[Evaluation], *, ended: bool) -> None:
-        """Records the points that are judged; a batch that has not ended is judged again in the next run."""
+        """Record the points that are judged; a batch that has not ended is judged again in the next run."""
         origins = [*(("user", "by hand") for _ in given), *(("solver", self._solver.method) for _ in asked)]
         rows: list[TrialRow] = [
             (
@@ -300,7 +300,7 @@ class StudyRun:
         self._file.save_trials(rows, told=batch + 1 if ended else None)
 
     def _recorded(self, evaluation: Evaluation) -> bool:
-        """Whether it was recorded before the solver was made for a larger budget, and nothing more is known now."""
+        """Return whether a trial so far, of a solver for a smaller budget, already says as much of the point."""
         exact = self._earlier.get(evaluation.point)
         return exact is not None and (exact or not evaluation.exact)
 
@@ -312,7 +312,7 @@ class StudyRun:
 
 
 def _think(solver: Solver, answer: SimpleQueue[list[Point] | BaseException]) -> None:
-    """Puts what a solver asks for, or the exception that it raises, into ``answer``."""
+    """Put what a solver asks for, or the exception that it raises, into ``answer``."""
     try:
         answer.put(solver.ask())
     except BaseException as error:
