@@ -7,8 +7,9 @@ import pytest
 
 import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario
-from vtbdrake.state import ArchiveError
+from vtbdrake.state import ArchiveError, SnapshotError
 from vtbdrake.state.archive import write_archive
+from vtbdrake.testbed import DpsAlone
 
 THETA = "sim.sys.Pendulum.theta.position"
 OMEGA = "sim.sys.Pendulum.theta.velocity"
@@ -221,3 +222,13 @@ def test_a_sweep_of_failures_has_no_best_point():
     assert sweep.failed.all()
     with pytest.raises(ValueError, match="no point .* the first failure: "):
         sweep.best()
+
+
+def test_a_start_that_does_not_fit_is_refused_at_once():
+    scenario = _problem().scenario
+    alone = DpsAlone(scenario)
+    with pytest.raises(SnapshotError, match="the snapshot is of a DPS alone, without a world"):
+        _problem(start=alone.snapshot(alone.default_context()))
+    other = AcrobotScenario().build()
+    with pytest.raises(SnapshotError, match="the snapshot is of another scenario"):
+        _problem(start=other.snapshot(other.default_context()))

@@ -6,6 +6,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
+from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import PoseRelay
 from vtbdrake.state import VariableError, discrete_state
@@ -46,6 +47,23 @@ def _world(builder, sensor=None, actuator=None):
         (lambda: Signal("y", size=2, rate=0.0), "rate limit must be positive"),
         (lambda: Signal("y", size=2, idle=float("nan")), "its idle has a NaN"),
         (lambda: Signal("y", size=2, max_age=0.0), "max_age must be positive"),
+        (lambda: Signal("y", size=2, max_age="1 s"), "max_age must be positive, in s, not '1 s'"),
+        (
+            lambda: Signal("y", size=2, lower=0.0, idle=[1.0, -0.5]),
+            r"its idle \[1.0, -0.5\] lies outside its limits, 0.0",
+        ),
+        (lambda: Signal("y", size=2, upper=[1.0, 2.0], default=1.5), "its default 1.5 lies outside its limits"),
+        (lambda: Signal("y", size=2, lower="low"), "its lower must be a number or several, not 'low'"),
+        (lambda: Signal("y", size=2.5), "at least one entry, not 2.5"),
+        (lambda: Signal("y", size="2"), "at least one entry, not '2'"),
+        (lambda: Signal("y", model_value=RigidTransform(), lower=0.0), "y is abstract: only a vector has a lower"),
+        (lambda: Signal("y", model_value=RigidTransform(), rate=[1.0]), "y is abstract: only a vector has a rate"),
+        (lambda: Signal("y", model_value=RigidTransform(), idle=0.0), "y carries a RigidTransform, not a float"),
+        (
+            lambda: Signal("y", model_value=ImageRgba8U(4, 3), idle=ImageRgba8U(3, 4)),
+            "images of 4 x 3 pixels, not one of",
+        ),
+        (lambda: Interface(["y"], []), r"an interface's sense is a list of Signal\(...\), but has 'y'"),
     ],
 )
 def test_an_interface_that_makes_no_sense_is_refused(make, message):
@@ -81,6 +99,7 @@ def test_an_input_of_the_dps_that_is_no_signal_is_refused():
     [
         ({"sensor": ConstantVectorSource([1.0])}, "signal y has 2 entries, but the port y0 of sim.sense.y has 1"),
         ({"sensor": ConstantValueSource(Value("a"))}, "signal y is vector, but the port y0 of sim.sense.y is abstract"),
+        ({"sensor": PassThrough(Value(ImageRgba8U(4, 3)))}, "y is vector, but"),
         ({"actuator": PassThrough(4)}, "signal u has 2 entries, but the port u of sim.act.u has 4"),
     ],
 )
@@ -97,6 +116,39 @@ def test_an_abstract_signal_of_another_type_is_refused():
         SignalError, match="seen carries a RigidTransform, but the port y0 of sim.sense.seen carries a str"
     ):
         builder.sim_sensor("seen", source.get_output_port())
+
+
+def test_an_image_of_another_size_is_refused_unless_the_signal_has_none():
+    for model in (ImageRgba8U(640, 480), ImageRgba8U()):
+        builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=model)], []))
+        source = builder.add("sense", "seen", ConstantValueSource(Value(ImageRgba8U(320, 240))))
+        if model.width():
+            with pytest.raises(SignalError, match="images of 640 x 480 pixels, but the port y0 .* of 320 x 240 pixels"):
+                builder.sim_sensor("seen", source.get_output_port())
+        else:
+            builder.sim_sensor("seen", source.get_output_port())
+
+
+@pytest.mark.parametrize("nothing", [None, DiagramBuilder(), "a DPS"])
+def test_what_is_no_system_is_refused(nothing):
+    builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
+    with pytest.raises(SignalError, match="the DPS is a System, not .*: does make_dps return it, built?"):
+        builder.set_dps(nothing)
+    with pytest.raises(ValueError, match="sim.sys.part is a System, not "):
+        builder.add("sys", "part", nothing)
+    with pytest.raises(SignalError, match="the sensor signal y takes an OutputPort of a system, not "):
+        builder.sim_sensor("y", nothing)
+    with pytest.raises(SignalError, match="the actuator signal u takes an InputPort of a system, not "):
+        builder.sim_actuator("u", PassThrough(2).get_output_port())
+    with pytest.raises(SignalError, match="has an Interface.sense, act, commands., not None"):
+        VirtualTestbedBuilder(None)
+
+
+def test_a_second_plant_is_refused():
+    builder = VirtualTestbedBuilder(Interface([], []))
+    builder.add_plant()
+    with pytest.raises(ValueError, match="has a plant already"):
+        builder.add_plant()
 
 
 def test_what_is_missing_is_named():

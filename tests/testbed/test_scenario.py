@@ -2,13 +2,14 @@
 
 import os
 import pickle
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError
-from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
+from vtbdrake.testbed import DpsAlone, ScenarioError, SimulatorFields, load_scenario
 
 NAME = "tests.testbeds:AcrobotScenario"
 # Ten lines that stand for ten thousand million entries.
@@ -33,8 +34,13 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (f"{NAME}:\n  perod: 0.1\n", "perod"),
-        (f"{NAME}:\n  simulator:\n    acuracy: 0.1\n", "acuracy"),
+        (f"{NAME}:\n  perod: 0.1\n", "line 2: AcrobotScenario has no field 'perod'; did you mean period"),
+        (
+            f"{NAME}:\n  period: 0.1\n  simulator:\n    acuracy: 0.1\n",
+            "line 4: SimulatorFields has no field 'simulator.acuracy'; did you mean accuracy",
+        ),
+        (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator, period, time_step"),
+        (f"{NAME}:\n  simulator: &a\n    <<: {{acuracy: 0.1}}\n", "'simulator.acuracy'"),
         (f"{NAME}:\n  period: 0.1\n  period: 0.2\n", "the key 'period' twice"),
         (f"{NAME}:\n  period: fast\n", "fast"),
         (f"{NAME}:\n  period: .nan\n", "period must be finite"),
@@ -79,6 +85,107 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "s.yaml")
     with pytest.raises(ScenarioError, match="no file of YAML"):
         load_scenario(tmp_path / "s.yaml")
+
+
+@dataclass
+class Rock:
+    radius: float = 0.1
+
+
+@dataclass
+class Boulder:
+    radius: float = 1.0
+    cracks: list[Rock] = field(default_factory=list)
+
+
+@dataclass
+class RockyScenario(AcrobotScenario):
+    rocks: list[Rock] = field(default_factory=list)
+    named: dict[str, Rock] = field(default_factory=dict)
+    largest: Rock | Boulder | None = None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rocks: [{radius: 0.1}, {radios: 0.2}]", "Rock has no field 'rocks.radios'; did you mean radius"),
+        (
+            "named: {one: {radius: 0.1}, two: {radios: 0.2}}",
+            "Rock has no field 'named.two.radios'; did you mean radius",
+        ),
+        ("largest: !Boulder {cracks: [{radios: 0.2}]}", "Rock has no field 'largest.cracks.radios'"),
+        ("largest: {cracks: []}", "Rock has no field 'largest.cracks'"),
+    ],
+)
+def test_a_misspelt_key_is_found_at_every_level(tmp_path, text, message):
+    (tmp_path / "s.yaml").write_text(f"{__name__}:RockyScenario:\n  {text}\n")
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario(tmp_path / "s.yaml")
+
+
+def test_what_is_spelt_right_at_every_level_is_read(tmp_path):
+    text = "rocks: [{radius: 0.2}]\n  named: {one: {radius: 0.3}}\n  largest: !Boulder {cracks: [{radius: 0.4}]}"
+    (tmp_path / "s.yaml").write_text(f"{__name__}:RockyScenario:\n  {text}\n")
+    scenario = load_scenario(tmp_path / "s.yaml")
+    assert scenario.rocks == [Rock(0.2)] and scenario.named == {"one": Rock(0.3)}
+    assert scenario.largest == Boulder(1.0, [Rock(0.4)])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"period": "0.1"}, "AcrobotScenario.period takes a value of type float, not '0.1' of type str"),
+        ({"period": [0.1]}, "AcrobotScenario.period takes a value of type float"),
+        ({"simulator": SimulatorFields(accuracy="fine")}, "simulator.accuracy takes a value of type float, not 'fine'"),
+        ({"simulator": SimulatorFields(use_error_control=1)}, "use_error_control takes a value of type bool, not 1"),
+        ({"simulator": SimulatorFields(integration_scheme=None)}, "integration_scheme is one of"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_when_the_testbed_is_built(values, message):
+    with pytest.raises(ScenarioError, match=message):
+        AcrobotScenario(**values).build()
+    AcrobotScenario(period=np.float64(0.02)).validate()
+
+
+def test_a_context_of_another_build_is_refused():
+    scenario = PendulumScenario()
+    testbed, other = scenario.build(), scenario.build()
+    foreign = other.default_context()
+    own = testbed.default_context()
+    alone = DpsAlone(scenario)
+    for use in (
+        lambda context: testbed.read(context, "time"),
+        lambda context: testbed.write(context, {"u.angle": 0.1}),
+        testbed.snapshot,
+        lambda context: testbed.restore(context, testbed.snapshot(own)),
+        testbed.simulator,
+        testbed.positions,
+        lambda context: testbed.switch(context, "sim"),
+        testbed.start_from_belief,
+        lambda context: alone.restore(context, testbed.snapshot(own)),
+    ):
+        for context in (foreign, testbed.plant.GetMyContextFromRoot(own)):
+            with pytest.raises(ValueError, match="no context of this testbed, but of another one"):
+                use(context)
+
+
+def test_values_that_are_no_mapping_are_refused():
+    testbed = PendulumScenario().build()
+    with pytest.raises(ValueError, match=r"by {address: value, ...}, not by \['u.angle', 0.1\]"):
+        testbed.write(testbed.default_context(), ["u.angle", 0.1])
+
+
+@pytest.mark.parametrize("at", [0.0, 0.1])
+def test_cenic_is_not_asked_for_a_step_of_no_length(at):
+    testbed = PendulumScenario(simulator=SimulatorFields("cenic", accuracy=1e-3)).build()
+    simulator = testbed.simulator()
+    if at:
+        simulator.AdvanceTo(at)
+    for step in (simulator.AdvancePendingEvents, lambda: simulator.AdvanceTo(at)):
+        with pytest.raises(ValueError, match=f"at {at} s already, and CENIC takes no step of length zero"):
+            step()
+    simulator.AdvanceTo(at + 0.1)
+    assert simulator.get_context().get_time() == at + 0.1
 
 
 def test_a_scenario_that_is_not_there_is_refused(tmp_path):

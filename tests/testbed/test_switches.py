@@ -316,3 +316,12 @@ def test_switch_positions_are_part_of_the_state():
     other.copier_from(testbed).copy(context, copied)
     for target in (restored, copied):
         assert other.positions(target) == {"sense": {"joint_state": "real"}, "act": {"torque": "twin"}}
+
+
+def test_what_does_not_fit_is_not_switched_to():
+    testbed = AcrobotScenario().build()
+    context = testbed.default_context()
+    testbed.diagram.GetInputPort("real.sense.joint_state").FixValue(context, [0.0, 0.0, np.nan, 0.0])
+    with pytest.raises(ValueError, match="signal joint_state: entry 2 is NaN; what is not known is not fed"):
+        testbed.switch(context, "real")
+    assert set(testbed.positions(context)["act"].values()) == {"sim"}

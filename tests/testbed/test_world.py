@@ -115,3 +115,19 @@ def test_world_that_lacks_a_sensor_is_refused() -> None:
 
     with pytest.raises(SignalError, match="no simulated sensor offers seen"):
         WorldAlone(Blind())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("torque", [np.nan], "signal torque: entry 0 is NaN"),
+        ("torque", np.nan, "signal torque: entry 0 is NaN"),
+        ("torque", [1.0, 2.0], r"signal torque has 1 entries, not the shape \(2,\)"),
+        ("torque", "much", "signal torque"),
+        ("torqe", 1.0, "no actuator signal 'torqe'; it has: torque"),
+    ],
+)
+def test_a_command_that_does_not_fit_is_refused(name, value, message):
+    world = WorldAlone(AcrobotScenario())
+    with pytest.raises(SignalError, match=message):
+        world.command(world.default_context(), name, value)

@@ -53,7 +53,8 @@ class Problem:
 
     Raises:
         ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets what is varied,
-            the horizon, threshold or sample period makes no sense, or an argument is of another kind than it says.
+            the horizon, threshold or sample period makes no sense, the start is of another scenario or of a DPS alone,
+            or an argument is of another kind than it says.
     """
 
     def __init__(
@@ -96,6 +97,8 @@ class Problem:
             raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
         self.scenario = self.task.scenario
         self.testbed: VirtualTestbed = self.scenario.build()
+        if start is not None:
+            self.testbed.restore(self.testbed.default_context(), start)
         self._testbeds = Testbeds(self.testbed)
         self._check()
 

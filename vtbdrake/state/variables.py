@@ -82,8 +82,10 @@ class Variables(Mapping[str, Variable]):
         first (a mass, which scales the inertia).
 
         Raises:
-            VariableError: a value is refused, or an array is given both whole and by entries.
+            VariableError: ``values`` is no mapping, a value is refused, or an array is given both whole and by entries.
         """
+        if not isinstance(values, Mapping):
+            raise VariableError(f"variables are set by {{address: value, ...}}, not by {values!r}")
         checked = {address: self[address].check(value) for address, value in values.items()}
         whole: dict[str, Any] = {}
         for address, value in checked.items():

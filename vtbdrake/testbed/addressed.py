@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
@@ -21,6 +21,25 @@ from vtbdrake.testbed.switch import BOARD
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
+
+
+class _CenicSimulator(Simulator):
+    """Drake's Simulator, but where CENIC would end the process, it raises: for a step of length zero."""
+
+    def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        self._refuse_no_step(boundary_time)
+        return super().AdvanceTo(boundary_time, interruptible)
+
+    def AdvancePendingEvents(self) -> SimulatorStatus:
+        self._refuse_no_step(self.get_context().get_time())
+        return super().AdvancePendingEvents()
+
+    def _refuse_no_step(self, boundary_time: float) -> None:
+        if boundary_time == self.get_context().get_time():
+            raise ValueError(
+                f"the simulation is at {boundary_time!r} s already, and CENIC takes no step of length zero: leave the "
+                "call out, or advance to a later time"
+            )
 
 
 class AddressedDiagram:
@@ -60,14 +79,34 @@ class AddressedDiagram:
             context.SetAccuracy(self.simulator_fields.accuracy)
         return context
 
+    def check_context(self, context: Context) -> None:
+        """
+        Raises:
+            ValueError: ``context`` is not one of the whole diagram's.
+        """
+        try:
+            self.diagram.ValidateContext(context)
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(
+                "this is no context of this testbed, but of another one (or another build, or of a part), or none at "
+                "all: make one with default_context(); a snapshot takes a state from one testbed to another"
+            ) from error
+
     def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
         """A new Drake Simulator of the testbed with its own integrator settings.
 
         Args:
             restored: ``context`` continues another one; initialization events, which would overwrite its state, have
                 happened before.
+
+        Raises:
+            ValueError: ``context`` is not one of this testbed's.
         """
-        simulator = Simulator(self.diagram, context if context is not None else self.default_context())
+        if context is None:
+            context = self.default_context()
+        self.check_context(context)
+        kind = _CenicSimulator if self.simulator_fields.integration_scheme == "cenic" else Simulator
+        simulator = kind(self.diagram, context)
         self._give_integrator(simulator)
         if restored:
             simulator.Initialize(InitializeParams(suppress_initialization_events=True))
@@ -121,10 +160,16 @@ class AddressedDiagram:
 
     def read(self, context: Context, address: str) -> Any:
         """The value of a variable, or of an output port (``path.port``), in ``context``."""
+        self.check_context(context)
         return self.reader(address)(context)
 
     def write(self, context: Context, values: Mapping[str, Any]) -> None:
-        """Sets variables by address."""
+        """Sets variables by address.
+
+        Raises:
+            ValueError: there is no such variable, or it does not take the value. Nothing has been set then.
+        """
+        self.check_context(context)
         self._variables.write(context, values)
 
     def reader(self, address: str) -> Callable[[Context], Any]:
@@ -157,14 +202,19 @@ class AddressedDiagram:
 
     def snapshot(self, context: Context) -> Snapshot:
         """s(t) as named arrays."""
+        self.check_context(context)
         record = self.scenario.record() if self.scenario is not None else {}
         return snapshots.take(self.diagram, context, self._variables, scenario=record)
 
     def check_scenario(self, snapshot: Snapshot) -> None:
         """
         Raises:
-            SnapshotError: the snapshot is of another scenario.
+            SnapshotError: the snapshot is none, or is of another scenario.
         """
+        if not isinstance(snapshot, Snapshot):
+            raise SnapshotError(
+                f"a state is restored from a snapshot, by Snapshot.load(file), say, not from {snapshot!r}"
+            )
         if self.scenario is None or not snapshot.scenario:
             return
         mine, theirs = self.scenario.record(), snapshot.scenario

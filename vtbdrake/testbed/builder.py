@@ -56,6 +56,10 @@ class VirtualTestbedBuilder:
     """
 
     def __init__(self, interface: Interface, *, simulator: SimulatorFields | None = None) -> None:
+        if not isinstance(interface, Interface):
+            raise SignalError(
+                f"a testbed has an Interface(sense, act, commands), not {interface!r}: does interface() return it?"
+            )
         self.interface = interface
         self.simulator = simulator or SimulatorFields()
         self.builder = DiagramBuilder()
@@ -73,10 +77,14 @@ class VirtualTestbedBuilder:
         """Adds a part of the simulated world as ``sim.<role>.<name>``; role is sense, sys, act or env."""
         if role not in ROLES:
             raise ValueError(f"the role of {name} is one of {', '.join(ROLES)}, not {role!r}")
+        if not isinstance(system, System):
+            raise ValueError(f"sim.{role}.{name} is a System, not {system!r}")
         return self.builder.AddNamedSystem(f"sim.{role}.{name}", system)
 
     def add_plant(self, fields: PlantFields | None = None) -> tuple[MultibodyPlant, SceneGraph]:
         """Adds the MultibodyPlant, a direct child named ``plant`` as CENIC wants it, and its SceneGraph."""
+        if self.plant is not None:
+            raise ValueError("the testbed has a plant already: add what is to touch its bodies to that one")
         from pydrake.multibody.plant import AddMultibodyPlant
 
         self.plant, self.scene_graph = AddMultibodyPlant((fields or PlantFields()).config(), self.builder)
@@ -95,30 +103,45 @@ class VirtualTestbedBuilder:
 
     def sim_sensor(self, name: str, port: OutputPort) -> None:
         """The simulated sensor signal ``name`` comes from ``port``."""
-        self._claim(self.interface.sense, name, "sensor", self.sensors).check_port(port, _owner(port))
+        self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort).check_port(port, _owner(port))
         self.sensors[name] = port
 
     def sim_actuator(self, name: str, port: InputPort) -> None:
         """The simulated actuator signal ``name`` goes to ``port``."""
-        self._claim(self.interface.act, name, "actuator", self.actuators).check_port(port, _owner(port))
+        self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort).check_port(
+            port, _owner(port)
+        )
         self.actuators[name] = port
 
     def command(self, name: str, port: OutputPort) -> None:
         """The command ``name`` comes from ``port``, instead of a constant that is the variable ``u.<name>``."""
-        self._claim(self.interface.commands, name, "command", self._commands).check_port(port, _owner(port))
+        self._claim(self.interface.commands, name, "command", self._commands, port, OutputPort).check_port(
+            port, _owner(port)
+        )
         self._commands[name] = port
 
     @staticmethod
-    def _claim(signals: Sequence[Signal], name: str, kind: str, taken: Mapping[str, object]) -> Signal:
+    def _claim(
+        signals: Sequence[Signal],
+        name: str,
+        kind: str,
+        taken: Mapping[str, object],
+        port: InputPort | OutputPort,
+        kind_of_port: type,
+    ) -> Signal:
         known = {signal.name: signal for signal in signals}
         if name not in known:
             raise SignalError(f"the interface has no {kind} signal {name!r}; it has: {', '.join(known) or 'none'}")
+        if not isinstance(port, kind_of_port):
+            raise SignalError(f"the {kind} signal {name} takes an {kind_of_port.__name__} of a system, not {port!r}")
         if name in taken:
             raise SignalError(f"two ports are given for the {kind} signal {name}")
         return known[name]
 
     def set_dps(self, dps: S) -> S:
         """Adds the data processing system: one System whose ports bear the names of the interface's signals."""
+        if not isinstance(dps, System):
+            raise SignalError(f"the DPS is a System, not {dps!r}: does make_dps return it, built?")
         if self._dps is not None:
             raise SignalError("the testbed has a DPS already; put several parts into one Diagram")
         self._check_ports(dps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import importlib
 import math
 import os
@@ -13,7 +14,8 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from inspect import isabstract
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, get_args, get_type_hints
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Self, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -69,8 +71,13 @@ class Scenario(ABC):
         """Looks at the values as they are when the testbed is built.
 
         Raises:
-            ScenarioError: a number is not finite, or the integration scheme is unknown. Subclasses add their own.
+            ScenarioError: a value is of another type than its field, a number is not finite, or the integration scheme
+                is unknown. Subclasses add their own.
         """
+        for name, owner, kinds in _scalar_fields(self):
+            value = getattr(owner, name.rpartition(".")[2])
+            if value is not None:  # A field that may be None has a type like float | None.
+                _scalar(value, kinds, f"{type(self).__name__}.{name}")
         for name, value in _flat(asdict(self)):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ScenarioError(f"{type(self).__name__}.{name} must be finite, not {value}")
@@ -241,6 +248,7 @@ def _load_yaml(path: Path, named: str) -> Scenario:
     try:
         schema = scenario_class(named or name)
         _resolve_types(schema)
+        _refuse_unknown(document.value[0][1], schema)
         return yaml_load_typed(schema=schema, filename=path, child_name=name)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         if isinstance(error, ScenarioError):
@@ -285,6 +293,46 @@ def _check_nodes(document: yaml.Node, path: Path) -> None:
             waiting += [value for _, value in node.value]
         elif isinstance(node, yaml.SequenceNode):
             waiting += node.value
+
+
+def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
+    """
+    Args:
+        node: what is given for a field.
+        hint: the type of that field.
+        name: its dotted name.
+
+    Raises:
+        ScenarioError: a key is no field of the dataclass that is expected there.
+    """
+    alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
+    inside = Union[inside] if inside else Any  # noqa: UP007
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_unknown(item, inside, name)
+        return
+    if not isinstance(node, yaml.MappingNode):
+        return
+    # Of several dataclasses, a tag names the one that is meant, and the first one needs no tag.
+    classes = [part for part in alternatives if isinstance(part, type) and is_dataclass(part)]
+    expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
+    known = {} if expected is None else {item.name: item.type for item in fields(expected)}
+    for key, value in node.value:
+        below = f"{name}.{key.value}".lstrip(".")
+        if expected is None:  # A dict, say.
+            _refuse_unknown(value, inside, below)
+        elif key.value == "<<":  # Keys that are taken over from elsewhere in the file.
+            for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                _refuse_unknown(merged, expected, name)
+        elif key.value in known:
+            _refuse_unknown(value, known[key.value], below)
+        else:
+            near = difflib.get_close_matches(key.value, known, n=1, cutoff=0.5)
+            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known)}"
+            raise ScenarioError(
+                f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}; {hint_text}"
+            )
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -24,7 +24,8 @@ class Signal:
     Attributes:
         name: the name of the port that carries it, on every side.
         size: entries of a vector signal; leave it out for an abstract one.
-        model_value: a value of an abstract signal's type (an image, a pose, any object); None for a vector one.
+        model_value: a value of an abstract signal's type (an image, a pose, any object); None for a vector one. All
+            images have its size, unless it has none.
         unit: SI unit of all entries; ``"1"`` if it has none.
         lower, upper: limits of its entries, scalars or arrays of shape (size,).
         rate: the largest change per second of an entry.
@@ -53,18 +54,24 @@ class Signal:
             raise SignalError(f"signal {self.name} is either a vector (give size=) or abstract (give model_value=)")
         if self.size is not None:
             self._check_vector()
-        if not self.max_age > 0:
-            raise SignalError(f"signal {self.name}: max_age must be positive, not {self.max_age} s")
+        else:
+            self._check_abstract()
+        if not isinstance(self.max_age, int | float | np.number) or not self.max_age > 0:
+            raise SignalError(f"signal {self.name}: max_age must be positive, in s, not {self.max_age!r}")
 
     def _check_vector(self) -> None:
-        assert self.size is not None
-        if self.size < 1:
-            raise SignalError(f"signal {self.name} must have at least one entry, not {self.size}")
+        if not isinstance(self.size, int | np.integer) or isinstance(self.size, bool) or self.size < 1:
+            raise SignalError(f"signal {self.name} must have at least one entry, not {self.size!r}")
         for name in ("lower", "upper", "rate", "acceleration", "idle", "default"):
             value = getattr(self, name)
             if value is None:
                 continue
-            array = np.asarray(value, dtype=float)
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise SignalError(
+                    f"signal {self.name}: its {name} must be a number or several, not {value!r}"
+                ) from error
             if array.shape not in ((), (self.size,)):
                 raise SignalError(f"signal {self.name} has {self.size} entries, but its {name} has shape {array.shape}")
             if np.isnan(array).any():
@@ -74,6 +81,23 @@ class Signal:
         for name in ("rate", "acceleration"):
             if (np.asarray(getattr(self, name)) <= 0).any():
                 raise SignalError(f"signal {self.name}: its {name} limit must be positive, not {getattr(self, name)}")
+        for name in ("idle", "default"):
+            value = getattr(self, name)
+            if value is not None and ((value < np.asarray(self.lower)) | (value > np.asarray(self.upper))).any():
+                raise SignalError(
+                    f"signal {self.name}: its {name} {value} lies outside its limits, {self.lower} to {self.upper}"
+                )
+
+    def _check_abstract(self) -> None:
+        for name, nothing in (("lower", -inf), ("upper", inf), ("rate", inf), ("acceleration", inf), ("default", None)):
+            value = getattr(self, name)
+            if value is not None and not (np.ndim(value) == 0 and value == nothing):
+                raise SignalError(f"signal {self.name} is abstract: only a vector has a {name}")
+        if self.idle is not None:
+            try:
+                self.check_value(self.idle)
+            except SignalError as error:
+                raise SignalError(f"the idle command does not fit: {error}") from None
 
     @property
     def is_vector(self) -> bool:
@@ -87,6 +111,29 @@ class Signal:
     def abstract_value(self) -> AbstractValue:
         """A new container of the signal's abstract type."""
         return Value(self.model_value)
+
+    def check_value(self, value: Any) -> None:
+        """
+        Raises:
+            SignalError: ``value`` cannot be one of the signal's: it has another size or type, or an entry is NaN.
+        """
+        if self.is_vector:
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise SignalError(f"signal {self.name} has {self.size} numbers, not {value!r}") from error
+            if array.shape != (self.size,):
+                raise SignalError(f"signal {self.name} has {self.size} entries, not the shape {array.shape}")
+            if np.isnan(array).any():
+                raise SignalError(
+                    f"signal {self.name}: entry {int(np.argmax(np.isnan(array)))} is NaN; what is not known is not fed"
+                )
+            return
+        model = self.abstract_value().get_value()
+        if not isinstance(value, type(model)):
+            raise SignalError(f"signal {self.name} carries a {type(model).__name__}, not a {type(value).__name__}")
+        if _pixels(model) not in (_ANY_SIZE, _pixels(value)):
+            raise SignalError(f"signal {self.name} carries images of {_pixels(model)}, not one of {_pixels(value)}")
 
     def check_port(self, port: InputPort | OutputPort, owner: str) -> None:
         """
@@ -106,12 +153,26 @@ class Signal:
                 f"{port.size()}"
             )
         if not is_vector and isinstance(port, OutputPort):
-            found, expected = type(port.Allocate().get_value()), type(self.abstract_value().get_value())
-            if found is not expected:
+            found, expected = port.Allocate().get_value(), self.abstract_value().get_value()
+            if type(found) is not type(expected):
                 raise SignalError(
-                    f"signal {self.name} carries a {expected.__name__}, but the port {port.get_name()} of {owner} "
-                    f"carries a {found.__name__}"
+                    f"signal {self.name} carries a {type(expected).__name__}, but the port {port.get_name()} of "
+                    f"{owner} carries a {type(found).__name__}"
                 )
+            if _ANY_SIZE not in (_pixels(expected), _pixels(found)) and _pixels(expected) != _pixels(found):
+                raise SignalError(
+                    f"signal {self.name} carries images of {_pixels(expected)}, but the port {port.get_name()} of "
+                    f"{owner} those of {_pixels(found)}: give a model_value of that size"
+                )
+
+
+# An image of no size stands for those of any size.
+_ANY_SIZE = "0 x 0 pixels"
+
+
+def _pixels(value: Any) -> str:
+    """The size of one of Drake's images; empty for anything else."""
+    return f"{value.width()} x {value.height()} pixels" if hasattr(value, "mutable_data") else ""
 
 
 @dataclass(frozen=True)
@@ -128,7 +189,10 @@ class Interface:
 
     def __post_init__(self) -> None:
         for name in ("sense", "act", "commands"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+            signals = (given,) if isinstance(given := getattr(self, name), Signal) else tuple(given)
+            if wrong := [item for item in signals if not isinstance(item, Signal)]:
+                raise SignalError(f"an interface's {name} is a list of Signal(...), but has {wrong[0]!r}")
+            object.__setattr__(self, name, signals)
         self._refuse_twins([*self.sense, *self.commands], "sensor signals and commands")
         self._refuse_twins(self.act, "actuator signals")
         for signal in self.act:

@@ -89,6 +89,7 @@ class DpsAlone(AddressedDiagram):
         Raises:
             SnapshotError: it is of another scenario, or of a DPS that is built in another way.
         """
+        self.check_context(context)
         self.check_scenario(snapshot)
         snapshots.apply(snapshot, self.diagram, context, self._variables, only=_is_dps)
         commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]

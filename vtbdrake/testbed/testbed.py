@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state import Snapshot, Variable, collect
+from vtbdrake.state import Snapshot, SnapshotError, Variable, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -86,6 +86,7 @@ class VirtualTestbed(AddressedDiagram):
         self.plant = plant
         self.scene_graph = scene_graph
         self.visualized = visualized
+        self._signals = {signal.name: signal for signal in interface.sense}
         self._sense = dict(sense)
         self._act = dict(act)
         self._beliefs = beliefs
@@ -96,6 +97,7 @@ class VirtualTestbed(AddressedDiagram):
 
     def positions(self, context: Context) -> dict[str, dict[str, str]]:
         """Where every switch stands: ``{"sense": {signal: position}, "act": {signal: position}}``."""
+        self.check_context(context)
         sides = {"sense": self._sense, "act": self._act}
         return {side: {name: s.get(context) for name, s in switches.items()} for side, switches in sides.items()}
 
@@ -117,8 +119,9 @@ class VirtualTestbed(AddressedDiagram):
 
         Raises:
             ValueError: a mode, position or signal is unknown, or nothing feeds a sensor signal that would become
-                real. No switch has been thrown then.
+                real, or what feeds it is NaN or does not fit. No switch has been thrown then.
         """
+        self.check_context(context)
         if mode is not None:
             check_mode(mode)
             if sense is not None or act is not None:
@@ -137,6 +140,7 @@ class VirtualTestbed(AddressedDiagram):
                         f"nothing feeds real.sense.{name}: fix a value on that input port, or start a bridge, before "
                         "its switch is thrown to real"
                     )
+                self._signals[name].check_value(port.Eval(context))
         for selector, position in changes:
             selector.set(context, position)
 
@@ -162,7 +166,14 @@ class VirtualTestbed(AddressedDiagram):
         Raises:
             SnapshotError: it is of another scenario, or of a testbed that is built in another way.
         """
+        self.check_context(context)
         self.check_scenario(snapshot)
+        switches = [selector.name for selector in [*self._sense.values(), *self._act.values()]]
+        if switches and not any(name in snapshot.values for name in switches):
+            raise SnapshotError(
+                "the snapshot is of a DPS alone, without a world: take one of a whole testbed, or restore this one "
+                "by DpsAlone"
+            )
         snapshots.apply(snapshot, self.diagram, context, self._variables)
 
     @property
@@ -178,6 +189,7 @@ class VirtualTestbed(AddressedDiagram):
         Raises:
             ValueError: the testbed declares no belief, or a variable refuses what is believed of it.
         """
+        self.check_context(context)
         if not self._beliefs:
             raise ValueError("this testbed does not declare what of its DPS sets its simulated world (see `believe`)")
         self.write(

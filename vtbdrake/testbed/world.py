@@ -13,6 +13,7 @@ from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.feed import Feed
+from vtbdrake.testbed.signal import SignalError
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -71,11 +72,23 @@ class WorldAlone(AddressedDiagram):
         return context
 
     def command(self, context: Context, name: str, value: Any) -> None:
-        """Gives the simulated actuator ``name`` a command, which lasts until the next one."""
+        """Gives the simulated actuator ``name`` a command, which lasts until the next one.
+
+        Args:
+            value: an array of shape (size,), a scalar for all entries, or a value of an abstract signal.
+
+        Raises:
+            SignalError: there is no such actuator signal, or the value has another size or type, or a NaN.
+        """
+        if name not in self._actuators:
+            raise SignalError(f"the interface has no actuator signal {name!r}; it has: {', '.join(self._actuators)}")
         signal, _ = self._actuators[name]
-        vector = signal.is_vector and np.shape(value) != (signal.size,)
-        self.feed(context)(name, signal.vector(value) if vector else value)
+        if signal.is_vector and np.ndim(value) == 0:
+            value = np.broadcast_to(value, (signal.size,))
+        signal.check_value(value)
+        self.feed(context)(name, np.array(value, dtype=float) if signal.is_vector else value)
 
     def feed(self, context: Context) -> Feed:
-        """What commands the simulated actuators of one context again and again, at the lowest cost."""
+        """What commands the simulated actuators of one context again and again, unchecked, at the lowest cost."""
+        self.check_context(context)
         return Feed(self._actuators, context)
