@@ -84,7 +84,7 @@ class WorldAlone(AddressedDiagram):
             raise SignalError(f"the interface has no actuator signal {name!r}; it has: {', '.join(self._actuators)}")
         signal, _ = self._actuators[name]
         if signal.is_vector and np.ndim(value) == 0:
-            value = np.broadcast_to(value, (signal.size,))
+            value = np.broadcast_to(value, signal.vector(0.0).shape)
         signal.check_value(value)
         self.feed(context)(name, np.array(value, dtype=float) if signal.is_vector else value)
 
