@@ -162,6 +162,16 @@ def test_a_growth_that_is_no_size_is_refused(growth):
         ProcessExecutor(1, growth=growth)
 
 
+@pytest.mark.parametrize("finished", [1, 2])
+def test_a_call_that_its_executor_does_not_outlive_is_an_error(finished):
+    with ProcessExecutor(1) as executor:
+        rollouts = executor.run(ANGLE, POINTS)
+        for _ in range(finished):
+            next(rollouts)
+    with pytest.raises(WorkerError, match="closed while it had rollouts to run"):
+        list(rollouts)
+
+
 def test_two_calls_at_a_time_of_processes_are_refused():
     with ProcessExecutor(1) as executor:
         first = executor.run(ANGLE, POINTS)

@@ -159,9 +159,13 @@ class ProcessExecutor(Executor):
         self.start(len(points))
         try:
             self._hand_out(blob, waiting, points)
-            while waiting or any(worker.jobs for worker in self._workers):
+            left = len(points)
+            while left:
                 finished: list[tuple[int, RolloutResult]] = []
-                for worker, index, reply in self._replies():
+                replies = self._replies()
+                if not self._workers:
+                    raise WorkerError("the executor was closed while it had rollouts to run")
+                for worker, index, reply in replies:
                     if isinstance(reply, RolloutResult):
                         finished.append((index, reply))
                     elif isinstance(reply, str):
@@ -179,6 +183,7 @@ class ProcessExecutor(Executor):
                 if error is None:
                     # Workers go on while the caller looks at what is finished.
                     self._hand_out(blob, waiting, points)
+                left -= len(finished)
                 yield from finished
                 if error is not None:
                     raise error
