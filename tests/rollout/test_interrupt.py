@@ -101,6 +101,8 @@ def test_ctrl_c_while_a_testbed_is_built_is_not_a_failed_build(at):
     task = RolloutTask(InterruptedBuild(), 0.1, Quality(abs, THETA))
     with SerialExecutor() as executor, pytest.raises(KeyboardInterrupt):
         list(executor.run(task, [{"scenario.at": at}]))
+    with SerialExecutor() as executor, pytest.raises(KeyboardInterrupt):
+        list(executor.run(RolloutTask(InterruptedBuild(at=at), 0.1, Quality(abs, THETA)), [{}]))
 
 
 def test_no_interrupt_of_many_is_lost():

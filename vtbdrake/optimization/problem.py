@@ -22,6 +22,7 @@ from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.casadi_function import ProblemFunction
@@ -215,7 +216,8 @@ class Problem:
 
         ends = [{p.address: p.ends[k] for p in self.parameters if not p.is_field} for k in (0, -1)]
         points = [{**split(self.conditions[k])[1], **ends[k]} for k in (0, -1)]
-        found = check_rollouts(self.task, self.testbed, points)
+        with Interruptible():
+            found = check_rollouts(self.task, self.testbed, points)
         travelling = []
         for values in (*self.conditions, *({p.address: end} for p in self.parameters for end in p.ends)):
             try:

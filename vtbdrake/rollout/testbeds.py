@@ -117,7 +117,8 @@ class Runners:
         # A task is its own key: to compare what it holds would take longer than to run it.
         key = (id(task), _key(fields))
         if key not in mine:
-            mine[key] = (task, self._make(task, fields))
+            with Interruptible():
+                mine[key] = (task, self._make(task, fields))
             for old in [k for k, (_, runner) in mine.items() if runner.testbed not in self._testbeds]:
                 del mine[old]
             if len(mine) > _RUNNERS:
@@ -132,8 +133,7 @@ class Runners:
             return RolloutRunner(task, self._testbeds.get(task.scenario))
         changed = replace(task, scenario=task.scenario.with_fields(fields))
         try:
-            with Interruptible():
-                testbed = self._testbeds.get(changed.scenario)
+            testbed = self._testbeds.get(changed.scenario)
         except ScenarioError:
             raise
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
