@@ -57,12 +57,10 @@ def test_it_asks_for_points_of_the_space_within_its_budget(name):
 EDGES = {
     "one number": ([Parameter("x", -1.0, 2.0)], 1, 0),
     "one number, constrained": ([Parameter("x", -1.0, 2.0)], 1, 1),
-    "two numbers": ([Parameter("x", -1.0, 2.0), Parameter("y", 1e-3, 2.0, log=True)], 1, 0),
     "two integers of few values": ([Parameter("i", 1, 2, integer=True), Parameter("j", 1, 3, integer=True)], 1, 0),
     "an integer on a logarithmic scale": ([Parameter("i", 1, 1000, integer=True, log=True)], 1, 0),
     "one choice": ([Choice("c", [1.0, 0.5])], 1, 0),
     "all kinds": ([Choice("c", [1.0, 0.5]), Parameter("i", 1, 3, integer=True), Parameter("x", -1.0, 2.0)], 1, 0),
-    "all kinds, constrained": ([Choice("c", [1.0, 0.5]), Parameter("x", -1.0, 2.0)], 1, 1),
     "a range without room": ([Parameter("x", 1.0, np.nextafter(1.0, 2.0)), Parameter("y", 0.0, 1.0)], 1, 0),
     "two objectives": ([Parameter("x", -1.0, 2.0)], 2, 0),
     "two objectives of integers, constrained": ([Parameter("i", 1, 9, integer=True)], 2, 1),

@@ -55,7 +55,7 @@ class Bayesian(BatchSolver):
     """
 
     def __init__(
-        self, search: Search, *, name: str, initial: int | None = None, batch: int = 4, memory: int = 150
+        self, search: Search, *, name: str, initial: int | None = None, batch: int = 4, memory: int = 100
     ) -> None:
         super().__init__(search, name=name)
         for option, given in (("initial", initial), ("batch", batch), ("memory", memory)):
