@@ -38,6 +38,8 @@ def payload(full: bool) -> Answer:
     static = static_limit(locked.testbed)
     simulated = locked.boundary(resolution=LOCKED_STEP, coarse=10.0, repeats=0)
     agrees = simulated.lower - LOCKED_STEP <= static <= simulated.upper + LOCKED_STEP
+    # The slower gait is beside the question: it shows where the order of the worlds comes from.
+    asked = [boundary for name, boundary in boundaries.items() if "stride" not in ENVIRONMENTS[name]]
     environments = "; ".join(f"{name} {_range(boundary)}" for name, boundary in boundaries.items())
     feet = "; ".join(f"{name} {limit:.1f} kg" for name, limit in statics(payload_problem().testbed).items())
     return Answer(
@@ -47,7 +49,7 @@ def payload(full: bool) -> Answer:
         unit="kg",
         interval=(moon.lower, moon.upper),
         paper=PAPER,
-        holds=agrees and all(isfinite(b.lower) and isfinite(b.upper) for b in boundaries.values()),
+        holds=agrees and all(isfinite(b.lower) and isfinite(b.upper) for b in asked),
         note=(
             "Stable in every rollout up to the first mass, and in none from some start phase at the second; undecided "
             f"between: {environments}. {len(moon.by_condition)} start phases on the moon, "
