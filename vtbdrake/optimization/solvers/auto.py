@@ -248,7 +248,7 @@ class Auto(BatchSolver):
             return
         if not self._changes or self._solver.name in ("start", MODEL, "sobol"):
             self._before += [*asked, *given]
-            values = [evaluation.values[0] for evaluation in asked if evaluation.feasible]
+            values = [evaluation.values[0] for evaluation in asked if evaluation.counts]
             self._spread = max(self._spread, max(values, default=0.0) - min(values, default=0.0))
         best = best_of([*asked, *([self._stage_best] if self._stage_best else [])])
         progress = self._progress(self._stage_best, best)
