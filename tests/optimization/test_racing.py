@@ -1,6 +1,7 @@
 """Racing: what it leaves out never changes the best point, whatever the kind of problem, risk and solver."""
 
 import importlib.util
+import random
 
 import numpy as np
 import pytest
@@ -253,3 +254,49 @@ def test_equal_points_are_judged_once():
     assert runs == [(a, 0), (a, 1)]
     judge.judge([a])
     assert len(runs) == 2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_budgets_racing_points_by_hand_and_interruptions_in_any_order_leave_a_study_whole(tmp_path, seed):
+    chance, rollouts, by_hand = random.Random(seed), 0, []
+    kind = chance.choice(list(QUALITIES))
+    solver = chance.choice(["sobol", "CMA-ES", "TPE", "LN_COBYLA", "differential-evolution", "latin-hypercube"])
+
+    def f(values):
+        x, c = values[THETA], round(values[DAMPING] / 0.01)
+        return None if x > 0.9 and c == 2 else (1.0 / (1.0 + abs(x - 0.4 - 0.05 * c)), (x - 0.7,))
+
+    def mean(trial):
+        """The mean of all conditions; None if a rollout fails or breaks the constraint."""
+        rows = [f({**trial.parameters, DAMPING: 0.01 * c}) for c in range(4)]
+        whole = all(row is not None and row[1][0] <= 0.0 for row in rows)
+        return sum(h for h, _ in rows) / 4.0 if whole else None
+
+    for _ in range(4):
+        rollouts += chance.randrange(1, 60)
+        stated = problem(4, "mean", quality=QUALITIES[kind], constraints=[LIMIT])
+        with stated.study(tmp_path / "a.db", solver=solver) as study:
+            given = [chance.random() for _ in range(chance.choice([0, 0, 1, 3]))]
+            study.add(*([x] for x in given))
+            by_hand += given
+            left = [chance.choice([5, 17, 10_000])]
+
+            def interrupted(values, left=left):
+                left[0] -= 1
+                if left[0] == 0:
+                    raise KeyboardInterrupt
+                return f(values)
+
+            racing = chance.choice([None, None, True, False])
+            study.run(rollouts=rollouts, racing=racing, executor=StatedExecutor(interrupted), progress=False)
+            study.run(rollouts=rollouts, executor=StatedExecutor(f), progress=False)
+            trials = study.trials
+            assert len(study) <= rollouts
+            assert len({(*t.parameters.values(), t.exact) for t in trials}) == len(trials)
+            truth = {t.number: h for t in trials if (h := mean(t)) is not None}
+            assert all(t.value == pytest.approx(truth[t.number]) for t in trials if t.counts)
+            if truth:
+                best = min(truth.values()) if kind == "minimized" else max(truth.values())
+                assert study.best.value == pytest.approx(best)
+            count = len(study)
+    assert count == rollouts or set(by_hand) <= {t.parameters[THETA] for t in trials}
