@@ -219,6 +219,18 @@ def test_what_racing_saves_goes_to_the_later_phases_of_auto():
     assert [method for _, method in solver.changes][:2] == ["bayesian", "LN_BOBYQA around the best"]
 
 
+def test_what_racing_dropped_is_no_start_of_a_local_search():
+    solver = make_solver("auto", SPHERE.space, budget=300)
+    while points := solver.ask():
+        if "around" in solver.method:
+            break
+        # Nothing bounds a quality without `upper`: what is dropped may be anything.
+        judged = [evaluation(p, SPHERE.cost) for p in points]
+        solver.tell([e if e.values[0] > -4.0 else replace(e, values=(np.inf,), exact=False) for e in judged])
+    solver.close()
+    assert SPHERE.cost(points[0]) < 0.1
+
+
 def test_auto_starts_anew_with_larger_populations_and_another_method():
     solver = make_solver("auto", ACKLEY.space, budget=2500)
     methods = []

@@ -25,12 +25,12 @@ def total_violation(evaluation: Evaluation) -> float:
 
 
 def rank_key(evaluation: Evaluation) -> tuple[int, float]:
-    """Sorts the evaluations of one objective, the best first."""
+    """Sorts the evaluations of one objective, the best first; what racing dropped comes after what was judged."""
     if not usable(evaluation):
-        return 2, 0.0
+        return 3, 0.0
     if not evaluation.feasible:
-        return 1, total_violation(evaluation)
-    return 0, -evaluation.values[0]
+        return 2, total_violation(evaluation)
+    return (0 if evaluation.exact else 1), -evaluation.values[0]
 
 
 def best_of(evaluations: Iterable[Evaluation]) -> Evaluation | None:
