@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
@@ -92,6 +94,75 @@ def test_what_is_no_answer_is_not_taken_for_one(hub: Hub, noise: bytes) -> None:
         with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
             bus.publish("VTB_WATCH_ANSWER", noise)
             rig.during(live.wait, 3, timeout=PATIENCE)
+
+
+@contextmanager
+def impostor(url: str, channel: str, answers: list[tuple[str, dict[str, Any]]]) -> Iterator[None]:
+    """Somebody who answers each request on a channel with the right id; ``ID`` in a channel stands for it, too."""
+    bus, stop = lcm.LCM(url), threading.Event()
+
+    def answer(_: str, data: bytes) -> None:
+        id = json.loads(data)["id"]
+        for where, content in answers:
+            bus.publish(where.replace("ID", id), json.dumps({"id": id, **content}).encode())
+
+    def serve() -> None:
+        while not stop.is_set():
+            bus.handle_timeout(20)
+
+    bus.subscribe(channel, answer)
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+NO_VALUES = [None, 3, [], {}, {"b": 1.0}, *({"a": value} for value in ("1", None, True, {}, [[1.0], 2.0], [None]))]
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "answer"),
+    [
+        *(("get", (["a"],), {"ok": True, "values": values}) for values in NO_VALUES),
+        ("get", (["a"],), {"ok": True}),
+        ("get", (["a"],), {"values": {"a": 1.0}}),
+        ("get", (["a"],), {"error": 3}),
+        ("set", ({"a": 1.0},), {"ok": False}),
+        ("set", ({"a": 1.0},), {"error": {"a": 1}}),
+        ("reset", (), {"ok": True}),
+        ("reset", (), {"ok": True, "released": "all"}),
+        ("reset", (), {"ok": True, "released": [3]}),
+    ],
+)
+def test_answer_that_is_none_of_a_dps_is_a_live_error(
+    hub: Hub, method: str, arguments: tuple[Any, ...], answer: dict[str, Any]
+) -> None:
+    channel = f"VTB_{method.upper()}"
+    with impostor(hub.url, channel, [(f"{channel}_ANSWER", answer)]), pytest.raises(LiveError) as caught:
+        asked(hub.url, method, *arguments)
+    assert str(answer.get("error", "is no DPS of vtbdrake")) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [
+        *({"time": 1.0, "since": 1.0, "values": values} for values in NO_VALUES),
+        {"since": 1.0, "values": {"a": 1.0}},
+        {"time": "now", "since": 1.0, "values": {"a": 1.0}},
+        {"time": 1.0, "values": {"a": 1.0}},
+        {"error": 3},
+    ],
+)
+def test_sample_that_is_none_of_a_dps_ends_a_watch_with_a_live_error(hub: Hub, sample: dict[str, Any]) -> None:
+    answers = [("VTB_WATCH_ANSWER", {"ok": True}), ("VTB_WATCHED/ID", sample)]
+    with impostor(hub.url, "VTB_WATCH", answers):
+        with pytest.raises(LiveError):
+            watched(hub.url, ["a"], 1)
+        with LiveWatch(hub.url, ["a"], timeout=PATIENCE) as live, pytest.raises(LiveError):
+            live.wait(1, timeout=PATIENCE)
 
 
 def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:
@@ -266,8 +337,16 @@ def test_unknown_addresses_are_not_watched(shared: Rig, address: str, reason: st
 
 
 def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> None:
-    with served(hub.url) as (rig, _), pytest.raises(SilenceError, match="or 1000000000 cycles of it take longer"):
-        rig.during(lambda: list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=3.0)))
+    def reason(timeout: float) -> str:
+        with pytest.raises(SilenceError) as caught:
+            list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=timeout))
+        return str(caught.value)
+
+    with served(hub.url) as (rig, _):
+        rig.during(asked, hub.url, "get", ["dps.gain"])
+        # On a busy computer nothing at all may have come when a short time-out is over.
+        told = rig.during(lambda: next((r for k in range(7) if "nobody" not in (r := reason(0.5 * 2**k))), ""))
+    assert "or 1000000000 cycles of it take longer" in told
 
 
 def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:

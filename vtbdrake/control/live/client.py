@@ -28,7 +28,7 @@ Values = dict[str, float | NDArray[np.float64]]
 
 
 class LiveError(ValueError):
-    """The DPS refuses what it is asked for."""
+    """The DPS refuses what it is asked for, or somebody else on the bus gives an answer that a DPS would not."""
 
 
 class SilenceError(TimeoutError):
@@ -77,7 +77,8 @@ class LiveClient:
             LiveError: one of them is refused.
             SilenceError: nobody answers.
         """
-        return to_arrays(self._ask(GET, {"get": list(addresses)})["values"])
+        addresses = list(addresses)
+        return to_arrays(_values(self._ask(GET, {"get": addresses}), addresses, GET))
 
     def reset(self) -> list[str]:
         """Releases the latch of the guards; what they had latched for, empty if they had not.
@@ -86,7 +87,10 @@ class LiveClient:
             LiveError: a cause persists; the fallbacks go on.
             SilenceError: nobody answers; it may have been released or not.
         """
-        released: list[str] = self._ask(RESET, {"reset": True})["released"]
+        answer = self._ask(RESET, {"reset": True})
+        released = answer.get("released")
+        if not isinstance(released, list) or not all(isinstance(reason, str) for reason in released):
+            raise _no_answer(RESET, "the list of reasons in 'released'", answer)
         return released
 
     def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
@@ -109,7 +113,9 @@ class LiveClient:
             self._link.take(_SLICE, _BURST)
         answer = self._answers.pop(self._waiting)
         if "error" in answer:
-            raise LiveError(answer["error"])
+            raise LiveError(str(answer["error"]))
+        if answer.get("ok") is not True:
+            raise _no_answer(channel, "'ok' or an error", answer)
         return answer
 
     def _hear(self, channel: str, data: bytes) -> None:
@@ -196,11 +202,12 @@ def samples(
                 message = received.popleft()
                 heard = time.monotonic()
                 if "error" in message:
-                    raise LiveError(message["error"])
+                    raise LiveError(str(message["error"]))
                 if "ended" in message:
                     return
                 begun = True
                 if "values" in message:
+                    _check_sample(message, addresses)
                     yield message
             if time.monotonic() >= heard + timeout:
                 if begun and link.connected:
@@ -233,6 +240,53 @@ def _answer(data: bytes) -> dict[str, Any]:
         return json_object(data, ValueError)
     except ValueError:
         return {}
+
+
+def _values(message: Mapping[str, Any], addresses: Sequence[str], channel: str) -> dict[str, Any]:
+    """Return the values of a message, by address.
+
+    Raises:
+        LiveError: they are not those of the addresses, or one of them is no number and no array of numbers.
+    """
+    values = message.get("values")
+    if not isinstance(values, dict) or not set(addresses) <= values.keys():
+        raise _no_answer(channel, f"the values of {', '.join(addresses)}", message)
+    for address, value in values.items():
+        if not _is_array(value):
+            raise _no_answer(channel, f"a number or an array of numbers for {address}", value)
+    return values
+
+
+def _check_sample(message: Mapping[str, Any], addresses: Sequence[str]) -> None:
+    """
+    Raises:
+        LiveError: a message of watched values is none.
+    """
+    _values(message, addresses, WATCHED)
+    for name in ("time", "since"):
+        if not _is_number(message.get(name)):
+            raise _no_answer(WATCHED, f"a number of seconds in {name!r}", message)
+
+
+def _is_array(value: Any) -> bool:
+    """Whether this is a number, or a rectangular list of lists of numbers; NaN and infinity are numbers here."""
+    try:
+        array = np.array(value)
+    except (ValueError, OverflowError):
+        return False  # It is ragged.
+    return array.dtype.kind in "iuf" or array.size == 0
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _no_answer(channel: str, expected: str, got: Any) -> LiveError:
+    text = repr(got)
+    return LiveError(
+        f"what answered on {channel} is no DPS of vtbdrake: its answer should have {expected}, and is "
+        f"{text if len(text) <= 100 else text[:100] + '...'}; see who publishes there"
+    )
 
 
 def _silence(link: LcmLink, seconds: float, channel: str = "", owner: str | None = None) -> SilenceError:
