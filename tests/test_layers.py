@@ -24,10 +24,10 @@ BELOW: dict[str, set[str]] = {
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization"},
 }
-# One module, which needs nothing of ours and not Drake: how objects travel to other processes.
+# Two modules, which need nothing of ours and not Drake: how other processes start, and how objects travel to them.
 for _layers in BELOW.values():
-    _layers.add("pickling")
-BELOW["pickling"] = set()
+    _layers.update({"interpreter", "pickling"})
+BELOW["interpreter"] = BELOW["pickling"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

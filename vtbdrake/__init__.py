@@ -6,6 +6,8 @@ Names are loaded when they are first used, so that importing the package costs n
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import vtbdrake.interpreter as _interpreter  # noqa: F401  It notes where relative entries of sys.path point to.
+
 if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
     from vtbdrake.control.hub import Hub

@@ -6,7 +6,6 @@ import logging
 import os
 import pickle
 import select
-import signal
 import socket
 import struct
 import subprocess
@@ -17,6 +16,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from vtbdrake.control.streams import Frames
+from vtbdrake.interpreter import command
 from vtbdrake.pickling import dumps
 
 _log = logging.getLogger(__name__)
@@ -80,7 +80,6 @@ class Companion:
     """
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
-        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.companion import main; main()"
         self.name = name
         self.dropped = 0
         self._backlog = backlog
@@ -96,7 +95,7 @@ class Companion:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
             self._line.setblocking(False)
             self._process = subprocess.Popen(
-                [sys.executable, "-c", program, str(theirs.fileno())],
+                command("vtbdrake.control.companion", str(theirs.fileno())),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
@@ -243,7 +242,6 @@ class Companion:
 
 def main() -> None:
     """The main program of a companion."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     # The loop may be confined to processors of its own, where nothing else is to work.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))

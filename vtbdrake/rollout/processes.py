@@ -6,7 +6,6 @@ import logging
 import pickle
 import socket
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from vtbdrake.interpreter import command
 from vtbdrake.rollout.arguments import as_number
 from vtbdrake.rollout.blob import Blob, Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
@@ -35,15 +35,10 @@ class _Worker:
     """A fresh interpreter at the other end of a socket. It does not import the main module again."""
 
     def __init__(self, kept: int, growth: float) -> None:
-        # Ctrl-C reaches the whole group of processes; the main one decides what it means.
-        program = (
-            "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-            f"sys.path[:] = {sys.path!r}; from vtbdrake.rollout.worker import main; main()"
-        )
         ours, theirs = socket.socketpair()
         with ours, theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", program, str(theirs.fileno()), str(kept), str(growth)],
+                command("vtbdrake.rollout.worker", str(theirs.fileno()), str(kept), str(growth)),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )

@@ -21,6 +21,7 @@ from vtbdrake.control.hub.config import HubConfig
 from vtbdrake.control.hub.server import HubServer, listen
 from vtbdrake.control.hub.statistics import Statistics
 from vtbdrake.control.hub.tcpq import address_name
+from vtbdrake.interpreter import command
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +61,6 @@ class Hub:
             HubAddressError: it cannot listen at its address.
             HubError: its process does not start.
         """
-        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.hub.process import main; main()"
         control, theirs = socket.socketpair()
         try:
             with theirs, contextlib.ExitStack() as stack:
@@ -68,7 +68,7 @@ class Hub:
                 filenos = [theirs.fileno(), *(listener.fileno() for listener in listeners)]
                 self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
                 self._process = subprocess.Popen(
-                    [sys.executable, "-c", program, json.dumps(asdict(self.config)), *map(str, filenos)],
+                    command("vtbdrake.control.hub.process", json.dumps(asdict(self.config)), *map(str, filenos)),
                     pass_fds=filenos,
                     stdin=subprocess.DEVNULL,
                 )
@@ -204,7 +204,5 @@ def main() -> None:
     """The process of a `Hub`."""
     control, *listeners = (socket.socket(fileno=int(fileno)) for fileno in sys.argv[2:])
     logging.basicConfig(format="hub: %(message)s")
-    # Ctrl-C reaches the whole group of processes; the one that started the hub decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     server = HubServer(HubConfig(**json.loads(sys.argv[1])), listeners=listeners, control=control)
     serve(server)

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -21,6 +20,7 @@ from vtbdrake.control.machine.config import MachineConfig
 from vtbdrake.control.machine.faults import Fault
 from vtbdrake.control.machine.machine import MachineStatus
 from vtbdrake.control.statistics import Histogram, LoopStatistics
+from vtbdrake.interpreter import command
 from vtbdrake.testbed import Scenario
 
 _START_TIMEOUT = 60.0
@@ -92,7 +92,6 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        program = f"import sys; sys.path[:] = {sys.path!r}; from vtbdrake.control.machine.serve import main; main()"
         control, theirs = socket.socketpair()
         self._control = control
         try:
@@ -101,7 +100,7 @@ class MachineProcess:
                 self.scenario.save(file)
                 order = {"scenario": f"{self.scenario.name()}@{file}", "config": _plain(self.config), **self._run}
                 self._process = subprocess.Popen(
-                    [sys.executable, "-c", program, str(theirs.fileno()), json.dumps(order)],
+                    command("vtbdrake.control.machine.serve", str(theirs.fileno()), json.dumps(order)),
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                 )

@@ -71,8 +71,6 @@ def main() -> None:
     control = socket.socket(fileno=int(sys.argv[1]))
     order = json.loads(sys.argv[2])
     logging.basicConfig(format="machine: %(message)s")
-    # Ctrl-C reaches the whole group of processes; the one that started the machine decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         scenario = load_scenario(order["scenario"])
         machine = Machine(scenario, MachineConfig(**order["config"]), epoch=epoch(lock_step=order["lock_step"]))
