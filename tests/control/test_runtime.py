@@ -435,8 +435,8 @@ def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cy
     setattr(bridge, held, stopped)
     runtime.run(cycles=10)
     assert bool(runtime.guards.latched) == (missed > 10)
-    if not asleep:
-        assert runtime.missed == missed
+    # Who waits for a message may do so for three periods; this one comes a period after the hold-up.
+    assert runtime.missed == (max(missed - 2, 0) if asleep else missed)
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), SystemExit("a failed assertion in Drake")])

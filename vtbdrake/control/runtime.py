@@ -156,7 +156,7 @@ class Runtime(Stepped):
                     done += 1
                     if until():
                         return
-                    deadline = self._next(due)
+                    deadline = self._next(due, lateness)
         except BaseException:
             self.send_fallback("the loop ended")
             raise
@@ -193,14 +193,15 @@ class Runtime(Stepped):
         self.bridge.poll()
         self.feed()
 
-    def _next(self, due: float) -> float:
+    def _next(self, due: float, lateness: float) -> float:
         """The next deadline; those that have passed already are left out and counted."""
         now = self.clock.now()
+        if self.pace is not None:
+            # It has waited for a message until now, late or not, and worked since.
+            self.statistics.miss(self._passed(lateness, now - due))
+            return now
         # The one that is due just now can still be kept.
         behind = max(floor((now - due) / self.period), 0)
-        if self.pace is not None:
-            self.statistics.miss(behind if now - due > self._patience else 0)
-            return now
         self.statistics.miss(behind)
         return due + (behind + 1) * self.period
 
