@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.control.bridge import Reception
-from vtbdrake.control.fallback import Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
+from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
 from vtbdrake.control.guard import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal
 
@@ -381,6 +381,34 @@ def test_after_an_outage_nothing_is_sent_until_what_it_departs_from_is_fresh() -
     assert loop.cycle({"torque": [0.1, 0.1]}).commands["torque"] == pytest.approx([3.9, 3.9])
 
 
+def test_first_command_that_did_not_leave_is_nothing_to_hold() -> None:
+    free = Signal("free", size=1, unit="rad", idle=0.0)
+    loop = Loop(free, start=False)
+    for _ in range(3):
+        assert loop.cycle({"free": [0.7]}).commands["free"].tolist() == [0.7]
+        loop.guards.withheld(("free",))
+    assert loop.cycle({"free": [nan]}).commands == {}
+
+
+@pytest.mark.parametrize("max_age", [0.02, inf])
+@pytest.mark.parametrize("commands", [[9.0, 9.0], [nan, 9.0]])
+def test_after_a_pause_of_the_loop_commands_depart_from_what_is_measured_unless_time_does_not_count(
+    max_age: float, commands: list[float]
+) -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=max_age)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
+    loop.guards.departures = {"torque": "acting"}
+    for _ in range(20):
+        loop.cycle({"torque": [2.0, 2.0]})
+        loop.guards.withheld(())
+    loop.now += 0.5
+    # The machine has braked by itself.
+    loop.receptions["acting"].value = np.array([-5.0, 1.0])
+    start = [-5.0, 1.0] if max_age < inf else [2.0, 2.0]
+    sent = loop.cycle({"torque": commands}).commands["torque"]
+    assert abs(sent - start).max() <= RATE * T + 1e-9
+
+
 def test_fallback_is_limited_like_any_command() -> None:
     loop = Loop(POSITION, fallback={"position": FallbackController(lambda *_: [100.0], otherwise=Hold())})
     loop.cycle({"position": [nan]})
@@ -537,3 +565,39 @@ def test_whatever_happens_what_goes_out_is_finite_and_within_all_limits(script: 
             assert abs(new - position) <= 1.0 * T + 1e-14
             assert abs(new - position - speed) <= 50.0 * T**2 + 1e-14
             torque, position, speed = sent["torque"], new, new - position
+
+
+happenings = st.sampled_from(["go", "go", "wild", "nan", "raise", "lost", "back", "mute", "talk", "reset", "off", "on"])
+
+
+@given(st.lists(st.tuples(happenings, st.integers(1, 30), st.sampled_from([0.0, 0.0, 0.0, 0.2])), max_size=30))
+def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_acts(
+    script: list[tuple[str, int, float]],
+) -> None:
+    """The machine goes where it likes once it has heard nothing for more than ten cycles."""
+    mute = False
+    quiet = FallbackController(lambda *_: NO_COMMAND if mute else [8.0, -8.0], otherwise=Hold())
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": quiet})
+    loop.guards.departures = {"torque": "acting"}
+    acting, lost, on = loop.cycle({"torque": [0.0, 0.0]}).commands["torque"], False, True
+    heard = loop.now
+    for event, times, pause in script:
+        loop.now += pause
+        mute, lost = {"mute": True, "talk": False}.get(event, mute), {"lost": True, "back": False}.get(event, lost)
+        for _ in range(times):
+            if loop.now - heard > 10.5 * T:
+                acting = np.array([acting[1] - 1.0, -0.5 * acting[0]])
+            loop.receptions["acting"].value = acting
+            if event == "on" and not on:
+                loop.guards.start("torque", acting)
+            on = {"on": True, "off": False}.get(event, on)
+            wanted = {"wild": [9.0, -9.0], "nan": [nan, 0.0]}.get(event, [0.3, 0.3])
+            options: dict[str, Any] = {"error": RuntimeError("x")} if event == "raise" else {}
+            if event == "reset":
+                loop.reset()
+            sent = loop.cycle({"torque": wanted} if on else {}, active=["torque"] if on else [], **options).commands
+            loop.guards.withheld(tuple(sent) if lost else ())
+            if sent and not lost:
+                assert (abs(sent["torque"] - acting) <= RATE * T + 1e-12).all()
+                acting, heard = sent["torque"], loop.now

@@ -54,8 +54,9 @@ class Guards:
     sample of each with its age. `Brake` turns into `Zero` when its velocity is stale.
 
     A command that did not leave does not count (see `withheld`). After more than `MOST_UNSENT` of them in a row, or as
-    long a silence of a fallback, nobody knows what the machine did meanwhile: its commands depart anew, from what
-    `departures` measures. Until that is fresh, nothing is sent.
+    long a silence of a fallback or of the loop itself, nobody knows what the machine did meanwhile: its commands depart
+    anew, from what `departures` measures. Until that is fresh, nothing is sent. (A loop that waits for a machine in
+    lock-step is not silent: a sensor signal whose `max_age` is infinite tells that the time does not count.)
 
     Args:
         interface: of the DPS.
@@ -116,9 +117,12 @@ class Guards:
         self._active: tuple[str, ...] = ()
         self._last: float | None = None
         self._most_unsent = min(max_missed, MOST_UNSENT)
+        self._longest_pause = (MOST_UNSENT + 1) * period
         # By actuator signal, for how many cycles nothing left: because it could not, or because a fallback is silent.
         self._unsent: dict[str, int] = {}
         self._held_back: frozenset[str] = frozenset()
+        # Those of which nothing has left since the loop itself has paused.
+        self._paused: frozenset[str] = frozenset()
         self._silent: frozenset[str] = frozenset()
 
     @property
@@ -177,7 +181,9 @@ class Guards:
         """
         driven = self._activate(active if active is not None else self._active if error else commands)
         causes = self._whole(now, error, missed, not_ready)
-        if self._unsent:
+        if self._last is not None and now - self._last > self._longest_pause:
+            self._paused = frozenset(driven)
+        if self._unsent or self._paused:
             causes += self._depart_anew(now, {**others, **receptions})
         wanted = []
         if error is None:
@@ -210,12 +216,13 @@ class Guards:
         Args:
             names: their actuator signals; empty if all have left.
         """
-        if not names and not self._unsent and not self._silent:
+        if not names and not self._unsent and not self._silent and not self._paused:
             return
         for name in names:
             self.commands[name].take_back()
         self._held_back = frozenset(names)
         self._unsent = {name: self._unsent.get(name, 0) + 1 for name in (*names, *(self._silent - self._held_back))}
+        self._paused &= self._unsent.keys()
 
     def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
@@ -268,14 +275,16 @@ class Guards:
     def _depart_anew(self, now: float, receptions: Mapping[str, Reception]) -> list[Fault]:
         """Has commands that have not left for long depart from what is measured now; gives what is wrong."""
         causes = []
-        for name, count in self._unsent.items():
-            if count <= self._most_unsent or name not in self._active:
-                continue
-            if name in self._held_back:
+        for name in self._active:
+            count = self._unsent.get(name, 0)
+            unsent = count > self._most_unsent
+            if unsent and name in self._held_back:
                 causes.append(Fault(now, name, "not sent", f"the last {count} commands {name} could not be sent"))
             guard = self.commands[name]
             sensor = self.departures.get(name)
             if not guard.needs_start or sensor is None:
+                continue
+            if not unsent and not (name in self._paused and self.watchdogs[sensor].max_age < inf):
                 continue
             reception = receptions.get(sensor)
             if reception is not None and self.watchdogs[sensor].check(now, reception) is None:

@@ -99,7 +99,7 @@ class CommandGuard:
             zip(steps.tolist(), changes.tolist(), lower.tolist(), upper.tolist(), strict=True)
         )
         self.needs_start = bool(np.isfinite(steps).any() or np.isfinite(changes).any())
-        self.has_start = False
+        self.has_start = self._had_start = False
         # s and x of above, and what they were before the last command.
         self._state, self._state_before = np.zeros((2, self._size)), np.zeros((2, self._size))
         self._sent, self._step_before = self._state
@@ -130,6 +130,7 @@ class CommandGuard:
     def take_back(self) -> None:
         """Take the last command for one that was never sent. It needs a command since the last start."""
         self._state[:] = self._state_before
+        self.has_start = self._had_start
 
     def limit(self, command: ArrayLike) -> NDArray[np.float64]:
         """What may be sent for ``command``, of shape (size,); it counts as sent.
@@ -159,6 +160,7 @@ class CommandGuard:
 
     def send(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """As `limit`, for what was `checked`."""
+        self._had_start = self.has_start
         if not self.has_start:
             if self.needs_start:
                 raise CommandFault("not started", NOT_STARTED)
