@@ -3,6 +3,7 @@
 import gc
 import os
 import select
+import signal
 import subprocess
 import sys
 import threading
@@ -98,6 +99,29 @@ def test_a_worker_that_died_while_idle_costs_nothing(caplog):
         assert all(worker.process.poll() is None for worker in executor._workers)
     # No rollout was lost with it.
     assert caplog.text == ""
+
+
+def _children():
+    """The processes that this one has started and that have not ended, the first first."""
+    listed = f"/proc/self/task/{threading.get_native_id()}/children"
+    with open(listed) as file:
+        return [int(pid) for pid in file.read().split()]
+
+
+def test_a_worker_that_is_killed_while_it_starts_costs_nothing():
+    others = set(_children())
+    with ProcessExecutor(2) as executor:
+        executor.start(2)
+        for pid in set(_children()) - others:
+            os.kill(pid, signal.SIGKILL)
+        _assert_right(executor, ANGLE, POINTS)
+
+
+def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch):
+    killed = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    monkeypatch.setattr("vtbdrake.rollout.processes.command", lambda *_: [sys.executable, "-c", killed])
+    with ProcessExecutor(2) as executor, pytest.raises(WorkerError, match=r"does not start \(exit code -9\)"):
+        list(executor.run(ANGLE, POINTS))
 
 
 def test_a_closed_executor_has_no_processes_left():

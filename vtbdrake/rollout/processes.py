@@ -94,9 +94,10 @@ class ProcessExecutor(Executor):
     """Processes that keep their testbed from rollout to rollout; for testbeds with systems in Python.
 
     A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
-    more by another worker, and is then a failed result. Where rollouts are short, a worker is given the next one before
-    it has finished the last. A worker whose memory has grown by ``growth`` is replaced between two rollouts: every
-    testbed that is built, for another value of a scenario's field, leaves memory behind.
+    more by another worker, and is then a failed result. One that is killed while it starts costs nothing. Where
+    rollouts are short, a worker is given the next one before it has finished the last. A worker whose memory has grown
+    by ``growth`` is replaced between two rollouts: every testbed that is built, for another value of a scenario's
+    field, leaves memory behind.
 
     Args:
         workers: how many; the number of cores if left out.
@@ -117,6 +118,8 @@ class ProcessExecutor(Executor):
         self._blobs = Blobs()
         self._workers: list[_Worker] = []
         self._running = False
+        # How many workers in a row were lost before they were ready.
+        self._starts_lost = 0
 
     def start(self, rollouts: int) -> None:
         """Start the workers that so many rollouts need, without waiting until they are ready.
@@ -192,8 +195,8 @@ class ProcessExecutor(Executor):
         """A rollout for every worker that is idle; then, as long as there are enough for all, the next ones ahead."""
         for idle in [worker for worker in self._workers if not worker.jobs]:
             worker = self._replace(idle) if waiting and idle.grown else idle
-            if waiting and not self._give(worker, task, waiting, points):
-                self._replace(worker)  # It died while it was idle.
+            while waiting and not self._give(worker, task, waiting, points):
+                worker = self._replace(worker)  # It died while it was idle, or was killed while it started.
         for worker in self._workers:
             if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # One that has died is found by its reply.
@@ -209,10 +212,16 @@ class ProcessExecutor(Executor):
         waiting.popleft()
         try:
             worker.give(task, index, message)
-        except OSError:
+        except (OSError, WorkerError) as error:
             worker.jobs.pop()
             waiting.appendleft(index)
+            if isinstance(error, WorkerError):
+                self._starts_lost += 1
+                # An exit code is its own doing, and so is a signal that gets all of them.
+                if worker.process.returncode >= 0 or self._starts_lost > self._count:
+                    raise
             return False
+        self._starts_lost = 0
         return True
 
     def _replies(self) -> list[tuple[_Worker, int, Any]]:

@@ -51,6 +51,11 @@ class Scenario(ABC):
     A subclass adds its fields and says what the interface of the DPS is, what the DPS is, and what the simulated
     world is. What sits in the Context (masses, gains, poses) is a variable of the testbed; what needs another Diagram
     (geometry, gravity, a time step) is a field.
+
+    When a study varies a field, a testbed is built for each value. Python's garbage collector frees those that are not
+    used any more if every system in Python has ``__slots__ = NO_DICT``, and gives its output ports ``weakly(self,
+    Class._calc)`` instead of the bound method; see `vtbdrake.state.collectable`. The others stay until their process
+    ends: `ProcessExecutor` replaces a worker that has grown too much, while serial rollouts and threads keep them.
     """
 
     simulator: SimulatorFields = field(default_factory=SimulatorFields)
