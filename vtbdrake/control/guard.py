@@ -55,8 +55,8 @@ class Guards:
 
     A command that did not leave does not count (see `withheld`). After more than `MOST_UNSENT` of them in a row, or as
     long a silence of a fallback or of the loop itself, nobody knows what the machine did meanwhile: its commands depart
-    anew, from what `departures` measures. Until that is fresh, nothing is sent. (A loop that waits for a machine in
-    lock-step is not silent: a sensor signal whose `max_age` is infinite tells that the time does not count.)
+    anew, from what `departures` measures. Until that is fresh, nothing is sent. A pause of the loop counts if it is
+    longer than the `max_age` of what is measured, too: in lock-step, where that is infinite, time stands still in it.
 
     Args:
         interface: of the DPS.
@@ -182,7 +182,7 @@ class Guards:
         driven = self._activate(active if active is not None else self._active if error else commands)
         causes = self._whole(now, error, missed, not_ready)
         if self._last is not None and now - self._last > self._longest_pause:
-            self._paused = frozenset(driven)
+            self._paused = self._lapsed(now - self._last)
         if self._unsent or self._paused:
             causes += self._depart_anew(now, {**others, **receptions})
         wanted = []
@@ -272,6 +272,14 @@ class Guards:
             faults.append(Fault(now, None, "not ready", f"the machine is not ready: {not_ready}"))
         return faults
 
+    def _lapsed(self, pause: float) -> frozenset[str]:
+        """Return the actuator signals that the machine need not have kept to in a pause of the loop, in seconds."""
+        return frozenset(
+            name
+            for name in self._active
+            if name in self.departures and pause > self.watchdogs[self.departures[name]].max_age
+        )
+
     def _depart_anew(self, now: float, receptions: Mapping[str, Reception]) -> list[Fault]:
         """Has commands that have not left for long depart from what is measured now; gives what is wrong."""
         causes = []
@@ -284,7 +292,7 @@ class Guards:
             sensor = self.departures.get(name)
             if not guard.needs_start or sensor is None:
                 continue
-            if not unsent and not (name in self._paused and self.watchdogs[sensor].max_age < inf):
+            if not unsent and name not in self._paused:
                 continue
             reception = receptions.get(sensor)
             if reception is not None and self.watchdogs[sensor].check(now, reception) is None:
