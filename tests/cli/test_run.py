@@ -6,8 +6,10 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import lcm
@@ -41,14 +43,14 @@ def hub() -> Iterator[Hub]:
         yield running
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
+def start(*arguments: object, priority: int = 0) -> subprocess.Popen[str]:
     """``vtbdrake run`` in a process of its own, which tells in its last line what it had imported."""
     program = (
         "import sys; from vtbdrake.cli import main\n"
         "try: main(prog_name='vtbdrake')\n"
         "finally: print(*sorted(sys.modules))"
     )
-    command = [sys.executable, "-u", "-c", program, "run", *map(str, arguments), "--priority", "0"]
+    command = [sys.executable, "-u", "-c", program, "run", *map(str, arguments), "--priority", str(priority)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -133,6 +135,61 @@ def test_in_the_end_the_fallback_goes_out_once(hub: Hub, ending: signal.Signals)
         heard = np.array(ear.listen()).reshape(-1, 2)
     assert program.returncode == 0, errors
     # No velocity; before that the DPS is on its way.
+    assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+
+
+@contextmanager
+def intruder(url: str) -> Iterator[None]:
+    """Somebody else who publishes on the command channel again and again."""
+    bus, over = lcm.LCM(url), threading.Event()
+
+    def intrude() -> None:
+        while not over.wait(0.01):
+            bus.publish(COMMAND, b"somebody else")
+
+    thread = threading.Thread(target=intrude)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_second_publisher_is_waited_for_before_the_switch_and_an_alarm_after_it(hub: Hub) -> None:
+    options = ("--url", hub.url, "--no-live", *FAR)
+    with MachineProcess(ServoMachineScenario(), hub.url), ExitStack() as stack:
+        with intruder(hub.url):
+            program = stack.enter_context(start(SERVO, *options))
+            assert program.stderr is not None
+            blocked = f"waiting: somebody else publishes commands on {COMMAND}: only one may command a machine"
+            assert any(blocked in line for line in program.stderr)
+        assert any("the DPS commands" in line for line in program.stderr)
+        with intruder(hub.url):
+            assert any(f"ALARM: somebody else publishes commands on {COMMAND}" in line for line in program.stderr)
+        program.send_signal(signal.SIGINT)
+        output, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    assert "ALARM: somebody else published commands to the machine, too" in output
+
+
+def may_have_priority() -> bool:
+    """Whether a process may have SCHED_FIFO here; asked in a process of its own."""
+    code = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not may_have_priority(), reason="needs the right to SCHED_FIFO")
+def test_a_step_that_does_not_end_is_ended_and_the_fallback_goes_out(hub: Hub) -> None:
+    with MachineProcess(ServoMachineScenario(rate=0.0), hub.url):
+        ear = Ear(hub.url)
+        endless = "tests.cli.endless:EndlessScenario"
+        with start(endless, "--url", hub.url, "--no-live", *FAR, priority=1) as program:
+            _, errors = program.communicate(timeout=PATIENCE)
+        heard = np.array(ear.listen()).reshape(-1, 2)
+    assert program.returncode == 1, errors
+    last = errors.splitlines()[-1]
+    assert last.startswith("Error: a real-time thread has computed for 2 s without waiting once: its step does not end")
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
 
 
