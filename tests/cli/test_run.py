@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -254,7 +255,7 @@ def test_a_machine_that_does_not_speak_is_waited_for_and_then_given_up(hub: Hub)
     assert program.returncode == 1
     assert "waiting: " in errors
     last = errors.splitlines()[-1]
-    assert last.startswith("Error: not switched to the machine after 1.0 s: ")
+    assert re.match(r"Error: not switched to the machine after \d+\.\d s: ", last)
     assert "position" in last and "speed" in last
 
 
@@ -262,10 +263,15 @@ def test_a_frozen_owner_of_the_commands_is_succeeded_only_on_request() -> None:
     with Hub(port=0, protect=[COMMAND], lease=0.05) as hub:
         owner, options = lcm.LCM(hub.url), ("--url", hub.url, "--no-live", "--pace", "", *FAR)
         owner.publish(COMMAND, b"the last one before it froze")
-        with start(SERVO, *options, "--wait", 3.0) as program:
-            _, errors = program.communicate(timeout=PATIENCE)
-        assert program.returncode == 1
-        assert f"the hub protects {COMMAND} for somebody else" in errors.splitlines()[-1]
+
+        def refusal(wait: float) -> str:
+            with start(SERVO, *options, "--wait", wait) as program:
+                _, errors = program.communicate(timeout=2 * PATIENCE)
+            assert program.returncode == 1
+            return errors.splitlines()[-1]
+
+        # On a computer that is busy, the hub may say so only after the first wait.
+        assert any(f"the hub protects {COMMAND} for somebody else" in refusal(wait) for wait in (1.0, 10.0, PATIENCE))
         ear = Ear(hub.url)
         with MachineProcess(ServoMachineScenario(), hub.url), start(SERVO, *options, "--take-over") as program:
             ear.listen(lambda: len(ear.torques) >= 40)

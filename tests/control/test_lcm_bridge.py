@@ -33,7 +33,7 @@ from vtbdrake.control.lcm_vectors import vector_map
 from vtbdrake.testbed import Interface, Signal
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE = 20.0  # s, for what depends on another process
+PATIENCE = 60.0  # s, for what depends on another process
 
 
 @pytest.fixture
@@ -279,10 +279,12 @@ def test_messages_that_leave_together_arrive_in_order_and_stamped_with_their_arr
         heard.clear()
         begin = time.monotonic()
         sender.publish(messages)
-        select.select([receiver], [], [], PATIENCE)
-        there = time.monotonic()
-        assert (receiver.take(10), heard) == (3, messages)
-        assert begin < receiver.arrived < there
+        while len(heard) < len(messages):
+            assert time.monotonic() < limit
+            select.select([receiver], [], [], PATIENCE)
+            receiver.take(10)
+        assert heard == messages
+        assert begin < receiver.arrived < time.monotonic()
 
 
 def test_frozen_hub_is_not_lost_and_not_waited_for(hub: Hub, user_types: ModuleType) -> None:

@@ -112,7 +112,7 @@ class Listener:
     def wait(self, condition: Callable[[list[bytes]], bool]) -> list[bytes]:
         """What has been heard, when the condition is fulfilled."""
         while not condition(self.heard):
-            assert self._lcm.handle_timeout(5000), "nothing is heard any more"
+            assert self._lcm.handle_timeout(60_000), "nothing is heard any more"
         return self.heard
 
     def next(self) -> bytes:
