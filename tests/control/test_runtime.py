@@ -9,6 +9,7 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.operation import take_over
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.testbed import DpsAlone
@@ -538,12 +539,31 @@ def test_an_interruption_that_pybind11_drops_ends_the_loop():
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 
 
-@pytest.mark.parametrize(("settings", "message"), [({"period": 0.0}, "positive"), ({"pace": "x"}, "position")])
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"period": 0.0}, "positive"),
+        ({"pace": "x"}, "position"),
+        *(({"patience": patience}, f"periods, not {patience}") for patience in (0.0, -1.0, np.nan, np.inf)),
+        ({"continuity": {"velocty": ("speed", 1.0)}}, "not from 'velocty' to 'speed'; there are velocity and"),
+        ({"continuity": {"velocity": ("sped", 1.0)}}, "not from 'velocity' to 'sped'"),
+        ({"continuity": {"velocity": ("speed", np.nan)}}, "a number from 0 on, not nan"),
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(settings, message):
     scenario = ServoScenario()
     clock = SimulatedClock()
     with pytest.raises(ValueError, match=message):
         Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)
+
+
+def test_a_time_that_is_no_number_is_not_waited_for():
+    runtime, _, _ = make()
+    with pytest.raises(ValueError, match="a number of seconds, not for nan"):
+        runtime.run(seconds=np.nan)
+    with pytest.raises(ValueError, match="timeout=nan"):
+        take_over(runtime, timeout=np.nan)
+    assert runtime.cycles == 0
 
 
 def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import inf, isnan
 from typing import Any
 
 from pydrake.systems.framework import Context
@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.control.switching import SwitchRefusedError, check_continuity
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, VirtualTestbed
 
 REPEAT = 1.0
@@ -70,15 +70,8 @@ class Operation:
                 "no sensor signal has a max_age, so that nobody would notice a machine that falls silent: give one to "
                 f"those that come regularly ({', '.join(signal.name for signal in interface.sense)})"
             )
-        sensed = {signal.name: signal for signal in interface.sense}
-        acted = {signal.name: signal for signal in interface.act}
-        for name, (sensor, _) in self.continuity.items():
-            if name not in acted or sensor not in sensed or acted[name].size != sensed[sensor].size:
-                raise ValueError(
-                    "continuity goes from an actuator signal to a sensor signal of its size, not from "
-                    f"{name!r} to {sensor!r}; there are {', '.join(acted)} and {', '.join(sensed)}"
-                )
-        for name in acted:
+        check_continuity(interface, self.continuity)
+        for name in (signal.name for signal in interface.act):
             if guards.needs_start(name) and name not in self.continuity:
                 raise ValueError(
                     f"the actuator signal {name} has a limit of its rate or acceleration, and nothing measured that "
@@ -154,7 +147,10 @@ def take_over(runtime: Runtime, *, timeout: float, tell: Callable[[str], None] =
 
     Raises:
         SwitchRefusedError: something still speaks against it.
+        ValueError: the timeout is no number of seconds.
     """
+    if isnan(timeout):
+        raise ValueError(f"take_over gives up after a number of seconds, not after timeout={timeout}")
     begin = runtime.clock.now()
     told = -REPEAT
 

@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from math import floor, inf
+from math import floor, inf, isnan
 from typing import Any, Self
 
 from pydrake.systems.framework import Context
@@ -19,7 +19,7 @@ from vtbdrake.control.guard import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepped import Stepped
-from vtbdrake.control.switching import Preparation, SwitchRefusedError, jumps, prepare
+from vtbdrake.control.switching import Preparation, SwitchRefusedError, check_continuity, jumps, prepare
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -90,11 +90,14 @@ class Runtime(Stepped):
             raise ValueError(f"the period of a loop is positive and finite, not {period} s")
         if pace is not None and pace not in bridge.sensed:
             raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
+        if not (0.0 < patience < inf):
+            raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {patience}")
+        self.continuity = dict(continuity or {})
+        check_continuity(target.interface, self.continuity)
         super().__init__(target, bridge, period=period, context=context)
         self.clock = clock or WallClock(spin=1e-4)
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
-        self.continuity = dict(continuity or {})
         self.guards.departures = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.ready = ready
         self.cycles = 0
@@ -139,7 +142,12 @@ class Runtime(Stepped):
             cycles: how many.
             seconds: on the clock.
             until: asked after every cycle.
+
+        Raises:
+            ValueError: the seconds are no number, so that it would never end.
         """
+        if seconds is not None and isnan(seconds):
+            raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
         self._stop.clear()
         self.look()
         begin = self.clock.now()

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.cycle import SWITCH
-from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
 from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM
 from vtbdrake.testbed.testbed import MODES, check_mode
 
@@ -107,6 +107,26 @@ def _positions(
         if position not in positions:
             raise ValueError(f"the {kind} signal {name} goes to one of {', '.join(positions)}, not to {position!r}")
     return given
+
+
+def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, float]]) -> None:
+    """
+    Args:
+        continuity: as of `Runtime`.
+
+    Raises:
+        ValueError: it names a signal that is not there, or two of different sizes, or a difference that is none.
+    """
+    acted = {signal.name: signal for signal in interface.act}
+    sensed = {signal.name: signal for signal in interface.sense}
+    for name, (sensor, limit) in continuity.items():
+        if name not in acted or sensor not in sensed or acted[name].size != sensed[sensor].size:
+            raise ValueError(
+                "continuity goes from an actuator signal to a sensor signal of its size, not from "
+                f"{name!r} to {sensor!r}; there are {', '.join(acted)} and {', '.join(sensed)}"
+            )
+        if not limit >= 0.0:
+            raise ValueError(f"the largest difference of {name} from {sensor} is a number from 0 on, not {limit}")
 
 
 def jumps(runtime: Runtime, names: Iterable[str]) -> list[str]:

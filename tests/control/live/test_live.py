@@ -267,6 +267,20 @@ def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> Non
     assert np.abs(np.diff(rig.sent, axis=0)).max() <= rate * PERIOD * (1.0 + 1e-9)
 
 
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("nan")])
+def test_timeout_that_is_no_positive_time_is_refused(hub: Hub, timeout: float) -> None:
+    for begin in (LiveClient, lambda url, timeout: LiveWatch(url, ["dps.gain"], timeout=timeout)):
+        with pytest.raises(ValueError, match="the timeout is a positive time in seconds, not"):
+            begin(hub.url, timeout=timeout)
+    with pytest.raises(ValueError, match="the timeout is a positive time in seconds, not"):
+        next(watch(hub.url, ["dps.gain"], timeout=timeout))
+
+
+def test_lease_that_is_no_number_is_refused(hub: Hub) -> None:
+    with pytest.raises(LiveError, match="lease lies in 0.1 to 60 s, not at nan"):
+        next(watch(hub.url, ["dps.gain"], lease=float("nan"), timeout=0.1))
+
+
 def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
     with LiveClient(hub.url, timeout=0.1) as client, pytest.raises(SilenceError, match="nobody has answered"):
         client.get(["dps.gain"])

@@ -49,10 +49,11 @@ class LiveClient:
 
     Raises:
         BridgeError: there is no bus.
+        ValueError: the timeout is no positive number.
     """
 
     def __init__(self, url: str, *, timeout: float = 5.0) -> None:
-        self._timeout = timeout
+        self._timeout = check_timeout(timeout)
         self._answers: dict[str, dict[str, Any]] = {}
         self._waiting = ""
         self._asked = -np.inf
@@ -170,6 +171,7 @@ def watch(
         BridgeError: there is no bus.
         LiveError: an address is refused.
         SilenceError: nothing comes.
+        ValueError: the timeout is no positive number.
     """
     for message in samples(url, addresses, every, lease, timeout):
         yield message["time"], to_arrays(message["values"])
@@ -179,7 +181,9 @@ def samples(
     url: str, addresses: Sequence[str], every: int, lease: float, timeout: float, stop: threading.Event | None = None
 ) -> Iterator[dict[str, Any]]:
     """As `watch`, with all that is told beside the values, until ``stop`` is set; see `messages`."""
+    check_timeout(timeout)
     request = {"id": _new_id(), "watch": list(addresses), "every": every, "lease": lease}
+    _checked(WATCH, request)
     received: deque[dict[str, Any]] = deque()
 
     def hear(channel: str, data: bytes) -> None:
@@ -226,12 +230,32 @@ def _publish(link: LcmLink, channel: str, message: dict[str, Any]) -> None:
     Raises:
         LiveError: the DPS would refuse it anyway.
     """
+    link.publish((channel, _checked(channel, message)))
+
+
+def _checked(channel: str, message: dict[str, Any]) -> bytes:
+    """Return the bytes of a request.
+
+    Raises:
+        LiveError: the DPS would refuse it anyway.
+    """
     data = to_json(message)
     try:
         parse(channel, data)
     except ValueError as error:
         raise LiveError(str(error)) from None
-    link.publish((channel, data))
+    return data
+
+
+def check_timeout(timeout: float) -> float:
+    """Return ``timeout``.
+
+    Raises:
+        ValueError: it is no positive number of seconds.
+    """
+    if not timeout > 0.0:
+        raise ValueError(f"the timeout is a positive time in seconds, not {timeout}")
+    return timeout
 
 
 def _answer(data: bytes) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.live.client import LiveError, SilenceError, Values, samples, to_arrays
+from vtbdrake.control.live.client import LiveError, SilenceError, Values, check_timeout, samples, to_arrays
 
 
 class LiveWatch:
@@ -26,6 +26,9 @@ class LiveWatch:
     Args:
         size: how many samples are kept.
         url, addresses, every, lease, timeout: as of `watch`.
+
+    Raises:
+        ValueError: the timeout is no positive number.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class LiveWatch:
         lease: float = 2.0,
         timeout: float = 5.0,
     ) -> None:
+        check_timeout(timeout)
         self._addresses = tuple(addresses)
         self._samples: deque[tuple[float, float, Values]] = deque(maxlen=size)
         self._error: Exception | None = None

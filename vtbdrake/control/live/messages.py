@@ -151,8 +151,10 @@ def _addresses(given: Any, *, least: int) -> tuple[str, ...]:
 
 
 def _values(given: Any) -> dict[str, Any]:
-    if not isinstance(given, dict) or not 1 <= len(given) <= MAX_ADDRESSES:
-        raise RequestError(f"values are given by 1 to {MAX_ADDRESSES} addresses, not by {_short(given)}")
+    if not isinstance(given, dict):
+        raise RequestError(f"values are given by address, not as {_short(given)}")
+    if not 1 <= len(given) <= MAX_ADDRESSES:
+        raise RequestError(f"a request has 1 to {MAX_ADDRESSES} values, not {len(given)}")
     for address, value in given.items():
         _check_value(address, value)
     return given
