@@ -409,6 +409,21 @@ def test_after_a_pause_of_the_loop_commands_depart_from_what_is_measured_unless_
     assert abs(sent - start).max() <= RATE * T + 1e-9
 
 
+@pytest.mark.parametrize("fresh", [True, False])
+def test_farewell_after_a_pause_departs_from_what_is_measured_or_is_left_out(fresh: bool) -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
+    loop.guards.departures = {"torque": "acting"}
+    for _ in range(20):
+        loop.cycle({"torque": [2.0, 2.0]})
+        loop.guards.withheld(())
+    loop.now += 0.5
+    if fresh:
+        loop.receptions["acting"] = Reception(value=np.array([-5.0, 1.0]), arrived=loop.now, count=99)
+    commands = loop.guards.fault("the time is up", loop.now, loop.receptions).commands
+    assert [command.tolist() for command in commands.values()] == ([[-5.0, 1.0]] if fresh else [])
+
+
 def test_fallback_is_limited_like_any_command() -> None:
     loop = Loop(POSITION, fallback={"position": FallbackController(lambda *_: [100.0], otherwise=Hold())})
     loop.cycle({"position": [nan]})

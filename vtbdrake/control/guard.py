@@ -181,10 +181,7 @@ class Guards:
         """
         driven = self._activate(active if active is not None else self._active if error else commands)
         causes = self._whole(now, error, missed, not_ready)
-        if self._last is not None and now - self._last > self._longest_pause:
-            self._paused = self._lapsed(now - self._last)
-        if self._unsent or self._paused:
-            causes += self._depart_anew(now, {**others, **receptions})
+        causes += self._depart_anew(now, receptions, others)
         wanted = []
         if error is None:
             for name in driven:
@@ -226,6 +223,7 @@ class Guards:
 
     def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
+        self._depart_anew(now, receptions)
         told = Fault(now, None, "told", reason)
         self.log.append(told)
         if not self._latched:
@@ -280,8 +278,17 @@ class Guards:
             if name in self.departures and pause > self.watchdogs[self.departures[name]].max_age
         )
 
-    def _depart_anew(self, now: float, receptions: Mapping[str, Reception]) -> list[Fault]:
-        """Has commands that have not left for long depart from what is measured now; gives what is wrong."""
+    def _depart_anew(
+        self,
+        now: float,
+        receptions: Mapping[str, Reception],
+        others: Mapping[str, Reception] = MappingProxyType({}),
+    ) -> list[Fault]:
+        """Have commands that have not left for long depart from what is measured now, and return what is wrong."""
+        if self._last is not None and now - self._last > self._longest_pause:
+            self._paused = self._lapsed(now - self._last)
+        if not self._unsent and not self._paused:
+            return []
         causes = []
         for name in self._active:
             count = self._unsent.get(name, 0)
@@ -294,7 +301,7 @@ class Guards:
                 continue
             if not unsent and name not in self._paused:
                 continue
-            reception = receptions.get(sensor)
+            reception = receptions.get(sensor) or others.get(sensor)
             if reception is not None and self.watchdogs[sensor].check(now, reception) is None:
                 guard.start_from(reception.value)
             else:
