@@ -80,6 +80,39 @@ def test_ctrl_c_in_a_second_simulation_for_the_state_is_not_a_failure():
         RolloutRunner(task).state({}, 0.5)
 
 
+class Pressing(dict):
+    """A point of a rollout; when it is looked at, Ctrl-C is pressed in a finalizer."""
+
+    def items(self):
+        Deletion()
+        return super().items()
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored")
+def test_ctrl_c_beside_a_simulation_is_not_lost():
+    task = RolloutTask(PendulumScenario(), 0.1, Quality(abs, THETA))
+    with SerialExecutor() as executor, pytest.raises(KeyboardInterrupt):
+        list(executor.run(task, [Pressing({THETA: 0.1})]))
+
+
+class PressingLater(SerialExecutor):
+    """Ctrl-C is pressed in a finalizer, beside the rollouts."""
+
+    def run(self, task, points):
+        for found in super().run(task, points):
+            Deletion()
+            yield found
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored")
+def test_ctrl_c_between_rollouts_is_not_lost(caplog):
+    task = RolloutTask(PendulumScenario(), 0.1, Quality(abs, THETA))
+    with PressingLater() as executor:
+        results = run_rollouts(executor, task, [{THETA: 0.1}] * 3, progress=False)
+    assert [result is None for result in results] == [False, True, True]
+    assert "interrupted: 1 of 3 rollouts" in caplog.text
+
+
 @dataclass
 class InterruptedBuild(PendulumScenario):
     at: float = 0.0
@@ -128,6 +161,7 @@ def test_no_interrupt_of_many_is_lost():
                     for _ in executor.run(task, [{SHOULDER: 0.1}]):
                         assert handled == i, "a rollout came to an end after its interruption"
             assert handled == i + 1
+            assert signal.getsignal(signal.SIGINT) is handler
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, alarm)

@@ -171,6 +171,9 @@ def test_a_worker_that_has_grown_is_replaced(tmp_path):
     file = tmp_path / "built"
     task = RolloutTask(GreedyScenario(file=str(file)), 0.1, Quality(_angle, THETA))
     points = [{"scenario.stiffness": 0.1 * i, THETA: 0.1} for i in range(12)]
+    # What the main process holds, or held, is not the worker's.
+    ballast = b"x" * 600_000_000
+    del ballast
     with ProcessExecutor(1, growth=120e6) as executor:
         results = dict(executor.run(task, points))
     assert sorted(results) == list(range(12)) and not any(result.failed for result in results.values())

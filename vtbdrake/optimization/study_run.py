@@ -22,6 +22,7 @@ from vtbdrake.rollout import Executor
 from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.many import watched
 from vtbdrake.rollout.result import QUALITY_FAILED
+from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
 
@@ -221,18 +222,20 @@ class StudyRun:
         self._refuse_lateness()
         results = self._executor.run(self._task, points) if points else iter(())
         try:
-            for index, result in results:
-                outcome = Outcome.of(result)
-                self._known[now[index]] = outcome
-                self._file.add(*now[index], outcome)
-                self._warn(outcome)
-                if time.monotonic() >= self._next_log:
-                    self._next_log += LOG_PERIOD
-                    self._log_progress()
-                assert self._bar is not None
-                self._bar.update()
-                self._refuse_success([now[index][0]])
-                self._refuse_lateness()
+            with Interruptible() as interruptible:
+                for index, result in results:
+                    outcome = Outcome.of(result)
+                    self._known[now[index]] = outcome
+                    self._file.add(*now[index], outcome)
+                    self._warn(outcome)
+                    if time.monotonic() >= self._next_log:
+                        self._next_log += LOG_PERIOD
+                        self._log_progress()
+                    assert self._bar is not None
+                    self._bar.update()
+                    self._refuse_success([now[index][0]])
+                    self._refuse_lateness()
+                    interruptible.check()
         finally:
             if points:
                 results.close()  # type: ignore[attr-defined]

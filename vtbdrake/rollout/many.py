@@ -11,6 +11,7 @@ from tqdm.auto import tqdm
 from vtbdrake.rollout.executor import Executor, Parameters
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
 
@@ -34,9 +35,11 @@ def run_rollouts(
     with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and watched())) as bar:
         rollouts = executor.run(task, points)
         try:
-            for index, result in rollouts:
-                results[index] = result
-                bar.update()
+            with Interruptible() as interruptible:
+                for index, result in rollouts:
+                    results[index] = result
+                    bar.update()
+                    interruptible.check()
         except KeyboardInterrupt:
             done = sum(result is not None for result in results)
             _log.warning("interrupted: %d of %d rollouts are finished and kept", done, len(points))

@@ -117,8 +117,7 @@ class Runners:
         # A task is its own key: to compare what it holds would take longer than to run it.
         key = (id(task), _key(fields))
         if key not in mine:
-            with Interruptible():
-                mine[key] = (task, self._make(task, fields))
+            mine[key] = (task, self._make(task, fields))
             for old in [k for k, (_, runner) in mine.items() if runner.testbed not in self._testbeds]:
                 del mine[old]
             if len(mine) > _RUNNERS:
@@ -158,15 +157,16 @@ class Runners:
         Args:
             begin: called when the testbed is there, before the rollout.
         """
-        fields, variables = split(point)
-        try:
-            runner = self.get(task, fields)
-        except BuildError as error:
-            return failed(point, str(error))
-        if begin is not None:
-            begin()
-        result = runner.run(variables, cancel=cancel)
-        return replace(result, parameters=dict(point)) if fields else result
+        with Interruptible():
+            fields, variables = split(point)
+            try:
+                runner = self.get(task, fields)
+            except BuildError as error:
+                return failed(point, str(error))
+            if begin is not None:
+                begin()
+            result = runner.run(variables, cancel=cancel)
+            return replace(result, parameters=dict(point)) if fields else result
 
     def clear(self) -> None:
         """Forgets the runners of all threads, and the testbeds."""

@@ -48,8 +48,8 @@ def serve(connection: Connection, runners: Runners, *, growth: float = inf) -> N
             begin = partial(connection.send_bytes, BEGUN) if kind == b"L" else None
             reply = answer(index, partial(_rollout, runners, load, point, begin))
             if limit == inf:
-                limit = _peak_memory() + growth
-            elif _peak_memory() > limit:
+                limit = _memory() + growth
+            elif _memory() > limit:
                 connection.send_bytes(GROWN)
                 limit = growth = inf
             connection.send_bytes(reply)
@@ -57,9 +57,14 @@ def serve(connection: Connection, runners: Runners, *, growth: float = inf) -> N
             return
 
 
-def _peak_memory() -> float:
-    """Return the most memory that this process ever held, in bytes."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
+def _memory() -> float:
+    """Return how much memory this process holds, in bytes; without /proc, the most that it ever held."""
+    try:
+        with open("/proc/self/statm", "rb") as file:
+            return float(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        # On Linux this would not do: there a process inherits the most that the one that started it ever held.
+        return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def _rollout(

@@ -49,6 +49,10 @@ class Interruptible:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
+            try:
+                signal.signal(signal.SIGINT, self._handler)
+            except BaseException:  # Ctrl-C came just now: it is handled first, and then no handler is set.
+                signal.signal(signal.SIGINT, self._handler)
+                raise
         if error is not self._raised:
             self.check()
