@@ -112,4 +112,7 @@ def test_a_failing_simulation_is_compared_too():
         quality=vtb.Quality(abs, of=SHOULDER),
         horizon=2.0,
     )
-    assert problem.check().ok
+    found = problem.check()
+    assert found.ok
+    assert f"the rollout fails after {found.seconds:g} s: {found.failure}" in str(found)
+    assert "RuntimeError: " in found.failure

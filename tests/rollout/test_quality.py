@@ -1,5 +1,6 @@
 """Equations (12) to (17) on trajectories made by hand, and through a simulation."""
 
+import sys
 from dataclasses import replace
 from math import inf, nan
 
@@ -106,6 +107,7 @@ def test_costs_of_any_size_are_compared_themselves(scale):
         (lambda t: inf, "is inf, but"),
         (lambda t: 1 / 0, "raises ZeroDivisionError: division by zero"),
         (lambda t: "good", "raises ValueError"),
+        (lambda t: sys.exit("failure in Drake"), "raises SystemExit: failure in Drake"),
         (lambda t, pitch: 1.0, "raises TypeError"),
     ],
 )

@@ -35,10 +35,12 @@ class Check:
     Attributes:
         findings: one sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
         seconds: how much simulated time of a rollout was looked at.
+        failure: how that rollout fails then, so that no more of it could be looked at; empty if it does not.
     """
 
     findings: tuple[str, ...]
     seconds: float
+    failure: str = ""
 
     @property
     def ok(self) -> bool:
@@ -46,9 +48,12 @@ class Check:
         return not self.findings
 
     def __str__(self) -> str:
+        lines = list(self.findings)
         if self.ok:
-            return f"nothing found: rollouts repeat over {self.seconds:g} s, side by side and in another process"
-        return "\n".join(self.findings)
+            lines.append(f"nothing found: rollouts repeat over {self.seconds:g} s, side by side and in another process")
+        if self.failure:
+            lines.append(f"no more was compared, as the rollout fails after {self.seconds:g} s: {self.failure}")
+        return "\n".join(lines)
 
 
 def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[Mapping[str, Any]]) -> Check:
@@ -76,7 +81,9 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
     travelling = list(_unsendable(task))
     if not travelling:
         travelling = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
-    return Check((*findings, *travelling), float(reference[-1][0]))
+    end, sample = reference[-1]
+    failure = next((measured for measured in sample[""] if isinstance(measured, str)), "")
+    return Check((*findings, *travelling), float(end), failure)
 
 
 def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:

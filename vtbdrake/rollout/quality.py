@@ -56,7 +56,7 @@ class Measure:
         """
         try:
             sample = float(self.f(*values))
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             raise QualityError(f"{self._at(values, time)} raises {type(error).__name__}: {error}") from error
         self._check(sample, lambda: self._at(values, time))
         return sample

@@ -50,6 +50,7 @@ class Variables(Mapping[str, Variable]):
         self._by_demand = dict(derived_by_demand or {})
 
     def __getitem__(self, address: str) -> Variable:
+        check_address(address)
         if address in self._listed:
             return self._listed[address]
         if address in self._by_demand:
@@ -130,6 +131,15 @@ class Variables(Mapping[str, Variable]):
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
         return "\n".join(lines)
+
+
+def check_address(address: object) -> None:
+    """
+    Raises:
+        AddressError: ``address`` is no text.
+    """
+    if not isinstance(address, str):
+        raise AddressError(f"an address is text, 'plant.box.mass', say, not {address!r}")
 
 
 def suggestion(address: str, known: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.systems import is_python, leaves
-from vtbdrake.state.variables import suggestion
+from vtbdrake.state.variables import check_address, suggestion
 from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import BOARD
@@ -134,8 +134,10 @@ class AddressedDiagram:
             simulator: one of this testbed; between two calls of its AdvanceTo.
 
         Raises:
-            ValueError: the simulator is of another Diagram.
+            ValueError: it is no Simulator, or one of another Diagram.
         """
+        if not isinstance(simulator, Simulator):
+            raise ValueError(f"what is forked is a simulator, made by testbed.simulator(), not {simulator!r}")
         if simulator.get_system() is not self.diagram:
             raise ValueError("the simulator to be forked is one of another Diagram: make it by testbed.simulator()")
         snapshot = self.snapshot(simulator.get_context())
@@ -178,6 +180,7 @@ class AddressedDiagram:
         Raises:
             AddressError: there is neither.
         """
+        check_address(address)
         if address in self._variables:
             return self._variables[address].get
         if address in self._ports:
