@@ -1,11 +1,16 @@
 """``vtbdrake study``: what it records is what the library finds."""
 
+import math
 from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
 
 from tests.cli.program import ANGLE, DAMPING, PENDULUM, RATE, run
 from tests.testbeds import PendulumScenario
-from vtbdrake import Parameter, Problem, Quality, Study
-from vtbdrake.cli.quality import magnitude
+from vtbdrake import Choice, Constraint, CVaR, Parameter, Problem, Quality, Study
+from vtbdrake.cli.quality import largest, magnitude
+from vtbdrake.cli.study import study as study_commands
 
 BEGIN = [PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--vary", f"{RATE}=-3:3", "--quality", ANGLE]
 BEGIN += ["--sample-period", 0.1, "--minimize", "--condition", f"{DAMPING}=0.1", "--condition", f"{DAMPING}=0.2"]
@@ -50,6 +55,40 @@ def test_a_study_is_run_shown_given_points_and_resumed(tmp_path: Path) -> None:
         assert given == [(-0.5, 2.0), (0.25, 0.0)]
 
 
+def test_all_kinds_of_parameters_and_constraints_can_be_stated(tmp_path: Path) -> None:
+    problem = Problem(
+        scenario=PendulumScenario(),
+        parameters=[
+            Parameter(DAMPING, 0.05, 0.8, log=True),
+            Parameter("scenario.stiffness", 0, 3, integer=True),
+            Choice("scenario.damping", [0, 0.5]),
+        ],
+        quality=Quality(magnitude, ANGLE),
+        horizon=0.3,
+        sample_period=0.1,
+        conditions=[{ANGLE: 0.2}, {ANGLE: 0.3}],
+        risk=CVaR(0.5),
+        constraints=[
+            Constraint(largest, RATE, at_most=0.1),
+            Constraint(math.hypot, [ANGLE, RATE], at_least=0.05),
+        ],
+    )
+    file = tmp_path / "a.db"
+    # A resumed study refuses another problem, so that the program states the same one.
+    with problem.study(file, solver="sobol", options={"points": 4}, seed=3) as study:
+        study.run(rollouts=8, racing=False, executor="serial", progress=False)
+    arguments = ["--horizon", 0.3, "--sample-period", 0.1, "--quality", ANGLE, "--risk", "cvar:0.5"]
+    arguments += ["--vary", f"{DAMPING}=0.05:0.8:log", "--vary", "scenario.stiffness=0:3:integer"]
+    arguments += ["--choose", "scenario.damping=0,0.5", "--at-most", f"{RATE}=0.1"]
+    arguments += ["--at-least", f"math:hypot({ANGLE},{RATE})=0.05", "--no-racing"]
+    arguments += ["--solver", "sobol", "--option", "points=4", "--seed", 3]
+    arguments += ["--condition", f"{ANGLE}=0.2", "--condition", f"{ANGLE}=0.3", "--on-error", "raise"]
+    done = run("study", "run", file, PENDULUM, *arguments, "--rollouts", 8, "--executor", "serial")
+    assert (done.returncode, done.stderr) == (0, "")
+    with Study.open(file) as study:
+        assert len(study.trials) == 4 and all(trial.exact for trial in study.trials)
+
+
 def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     run("study", "run", file, *BEGIN, "--rollouts", 4, "--executor", "serial")
@@ -64,3 +103,26 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
     ):
         failed = run("study", *arguments)
         assert failed.returncode == 2 and message in failed.stderr and len(failed.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--vary", "a=0:1:lin"], "then :log, :integer or both, not 'a=0:1:lin'"),
+        (["--vary", "a=0"], "it takes ADDRESS=LOWER:UPPER"),
+        (["--vary", "a=0:1:log"], "a logarithmic range begins above 0"),
+        (["--choose", "a=1"], "at least two different options"),
+        (["--choose", "a"], "it takes ADDRESS=OPTION,OPTION[,...], not 'a'"),
+        (["--at-most", "math:hypot=1"], "MODULE:FUNCTION(ADDRESS,...)=LIMIT"),
+        (["--at-most", "a=fast"], "LIMIT a number"),
+        (["--at-least", "math:hypo(a,b)=1"], "math has no function 'hypo'"),
+        (["--risk", "cvar:2"], "a number in (0, 1], not '2'"),
+        (["--risk", "median:0.5"], "it takes worst, mean, quantile:LEVEL or cvar:LEVEL"),
+        ([], "say with --vary or --choose what is varied"),
+    ],
+)
+def test_a_wrong_option_says_what_it_takes(arguments: list[str], message: str, tmp_path: Path) -> None:
+    common = [str(tmp_path / "a.db"), PENDULUM, "--horizon", "0.3", "--quality", ANGLE]
+    failed = CliRunner().invoke(study_commands, ["run", *common, *arguments])
+    assert failed.exit_code != 0
+    assert message in " ".join(f"{failed.output} {failed.exception}".split())

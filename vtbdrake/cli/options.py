@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -15,7 +16,7 @@ from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, load_scenario
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Parameter
+    from vtbdrake.optimization import Choice, Parameter
 
 # (address, value)
 Setting = tuple[str, float | list[Any]]
@@ -51,10 +52,14 @@ def parse_field(text: str) -> tuple[str, Any]:
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
         raise click.BadParameter(f"it takes NAME=VALUE, not {text!r}")
+    return name, _json_or_text(value)
+
+
+def _json_or_text(value: str) -> Any:
     try:
-        return name, json.loads(value)
+        return json.loads(value)
     except json.JSONDecodeError:
-        return name, value
+        return value
 
 
 def parse_condition(text: str) -> dict[str, Any]:
@@ -87,6 +92,29 @@ def parse_range(text: str) -> Parameter:
 
     (lower, upper), address = _numbers(text, (float, float), "ADDRESS=LOWER:UPPER")
     return Parameter(address, lower, upper)
+
+
+# What may follow a range.
+SCALES = {"log", "integer"}
+
+
+def parse_scaled_range(text: str) -> Parameter:
+    """``ADDRESS=LOWER:UPPER``, and ``:log``, ``:integer`` or both after it."""
+    parts = text.split(":")
+    kinds = [part.strip() for part in parts[2:]]
+    if len(set(kinds) & SCALES) < len(kinds):
+        raise click.BadParameter(f"it takes ADDRESS=LOWER:UPPER, then :log, :integer or both, not {text!r}")
+    return replace(parse_range(":".join(parts[:2])), **dict.fromkeys(kinds, True))
+
+
+def parse_choice(text: str) -> Choice:
+    """``ADDRESS=OPTION,OPTION,...``, each in JSON, or else a text."""
+    from vtbdrake.optimization import Choice
+
+    address, equals, options = (part.strip() for part in text.partition("="))
+    if not (address and equals and options):
+        raise click.BadParameter(f"it takes ADDRESS=OPTION,OPTION[,...], not {text!r}")
+    return Choice(address, [_json_or_text(option.strip()) for option in options.split(",")])
 
 
 def parse_grid(text: str) -> tuple[Parameter, int]:

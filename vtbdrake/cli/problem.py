@@ -28,7 +28,10 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.quality import make_quality
 from vtbdrake.cli.text import number, table, write_csv
-from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
+from vtbdrake.optimization import Boundary, Problem, Sweep
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.risk import Risk
+from vtbdrake.rollout import Constraint
 from vtbdrake.rollout.choice import NAMES
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
@@ -82,7 +85,7 @@ def execution_options(command: F) -> F:
 
 def make_problem(
     scenario: Scenario,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[Dimension],
     *,
     quality: str,
     of: Sequence[str],
@@ -93,7 +96,8 @@ def make_problem(
     sample_period: float,
     start: Snapshot | None,
     minimize: bool = False,
-    risk: str = "worst",
+    risk: str | Risk = "worst",
+    constraints: Sequence[Constraint] = (),
 ) -> Problem:
     """The problem that the options state; ``values`` hold under every condition."""
     common = list(settings(values).items())
@@ -107,6 +111,7 @@ def make_problem(
         conditions=[settings([*common, *condition.items()]) for condition in conditions or ({},)],
         start=start,
         risk=risk,
+        constraints=constraints,
     )
 
 

@@ -1,4 +1,4 @@
-"""The quality of a study, as the command line states it."""
+"""The quality and the constraints of a problem, as the command line states them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,49 @@ from typing import Any
 import click
 import numpy as np
 
-from vtbdrake.rollout import Quality
+from vtbdrake.rollout import Constraint, Quality
 
 _FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_CALL = re.compile(rf"({_FUNCTION.pattern})\((.*)\)")
 
 
 def magnitude(value: float | np.ndarray) -> float:
     """f = abs(value); of an array, its largest entry."""
     return float(np.max(np.abs(value)))
+
+
+def largest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its largest entry."""
+    return float(np.max(value))
+
+
+def smallest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its smallest entry."""
+    return float(np.min(value))
+
+
+def make_constraint(text: str, *, limit: str) -> Constraint:
+    """The constraint that ``limit``, ``at_most`` or ``at_least``, states of ``ADDRESS=NUMBER`` or of a function.
+
+    A function of variables is written ``module:function(ADDRESS,...)=NUMBER``.
+
+    Raises:
+        click.BadParameter: it has another form.
+        click.UsageError: the function does not exist.
+    """
+    what, _, number = (part.strip() for part in text.rpartition("="))
+    form = "ADDRESS=LIMIT or MODULE:FUNCTION(ADDRESS,...)=LIMIT"
+    try:
+        value = float(number)
+    except ValueError as error:
+        raise click.BadParameter(f"it takes {form}, LIMIT a number, not {text!r}") from error
+    call = _CALL.fullmatch(what)
+    if call is not None:
+        of = [address.strip() for address in call[2].split(",") if address.strip()]
+        return Constraint(_function(call[1]), of=of, **{limit: value})
+    if not what or _FUNCTION.fullmatch(what):
+        raise click.BadParameter(f"it takes {form}, not {text!r}")
+    return Constraint(largest if limit == "at_most" else smallest, of=what, **{limit: value})
 
 
 def make_quality(text: str, of: Sequence[str]) -> Quality:

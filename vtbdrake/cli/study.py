@@ -4,20 +4,39 @@ from __future__ import annotations
 
 import json
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 from vtbdrake.cli.group import FailedError
-from vtbdrake.cli.options import converted, output, parse_field, parse_range, settings
+from vtbdrake.cli.options import converted, output, parse_choice, parse_field, parse_scaled_range, settings
 from vtbdrake.cli.problem import make_problem, problem_options
+from vtbdrake.cli.quality import make_constraint
 from vtbdrake.cli.text import table, write_csv
-from vtbdrake.optimization import Parameter, Study
+from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
+from vtbdrake.optimization.risk import Risk
+from vtbdrake.rollout import Constraint
 from vtbdrake.rollout.choice import NAMES
 from vtbdrake.testbed import Scenario
 
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+
+
+_LEVELS = {"quantile": Quantile, "cvar": CVaR}
+
+
+def _risk(text: str) -> str | Risk:
+    name, colon, level = text.partition(":")
+    if not colon:
+        return text
+    if name not in _LEVELS:
+        raise click.BadParameter(f"it takes worst, mean, quantile:LEVEL or cvar:LEVEL, not {text!r}")
+    try:
+        return _LEVELS[name](float(level))
+    except ValueError as error:
+        raise click.BadParameter(f"the level of {name} is a number in (0, 1], not {level!r}") from error
 
 
 _point = click.argument(
@@ -42,15 +61,51 @@ def study() -> None:
 @problem_options
 @click.option(
     "--vary",
-    callback=converted(parse_range),
+    callback=converted(parse_scaled_range),
     multiple=True,
-    required=True,
-    metavar="ADDRESS=LOWER:UPPER",
-    help="A parameter and its range. May be repeated.",
+    metavar="ADDRESS=LOWER:UPPER[:log][:integer]",
+    help="A parameter and its range: on a logarithmic scale, or whole numbers only. May be repeated.",
+)
+@click.option(
+    "--choose",
+    callback=converted(parse_choice),
+    multiple=True,
+    metavar="ADDRESS=OPTION,OPTION[,...]",
+    help="A parameter that takes one of several values without an order: numbers, words, true or false; a variable "
+    "or scenario.<field>. May be repeated; in a point, those of --choose follow those of --vary.",
+)
+@click.option(
+    "--at-most",
+    callback=converted(partial(make_constraint, limit="at_most")),
+    multiple=True,
+    metavar="ADDRESS=LIMIT",
+    help="A constraint: the variable (of an array, its largest entry) never exceeds the limit. Or of a Python function "
+    "of variables: MODULE:FUNCTION(ADDRESS,...)=LIMIT. May be repeated.",
+)
+@click.option(
+    "--at-least",
+    callback=converted(partial(make_constraint, limit="at_least")),
+    multiple=True,
+    metavar="ADDRESS=LIMIT",
+    help="Likewise, that it (of an array, its smallest entry) never falls below the limit.",
 )
 @click.option("--minimize", is_flag=True, help="The quality is a cost: smaller is better.")
-@click.option("--risk", default="worst", show_default=True, help="How conditions become one: worst or mean.")
+@click.option(
+    "--risk",
+    callback=converted(_risk),
+    default="worst",
+    show_default=True,
+    help="How conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
+)
 @click.option("--solver", metavar="NAME", help="auto if left out, or that of the file.")
+@click.option(
+    "--option",
+    "options",
+    callback=converted(parse_field),
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Of the solver. May be repeated.",
+)
 @click.option("--seed", type=int, metavar="N", help="Of the solver; 0 if left out, or that of the file.")
 @click.option("--rollouts", type=click.IntRange(min=1), metavar="N", help="How many the study has in the end.")
 @click.option("--seconds", type=float, metavar="S", help="Wall time of this run.")
@@ -60,15 +115,31 @@ def study() -> None:
     "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
 )
 @click.option("--time-limit", type=float, metavar="S", help="A rollout that takes longer fails.")
+@click.option(
+    "--racing/--no-racing",
+    default=None,
+    help="Drop points that can no longer win before all conditions have run; the default with several conditions.",
+)
+@click.option(
+    "--on-error",
+    type=click.Choice(["record", "raise"]),
+    default="record",
+    show_default=True,
+    help="Where the quality function fails: record the rollout as failed, or end the run.",
+)
 @click.option("--allow-changed-code", is_flag=True, help="Resume although the code of the problem has changed.")
 def run(
     file: Path,
     scenario: Scenario,
     vary: tuple[Parameter, ...],
+    choose: tuple[Choice, ...],
+    at_most: tuple[Constraint, ...],
+    at_least: tuple[Constraint, ...],
     *,
     minimize: bool,
-    risk: str,
+    risk: str | Risk,
     solver: str | None,
+    options: tuple[tuple[str, Any], ...],
     seed: int | None,
     rollouts: int | None,
     seconds: float | None,
@@ -76,13 +147,35 @@ def run(
     executor: str,
     workers: int | None,
     time_limit: float | None,
+    racing: bool | None,
+    on_error: str,
     allow_changed_code: bool,
     **problem: Any,
 ) -> None:
-    """Begin a study, or go on with the one in FILE. Ctrl-C keeps what is finished."""
+    """Begin a study, or go on with the one in FILE. Ctrl-C keeps what is finished.
+
+    It takes one quality, read as the best over time. Several qualities, other readings, limits of the quality and
+    callbacks need a Python program: see Problem.study.
+
+    \b
+    Example:
+      vtbdrake study run gait.db diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+          --vary dps.impl.gait.period=1:4:log --choose scenario.gravity=1.62,9.81 \\
+          --quality sim.sys.climber.base.x --at-most sim.sys.climber.base.pitch=0.2
+    """
+    if not (vary or choose):
+        raise click.UsageError("say with --vary or --choose what is varied")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    stated = make_problem(scenario, vary, **problem, minimize=minimize, risk=risk)
-    with stated.study(file, solver=solver, seed=seed, allow_changed_code=allow_changed_code) as opened:
+    stated = make_problem(
+        scenario, [*vary, *choose], **problem, minimize=minimize, risk=risk, constraints=[*at_most, *at_least]
+    )
+    with stated.study(
+        file,
+        solver=solver,
+        seed=seed,
+        options=settings(options) if options else None,
+        allow_changed_code=allow_changed_code,
+    ) as opened:
         opened.run(
             rollouts=rollouts,
             seconds=seconds,
@@ -90,6 +183,8 @@ def run(
             executor=executor,
             workers=workers,
             time_limit=time_limit,
+            racing=racing,
+            on_error=on_error,
         )
         click.echo(opened.summary())
         if opened.reason == "interrupted":
