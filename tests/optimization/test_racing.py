@@ -190,7 +190,7 @@ def test_auto_comes_to_its_local_search_under_racing():
     study = problem(4, "mean", quality=QUALITIES["maximized up to 1"]).study()
     study.run(rollouts=400, executor=StatedExecutor(f), progress=False)
     assert any("around the best" in trial.method for trial in study.trials)
-    assert study.reason == "solver", "its plan fits the budget, and is not cut off in the midst"
+    assert 396 < len(study) <= 400, "all is spent but what is less than a point under all conditions"
 
 
 def test_racing_saves_what_the_worst_condition_tells():

@@ -104,7 +104,7 @@ def parse_scaled_range(text: str) -> Parameter:
     kinds = [part.strip() for part in parts[2:]]
     if len(set(kinds) & SCALES) < len(kinds):
         raise click.BadParameter(f"it takes ADDRESS=LOWER:UPPER, then :log, :integer or both, not {text!r}")
-    return replace(parse_range(":".join(parts[:2])), **dict.fromkeys(kinds, True))
+    return replace(parse_range(":".join(parts[:2])), log="log" in kinds, integer="integer" in kinds)
 
 
 def parse_choice(text: str) -> Choice:

@@ -43,16 +43,16 @@ def make_constraint(text: str, *, limit: str) -> Constraint:
     what, _, number = (part.strip() for part in text.rpartition("="))
     form = "ADDRESS=LIMIT or MODULE:FUNCTION(ADDRESS,...)=LIMIT"
     try:
-        value = float(number)
+        limits: dict[str, Any] = {limit: float(number)}
     except ValueError as error:
         raise click.BadParameter(f"it takes {form}, LIMIT a number, not {text!r}") from error
     call = _CALL.fullmatch(what)
     if call is not None:
         of = [address.strip() for address in call[2].split(",") if address.strip()]
-        return Constraint(_function(call[1]), of=of, **{limit: value})
+        return Constraint(_function(call[1]), of=of, **limits)
     if not what or _FUNCTION.fullmatch(what):
         raise click.BadParameter(f"it takes {form}, not {text!r}")
-    return Constraint(largest if limit == "at_most" else smallest, of=what, **{limit: value})
+    return Constraint(largest if limit == "at_most" else smallest, of=what, **limits)
 
 
 def make_quality(text: str, of: Sequence[str]) -> Quality:

@@ -197,10 +197,10 @@ def test_auto_chooses_by_the_problem(space, arguments, method):
     [
         (2, 30, ["bayesian"]),
         (21, 100, ["sobol", "CMA-ES, start 1, population 13"]),
-        (2, 400, ["bayesian", "LN_BOBYQA around the best", "CMA-ES, start 1, population 6"]),
+        (2, 180, ["bayesian", "LN_BOBYQA around the best", "CMA-ES, start 1, population 6"]),
     ],
 )
-def test_auto_has_a_plan_for_every_budget(size, budget, methods):
+def test_auto_has_a_plan_for_every_budget(size, budget, methods, short_model):
     space = box(size, -3.0, 4.0)
     solver = make_solver("auto", space, budget=budget)
     log = drive(solver, lambda p: float(np.sum((np.array(p) - 1.0) ** 2)))
@@ -208,14 +208,39 @@ def test_auto_has_a_plan_for_every_budget(size, budget, methods):
     assert [method for _, method in solver.changes][: len(methods)] == methods
 
 
-def test_what_racing_saves_goes_to_the_later_phases_of_auto():
+@pytest.mark.parametrize("function", [SPHERE, ROSENBROCK, ACKLEY])
+@pytest.mark.parametrize("budget", [90, 180])
+def test_auto_spends_its_whole_budget(function, budget, short_model):
+    solver = make_solver("auto", function.space, budget=budget)
+    assert len(drive(solver, function.cost)) == budget
+    assert (solver.success, solver.message) == (False, f"the budget of {budget} evaluations is spent")
+
+
+def test_the_start_takes_from_the_budget_of_auto_once():
+    solver = make_solver("auto", SPHERE.space, budget=12, start=(3.0, 3.5))
+    assert len(drive(solver, SPHERE.cost)) == 12
+    assert [method for _, method in solver.changes] == ["start", "bayesian"]
+
+
+@pytest.mark.parametrize(("continuous", "method"), [(2, "LN_BOBYQA around the best"), (1, "LN_COBYLA around the best")])
+def test_auto_searches_locally_with_the_integers_held(continuous, method, short_model):
+    solver = make_solver("auto", (COUNT, *box(continuous, -3.0, 4.0)), budget=150)
+    log = drive(solver, lambda p: (p[0] - 2) ** 2 + sum((x - 0.1 * p[0]) ** 2 for x in p[1:]))
+    assert solver.changes[1][1] == method
+    best = max(log, key=lambda e: e.values[0])
+    assert best.point == (2, *[pytest.approx(0.2, abs=1e-5)] * continuous)
+    assert -best.values[0] < 1e-10
+
+
+def test_what_racing_saves_goes_to_the_later_phases_of_auto(short_model):
     # Every point takes a quarter of what its conditions would take: there are four times as many points.
     solver = make_solver("auto", SPHERE.space, budget=100)
     asked = 0
     while points := solver.ask():
         asked += len(points)
         solver.tell([replace(evaluation(p, ACKLEY.cost), effort=0.25) for p in points])
-    assert 150 <= asked <= 400
+    # Less than one evaluation is left.
+    assert 396 < asked <= 400
     assert [method for _, method in solver.changes][:2] == ["bayesian", "LN_BOBYQA around the best"]
 
 
@@ -231,7 +256,7 @@ def test_what_racing_dropped_is_no_start_of_a_local_search():
     assert SPHERE.cost(points[0]) < 0.1
 
 
-def test_auto_starts_anew_with_larger_populations_and_another_method():
+def test_auto_starts_anew_with_larger_populations_and_another_method(short_model):
     solver = make_solver("auto", ACKLEY.space, budget=2500)
     methods = []
     while points := solver.ask():
@@ -247,7 +272,7 @@ def test_auto_starts_anew_with_larger_populations_and_another_method():
     ]
 
 
-def test_auto_leaves_a_search_that_stalls():
+def test_auto_leaves_a_search_that_stalls(short_model):
     # A plateau with noise below the criterion: CMA-ES alone would go on.
     solver = make_solver("auto", ROSENBROCK.space)
 

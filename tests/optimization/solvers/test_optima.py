@@ -26,6 +26,8 @@ from vtbdrake.optimization.solvers.nlopt_algorithms import (
     WITH_DERIVATIVES,
 )
 
+pytestmark = pytest.mark.usefixtures("short_model")
+
 LOCAL = ["SNOPT", "IPOPT", "LD_SLSQP", "LN_BOBYQA", "LN_NELDERMEAD"]
 
 

@@ -33,6 +33,9 @@ SEEDED = [
 ]
 
 
+pytestmark = pytest.mark.usefixtures("short_model")
+
+
 @pytest.fixture(autouse=True)
 def no_thread_is_left():
     before = set(threading.enumerate())

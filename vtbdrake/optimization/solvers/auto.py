@@ -42,8 +42,8 @@ class Auto(BatchSolver):
       objective: a grid;
     * several objectives, or a categorical parameter: Bayesian optimization to the end;
     * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most, and a local search from
-      its best point. Then CMA-ES from the best point; where less than ten generations of it are left, what is left
-      goes to Bayesian optimization instead;
+      its best point, for a third of what is left at most. Then CMA-ES from the best point; where less than ten
+      generations of it are left, what is left goes to Bayesian optimization instead;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
     So the first points, which matter most where rollouts are expensive, are chosen with care, and thousands of points
@@ -54,10 +54,11 @@ class Auto(BatchSolver):
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
     Then it starts anew at a random point with twice the population (IPOP); every third start is differential evolution,
     since no global method alone is reliable. Five starts in a row that do not improve the best value by as much are the
-    end, with success. Last, a tenth of the budget at most goes into another local search.
+    end, with success. Last, if the best point is better than that of the model, a tenth of the budget at most goes into
+    another local search, and what is left then into Bayesian optimization.
 
-    The local searches (BOBYQA, or COBYLA with constraints or one parameter) stay in a box around the best point. They
-    take place if all parameters are continuous and there are at most 20.
+    The local searches (BOBYQA, or COBYLA with constraints or one continuous parameter) stay in a box around the best
+    point and hold its integers. They take place with at most 20 parameters of which at least one is continuous.
 
     Args:
         search: what is searched.
@@ -76,6 +77,8 @@ class Auto(BatchSolver):
         self._solver: BatchSolver
         self._patience = math.inf
         self._limit = math.inf
+        # The best point that a local search began from: its integers are not varied.
+        self._held: Point | None = None
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
         # What was told before the model began.
@@ -121,23 +124,28 @@ class Auto(BatchSolver):
             yield
         self._begin_model()
         yield
-        if self._best is not None and self._has_local:
-            self._begin_local(self._best.point, radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
+        found = self._best
+        if found is not None and self._has_local:
+            self._begin_local(radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
             yield
-        fruitless, start, polished = 0, 0, self._best
+        fruitless, start = 0, 0
         while fruitless < PATIENCE and self._left_but_polish() > 0:
             before = self._best
             self._begin_global(start)
             yield
             start += 1
             fruitless = 0 if self._progress(before, self._best) else fruitless + 1
-        if self._best is not None and self._has_local and self._progress(polished, self._best):
-            self._begin_local(self._best.point, radius=POLISH_RADIUS, limit=math.inf)
+        if self._has_local and self._progress(found, self._best):
+            self._begin_local(radius=POLISH_RADIUS, limit=math.inf)
             yield
         if fruitless == PATIENCE:
             self._end(True, f"{PATIENCE} starts in a row found nothing better")
-        else:
-            self._spent()
+            return
+        # The last local search did not take place, or has converged.
+        while self._left:
+            self._begin_model()
+            yield
+        self._spent()
 
     def _begin_model(self) -> None:
         """The Gaussian process, or of many parameters a design."""
@@ -150,7 +158,9 @@ class Auto(BatchSolver):
         if left < points + 10 * default_population(size):
             points = int(left)
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
-        model.tell(self._before)
+        # They took from the budget already.
+        known = [*self._before, *([] if self._best is None else [self._best])]
+        model.tell([replace(evaluation, effort=0.0) for evaluation in known])
         # With racing, the budget may allow for many more points.
         self._begin(MODEL, model, limit=points)
 
@@ -184,13 +194,17 @@ class Auto(BatchSolver):
 
     @property
     def _has_local(self) -> bool:
-        space = self.search.space
-        return len(space) <= MODEL_SIZE and all(parameter.is_continuous for parameter in space)
+        return len(self._continuous) > 0 and self.search.size <= MODEL_SIZE
+
+    @property
+    def _continuous(self) -> list[int]:
+        """Which parameters are continuous, by their places."""
+        return [i for i, parameter in enumerate(self.search.space) if parameter.is_continuous]
 
     @property
     def _local_limit(self) -> int:
         """How many evaluations a local search takes at most."""
-        return 20 * (self.search.size + 1)
+        return 20 * (len(self._continuous) + 1)
 
     def _left_but_polish(self) -> float:
         """The evaluations that are left for global methods."""
@@ -199,16 +213,20 @@ class Auto(BatchSolver):
         reserve = min(self.search.budget // 10, self._local_limit) if self._has_local else 0
         return self._left - reserve
 
-    def _begin_local(self, best: Point, *, radius: float, limit: float) -> None:
+    def _begin_local(self, *, radius: float, limit: float) -> None:
+        """A local search that begins at the best point, whose integers are held."""
+        assert self._best is not None
+        best, varied = self._best.point, self._continuous
         u = self.search.unit(best)
         lower = self.search.point(np.maximum(u - radius, 0.0))
         upper = self.search.point(np.minimum(u + radius, 1.0))
-        box = tuple(_between(*ends) for ends in zip(self.search.space, lower, upper, strict=True))
+        box = tuple(_between(self.search.space[i], lower[i], upper[i]) for i in varied)
         # BOBYQA takes no constraints, and at least two parameters.
-        name = "LN_COBYLA" if self.search.constraints or self.search.size == 1 else "LN_BOBYQA"
+        name = "LN_COBYLA" if self.search.constraints or len(varied) == 1 else "LN_BOBYQA"
         budget = int(max(1, min(limit, self._local_limit)))
-        search = replace(self.search, space=box, start=best, budget=budget)
+        search = replace(self.search, space=box, start=tuple(best[i] for i in varied), budget=budget)
         self._begin(f"{name} around the best", NloptDerivativeFree(search, name=name))
+        self._held = best
 
     # ------------------------------------------------------------------------------ its steps
 
@@ -224,6 +242,7 @@ class Auto(BatchSolver):
             limit: after how many points it ends.
         """
         self._method = method
+        self._held = None
         self._changes.append((self._count, method))
         self._solver = solver
         self._stage_best = None
@@ -234,7 +253,7 @@ class Auto(BatchSolver):
     def _next(self) -> list[Point]:
         while self._success is None:
             ended = self._without_progress > self._patience or self._count >= self._limit
-            points = [] if ended else self._solver.ask()
+            points = [] if ended else [self._with_held(point) for point in self._solver.ask()]
             if points:
                 self._count += len(points)
                 return points
@@ -242,8 +261,18 @@ class Auto(BatchSolver):
             next(self._plan, None)
         return []
 
+    def _with_held(self, point: Point) -> Point:
+        """A point of the method, with the integers that are held."""
+        if self._held is None:
+            return point
+        varied = dict(zip(self._continuous, point, strict=True))
+        return tuple(varied.get(i, held) for i, held in enumerate(self._held))
+
+    def _without_held(self, point: Point) -> Point:
+        return point if self._held is None else tuple(point[i] for i in self._continuous)
+
     def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        self._solver.tell([*asked, *given])
+        self._solver.tell([replace(e, point=self._without_held(e.point)) for e in (*asked, *given)])
         if self.search.objectives > 1:
             return
         if not self._changes or self._solver.name in ("start", MODEL, "sobol"):

@@ -138,8 +138,7 @@ class Bayesian(BatchSolver):
             return np.array(sorted(range(len(told)), key=lambda i: rank_key(told[i])))
         costs = costs[:, : self.search.objectives]
         feasible = np.array([evaluation.feasible for evaluation in told])
-        better = [int(np.sum(np.all(costs <= row, axis=1) & np.any(costs < row, axis=1) & feasible)) for row in costs]
-        return np.lexsort((np.array(better), ~feasible))
+        return np.lexsort((_domination(costs)[feasible].sum(axis=0), ~feasible))
 
     def _targets(self, told: Sequence[Evaluation]) -> np.ndarray:
         """What the models are fitted to, shape (k, objectives + constraints): costs, and violations around 0."""
@@ -184,23 +183,23 @@ class Bayesian(BatchSolver):
     def _weighed_improvement(self, models: Sequence[_Model], costs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """The logarithm of the EI of max_i(w_i c_i) + 0.05 sum_i(w_i c_i), with weights w drawn at random."""
         weights = self._rng.dirichlet(np.ones(len(models)))
-        front = costs[[not np.any(np.all(costs <= c, axis=1) & np.any(costs < c, axis=1)) for c in costs]]
+        front = costs[~_domination(costs).any(axis=0)]
         lowest, width = front.min(axis=0), np.ptp(front, axis=0)
         width = np.where(width > 1e-6, width, 1.0)
         quantiles = ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
-        draws = np.column_stack([self._rng.permutation(quantiles) for _ in models])
+        draws = [self._rng.permutation(quantiles) for _ in models]
 
-        def weighed(c: np.ndarray) -> np.ndarray:
-            parts = weights * (c - lowest) / width
-            return np.asarray(np.max(parts, axis=-1) + 0.05 * np.sum(parts, axis=-1))
+        def weighed(each: Sequence[np.ndarray]) -> np.ndarray:
+            """The weighed costs, of one array per objective."""
+            parts = [w * (c - low) / span for w, c, low, span in zip(weights, each, lowest, width, strict=True)]
+            return np.asarray(np.maximum.reduce(parts) + 0.05 * np.add.reduce(parts))
 
-        best = weighed(costs).min()
+        best = weighed(list(costs.T)).min()
 
         def improvement(places: np.ndarray) -> np.ndarray:
-            means, deviations = (
-                np.column_stack(each) for each in zip(*(m.predict(places) for m in models), strict=True)
-            )
-            gains = np.maximum(best - weighed(means[:, np.newaxis] + deviations[:, np.newaxis] * draws), 0.0)
+            means, deviations = zip(*(model.predict(places) for model in models), strict=True)
+            drawn = [m[:, np.newaxis] + d[:, np.newaxis] * z for m, d, z in zip(means, deviations, draws, strict=True)]
+            gains = np.maximum(best - weighed(drawn), 0.0)
             # The small part leads to where a draw might improve, if none does.
             return np.asarray(np.log(gains.mean(axis=1) + 1e-9 * np.exp(np.minimum(best - weighed(means), 0.0))))
 
@@ -339,6 +338,12 @@ def _log_h(z: np.ndarray) -> np.ndarray:
     near = np.maximum(z, -6.0)
     exact = np.log(np.exp(-0.5 * near**2) / np.sqrt(2.0 * np.pi) + near * np.exp(log_ndtr(near)))
     return np.where(z > -6.0, exact, log_phi - 2.0 * np.log(np.maximum(-z, 1.0)))
+
+
+def _domination(costs: np.ndarray) -> np.ndarray:
+    """Whether row i of ``costs``, shape (k, m), dominates row j: nowhere worse, somewhere better; shape (k, k)."""
+    no_worse = np.logical_and.reduce([column[:, np.newaxis] <= column for column in costs.T])
+    return np.asarray(no_worse & ~no_worse.T)
 
 
 def _normal(costs: np.ndarray) -> np.ndarray:
