@@ -9,10 +9,12 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.guard import Guards
 from vtbdrake.control.operation import take_over
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed import DpsAlone, Interface
 
 TARGET = np.array([0.2, -0.1])
 
@@ -548,6 +550,12 @@ def test_an_interruption_that_pybind11_drops_ends_the_loop():
         ({"continuity": {"velocty": ("speed", 1.0)}}, "not from 'velocty' to 'speed'; there are velocity and"),
         ({"continuity": {"velocity": ("sped", 1.0)}}, "not from 'velocity' to 'sped'"),
         ({"continuity": {"velocity": ("speed", np.nan)}}, "a number from 0 on, not nan"),
+        ({"guards": Guards(ServoScenario().interface(), 1.0)}, "made for a period of 1.0 s, and it has 0.001 s"),
+        ({"statistics": LoopStatistics(1.0)}, "made for a period of 1.0 s, and it has 0.001 s"),
+        (
+            {"guards": Guards(Interface(sense=[], act=[]), PERIOD)},
+            "made for the actuator signals none, and its DPS has velocity",
+        ),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):

@@ -68,6 +68,7 @@ class Guards:
         log_size: how many faults `log` keeps.
 
     Attributes:
+        period: of the loop whose cycles they judge, in seconds.
         commands: the guard of each actuator signal, with its counts.
         watchdogs: of each sensor signal.
         log: the newest faults, each once while it lasts.
@@ -108,7 +109,7 @@ class Guards:
             s.name: chain(fallback.get(s.name) or default_fallback(s), s, interface=interface) for s in interface.act
         }
         self._max_missed = max_missed
-        self._period = period
+        self.period = period
         self._latched: tuple[Fault, ...] = ()
         self._faults: tuple[Fault, ...] = ()
         self._causes: tuple[Fault, ...] = ()  # Those of them that are not about sensor signals.
@@ -329,7 +330,7 @@ class Guards:
 
     def _fall_back(self, now: float, receptions: Mapping[str, Reception]) -> dict[str, Any]:
         """The fallbacks' commands, within the limits."""
-        dt = self._period if self._last is None else now - self._last
+        dt = self.period if self._last is None else now - self._last
         self._last = now
         sensed = {
             name: reception.value

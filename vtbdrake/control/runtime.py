@@ -20,7 +20,7 @@ from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepped import Stepped
 from vtbdrake.control.switching import Preparation, SwitchRefusedError, check_continuity, jumps, prepare
-from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
+from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
@@ -47,7 +47,8 @@ class Runtime(Stepped):
         period: of a cycle, in seconds.
         context: where the target begins; by default its defaults. It is the runtime's own from here on.
         clock: by default the wall clock, which wakes up 0.1 ms early; a `SimulatedClock` makes tests deterministic.
-        guards: limits, watchdogs and fallbacks; by default those that follow from the interface.
+        guards: limits, watchdogs and fallbacks, made for the same period and signals; by default those that follow from
+            the interface.
         pace: by default the clock; the name of a sensor signal lets every message of it begin a cycle (lock-step with
             the machine), or the clock, where none comes for ``patience`` periods. Where the machine tells a cycle in
             several messages, name a signal of the last one: a cycle begins with the first message that has the signal,
@@ -98,6 +99,7 @@ class Runtime(Stepped):
         self.clock = clock or WallClock(spin=1e-4)
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
+        _check_made_for(self.guards, self.statistics, target.interface, period)
         self.guards.departures = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.ready = ready
         self.cycles = 0
@@ -351,3 +353,21 @@ class Runtime(Stepped):
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
         self.changed(RESET, {})
+
+
+def _check_made_for(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:
+    """
+    Raises:
+        ValueError: they are those of a loop with another period, or of another DPS.
+    """
+    for what, its in (("guards", guards.period), ("statistics", statistics.period)):
+        if its != period:
+            raise ValueError(f"the {what} of this loop are made for a period of {its} s, and it has {period} s")
+    sides = (("actuator", guards.commands, interface.act), ("sensor", guards.watchdogs, interface.sense))
+    for side, guarded, signals in sides:
+        names = [signal.name for signal in signals]
+        if set(guarded) != set(names):
+            raise ValueError(
+                f"the guards of this loop are made for the {side} signals {', '.join(guarded) or 'none'}, and its DPS "
+                f"has {', '.join(names) or 'none'}"
+            )
