@@ -24,6 +24,7 @@ from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers import Evaluation, Point, make_solver
 from vtbdrake.rollout import RolloutRunner
+from vtbdrake.testbed import SimulatorFields
 
 BUDGETS = (30, 100, 400)
 SEEDS = range(5)
@@ -187,7 +188,8 @@ _FONSECA = math.exp(-4.0) - float(np.trapezoid(np.exp(-((_t + 1.0) ** 2)), 1.0 -
 def pendulum() -> Problem:
     """Which swing of a pendulum ends near 0.3 rad, whatever its damping is? At worst, at each of `DAMPINGS`."""
     return vtb.Problem(
-        scenario=PendulumScenario(),
+        # Less exact than usual, so that the benchmark is quick.
+        scenario=PendulumScenario(simulator=SimulatorFields(accuracy=1e-4, max_step_size=0.1)),
         parameters=[vtb.Parameter(ANGLE, -1.5, 1.5), vtb.Parameter(RATE, -6.0, 6.0)],
         quality=vtb.Quality(lambda theta: abs(theta - 0.3), ANGLE, minimize=True, reading="end"),
         horizon=0.8,
@@ -218,7 +220,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "integers": lambda: Case(_ackley, _INTEGERS, 0.0),
     "two_qualities_fonseca": lambda: Case(_fonseca, _box(3, -4.0, 4.0), -_FONSECA, corner=(1.0, 1.0)),
     "two_qualities_zdt1": lambda: Case(_zdt1, _box(4, 0.0, 1.0), -2.0 / 3.0, corner=(1.0, 1.0)),
-    STUDY: lambda: Case(_swing, pendulum().parameters, 0.0964906, rollouts=len(DAMPINGS)),
+    STUDY: lambda: Case(_swing, pendulum().parameters, 0.0964855, rollouts=len(DAMPINGS)),
 }
 
 

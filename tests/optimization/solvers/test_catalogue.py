@@ -232,6 +232,14 @@ def test_auto_searches_locally_with_the_integers_held(continuous, method, short_
     assert -best.values[0] < 1e-10
 
 
+def test_auto_searches_locally_in_a_range_of_two_numbers(short_model):
+    space = (Parameter("x", 1.0, np.nextafter(1.0, 2.0)), Parameter("y", 0.0, 1.0))
+    solver = make_solver("auto", space, budget=100)
+    log = drive(solver, lambda p: (p[1] - 0.3) ** 2)
+    assert any("around the best" in method for _, method in solver.changes)
+    assert max(told.values[0] for told in log) > -1e-8
+
+
 def test_what_racing_saves_goes_to_the_later_phases_of_auto(short_model):
     # Every point takes a quarter of what its conditions would take: there are four times as many points.
     solver = make_solver("auto", SPHERE.space, budget=100)

@@ -298,5 +298,6 @@ class Auto(BatchSolver):
 
 
 def _between(parameter: Dimension, lower: float, upper: float) -> Parameter:
+    """The parameter between two ends; with its own where they are equal, in a range of a few floating-point numbers."""
     assert isinstance(parameter, Parameter)
-    return replace(parameter, lower=lower, upper=upper)
+    return replace(parameter, lower=lower, upper=upper) if lower < upper else parameter
