@@ -315,7 +315,8 @@ def test_a_budget_of_rollouts_is_kept_to_the_rollout():
 def test_a_small_budget_under_many_conditions_has_a_best_point():
     conditions = [{DAMPING: d} for d in (0.0, 0.1, 0.2, 0.3)]
     study = pendulum_problem(conditions=conditions).study().run(rollouts=40, executor="serial", progress=False)
-    assert len(study) == 40 and study.best.exact
+    # What is left is not enough for another point under all conditions.
+    assert 40 - len(conditions) < len(study) <= 40 and study.best.exact
 
 
 def test_a_target_ends_a_study():

@@ -80,12 +80,13 @@ class AddressedDiagram:
         return context
 
     def check_context(self, context: Context) -> None:
-        """
+        """Refuse a context that is not the root context of this diagram, or of a diagram that holds it.
+
         Raises:
-            ValueError: ``context`` is not one of the whole diagram's.
+            ValueError: it is another diagram's, or that of a part.
         """
         try:
-            self.diagram.ValidateContext(context)
+            self.diagram.ValidateContext(self.diagram.GetMyContextFromRoot(context))
         except (RuntimeError, TypeError) as error:
             raise ValueError(
                 "this is no context of this testbed, but of another one (or another build, or of a part), or none at "

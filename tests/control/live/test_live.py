@@ -95,7 +95,7 @@ def test_who_is_not_let_to_set_is_told_by_whom(hub: Hub) -> None:
 @pytest.mark.parametrize("noise", [b"", b"[1]", b"no", b"\xff", b"[" * 5000, b'{"id": 3}'])
 def test_what_is_no_answer_is_not_taken_for_one(hub: Hub, noise: bytes) -> None:
     bus = lcm.LCM(hub.url)
-    with served(hub.url) as (rig, _), LiveClient(hub.url, timeout=PATIENCE) as client:
+    with served(hub.url, **AMPLE) as (rig, _), LiveClient(hub.url, timeout=PATIENCE) as client:
         for channel in ("VTB_GET_ANSWER", "VTB_WATCH_ANSWER", "VTB_GET", "VTB_SET", "VTB_WATCH"):
             bus.publish(channel, noise)
         assert list(rig.during(client.get, ["dps.gain"])) == ["dps.gain"]
@@ -287,7 +287,7 @@ def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
 
 
 def test_a_latch_is_released_from_outside_once_its_cause_is_over(hub: Hub) -> None:
-    with served(hub.url) as (rig, _):
+    with served(hub.url, **AMPLE) as (rig, _):
         assert rig.during(asked, hub.url, "reset") == []
         rig.during(asked, hub.url, "set", {"dps.trouble": 1.0})
         rig.until(lambda: rig.runtime.guards.latched != ())
@@ -364,7 +364,7 @@ def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> Non
             list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=timeout))
         return str(caught.value)
 
-    with served(hub.url) as (rig, _):
+    with served(hub.url, **AMPLE) as (rig, _):
         rig.during(asked, hub.url, "get", ["dps.gain"])
         told = "or 1000000000 cycles of it take longer"
         assert rig.during(lambda: any(told in reason(timeout) for timeout in LONGER_AND_LONGER))
@@ -372,7 +372,7 @@ def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> Non
 
 def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
     bus = lcm.LCM(hub.url)
-    with served(hub.url) as (rig, service):
+    with served(hub.url, **AMPLE) as (rig, service):
         rig.during(asked, hub.url, "get", ["dps.gain"])
         bus.publish("VTB_WATCH", json.dumps({"id": "me", "watch": ["dps.gain"], "lease": 0.2}).encode())
         rig.until(lambda: service.watches == 1)
@@ -388,7 +388,7 @@ def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
 
 def test_commands_are_the_same_to_the_last_bit_whether_watched_or_not(hub: Hub) -> None:
     addresses = ["real.act.velocity", "dps.seen"]
-    with served(hub.url) as (rig, _), LiveWatch(hub.url, addresses, timeout=PATIENCE) as live:
+    with served(hub.url, **AMPLE) as (rig, _), LiveWatch(hub.url, addresses, timeout=PATIENCE) as live:
         rig.during(live.wait, 100, timeout=PATIENCE)
     alone = Rig()
     while len(alone.bridge.sent) < len(rig.bridge.sent):
@@ -414,7 +414,7 @@ def test_the_newest_values_are_kept_to_be_plotted(hub: Hub) -> None:
 
 
 def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
-    with served(hub.url) as (rig, _):
+    with served(hub.url, **AMPLE) as (rig, _):
         live = LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE)
         rig.during(live.wait, 5, timeout=PATIENCE)
     live.close()
@@ -422,7 +422,7 @@ def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
 
 
 def test_the_loop_goes_on_when_the_companion_is_gone(hub: Hub) -> None:
-    with served(hub.url) as (rig, service):
+    with served(hub.url, **AMPLE) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
             rig.during(live.wait, 5, timeout=PATIENCE)
             service._companion.kill()

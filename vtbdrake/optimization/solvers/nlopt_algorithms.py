@@ -2,8 +2,9 @@
 
 The first letter says global or local, the second says whether it uses derivatives (D) or not (N). Not offered, though
 Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which its build leaves out, and those
-that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name. They return at
-once with x = nan.
+that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name: they return at
+once with x = nan. Nor is LN_NEWUOA_BOUND, which can compute for ever without a call of the function, and holds Python's
+lock meanwhile; LN_BOBYQA is its successor.
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
 """
@@ -31,7 +32,6 @@ DERIVATIVE_FREE = (
     "LN_COBYLA",
     "LN_NELDERMEAD",
     "LN_NEWUOA",
-    "LN_NEWUOA_BOUND",
     "LN_PRAXIS",
     "LN_SBPLX",
 )
@@ -64,8 +64,8 @@ WITH_CONSTRAINTS = frozenset(
     }
 )
 
-# PRAXIS goes round in circles on one parameter, and the NEWUOAs refuse it.
-SEVERAL_PARAMETERS = frozenset({"LN_NEWUOA", "LN_NEWUOA_BOUND", "LN_PRAXIS"})
+# PRAXIS goes round in circles on one parameter, and NEWUOA refuses it.
+SEVERAL_PARAMETERS = frozenset({"LN_NEWUOA", "LN_PRAXIS"})
 
 # NLopt seeds its random numbers from the clock, and Drake has no way to seed them.
 SEEDED_BY_CLOCK = frozenset(
@@ -88,9 +88,7 @@ UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
 # These do not survive an exception in their callback: they go on for ever, or crash the process. When they are closed,
 # they are given the same value everywhere instead, and run to their end or to the limit of their calls: the budget, or
 # this number without one.
-NO_EXCEPTIONS = frozenset(
-    {"GD_STOGO", "GD_STOGO_RAND", "GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L", "LN_NEWUOA", "LN_NEWUOA_BOUND"}
-)
+NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L", "LN_NEWUOA"})
 LIMIT = 5_000
 
 # How NLopt names the number that it returns.
