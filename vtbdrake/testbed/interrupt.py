@@ -38,6 +38,8 @@ class Interruptible:
             self._handler(number, frame)
         except BaseException as error:
             self._raised = error
+            # At once, as this may be raised where the block ends, before `__exit__` comes to it.
+            signal.signal(signal.SIGINT, self._handler)
             raise
 
     def check(self) -> None:
@@ -49,10 +51,6 @@ class Interruptible:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._handler is not None:
-            try:
-                signal.signal(signal.SIGINT, self._handler)
-            except BaseException:  # Ctrl-C came just now: it is handled first, and then no handler is set.
-                signal.signal(signal.SIGINT, self._handler)
-                raise
+            signal.signal(signal.SIGINT, self._handler)
         if error is not self._raised:
             self.check()

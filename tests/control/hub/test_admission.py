@@ -36,7 +36,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become ano
 
 # What another user does: it connects as told, n times; says how each went; and keeps them until it is told to end.
 _STRANGER = """
-import os, socket, sys
+import encodings.idna, os, socket, sys  # before setuid: the interpreter may lie where only root may look
 from struct import pack
 host, port, kind, n, user = sys.argv[1], int(sys.argv[2]), sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
 os.setuid(user)
@@ -115,7 +115,7 @@ def test_what_a_stranger_sends_before_it_closes_its_socket_does_not_pass_as_root
     listener = Client(hub.url, "A")
     os.kill(hub.pid, signal.SIGSTOP)  # It sees the connection when nobody is there any more
     code = f"""
-import os, socket
+import encodings.idna, os, socket
 os.setuid({STRANGER})
 with socket.create_connection({address(hub.url)!r}) as sock:
     sock.sendall({GREETING + record(1, b"A", b"forged")!r})

@@ -68,6 +68,7 @@ def test_an_unknown_option_is_never_ignored():
         ("QMC", {"constraints": 2}, "QMC knows no constraints"),
         ("LN_PRAXIS", {}, "LN_PRAXIS needs at least two parameters, and there is one; LN_COBYLA can do that"),
         ("LN_NEWUOA", {}, "at least two parameters"),
+        ("GN_ORIG_DIRECT", {}, "at least two parameters"),
         ("bayesian", {"batch": 0}, "batch is a number of points, at least one, not 0"),
         ("sobol", {"start": (0.5,)}, "sobol does not start at a point"),
         ("SNOPT", {"start": (0.5, 0.5)}, "one value per parameter, 1, not 2"),
