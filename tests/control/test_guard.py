@@ -589,7 +589,7 @@ happenings = st.sampled_from(["go", "go", "wild", "nan", "raise", "lost", "back"
 def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_acts(
     script: list[tuple[str, int, float]],
 ) -> None:
-    """The machine goes where it likes once it has heard nothing for more than ten cycles."""
+    """The machine goes where it likes once it has heard nothing for more than ten cycles since it was switched on."""
     mute = False
     quiet = FallbackController(lambda *_: NO_COMMAND if mute else [8.0, -8.0], otherwise=Hold())
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
@@ -606,6 +606,7 @@ def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_act
             loop.receptions["acting"].value = acting
             if event == "on" and not on:
                 loop.guards.start("torque", acting)
+                heard = loop.now
             on = {"on": True, "off": False}.get(event, on)
             wanted = {"wild": [9.0, -9.0], "nan": [nan, 0.0]}.get(event, [0.3, 0.3])
             options: dict[str, Any] = {"error": RuntimeError("x")} if event == "raise" else {}

@@ -4,7 +4,8 @@ The first letter says global or local, the second says whether it uses derivativ
 Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which its build leaves out, and those
 that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name: they return at
 once with x = nan. Nor is LN_NEWUOA_BOUND, which can compute for ever without a call of the function, and holds Python's
-lock meanwhile; LN_BOBYQA is its successor.
+lock meanwhile (LN_BOBYQA is its successor), nor GN_ORIG_DIRECT and GN_ORIG_DIRECT_L, which crash the process with drake
+1.58 (GN_DIRECT and GN_DIRECT_L are the same methods).
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
 """
@@ -24,8 +25,6 @@ DERIVATIVE_FREE = (
     "GN_ISRES",
     "GN_MLSL",
     "GN_MLSL_LDS",
-    "GN_ORIG_DIRECT",
-    "GN_ORIG_DIRECT_L",
     "LN_AUGLAG",
     "LN_AUGLAG_EQ",
     "LN_BOBYQA",
@@ -48,7 +47,7 @@ WITH_DERIVATIVES = (
     "LD_SLSQP",
 )
 
-# LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside, GN_ORIG_DIRECT and GN_ORIG_DIRECT_L;
+# LD_MMA takes constraints too, and so do LD_AUGLAG_EQ, which works with it inside;
 # but on smooth functions of two variables under a linear constraint they report success far from the optimum. Others
 # refuse them.
 WITH_CONSTRAINTS = frozenset(
@@ -64,8 +63,8 @@ WITH_CONSTRAINTS = frozenset(
     }
 )
 
-# On one parameter PRAXIS goes round in circles, NEWUOA refuses, and the original DIRECT can crash (drake 1.58).
-SEVERAL_PARAMETERS = frozenset({"GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L", "LN_NEWUOA", "LN_PRAXIS"})
+# PRAXIS goes round in circles on one parameter, and NEWUOA refuses it.
+SEVERAL_PARAMETERS = frozenset({"LN_NEWUOA", "LN_PRAXIS"})
 
 # NLopt seeds its random numbers from the clock, and Drake has no way to seed them.
 SEEDED_BY_CLOCK = frozenset(
@@ -88,7 +87,7 @@ UNTIL_LIMIT = frozenset({"GD_STOGO", "GD_STOGO_RAND"})
 # These do not survive an exception in their callback: they go on for ever, or crash the process. When they are closed,
 # they are given the same value everywhere instead, and run to their end or to the limit of their calls: the budget, or
 # this number without one.
-NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L", "LN_NEWUOA"})
+NO_EXCEPTIONS = frozenset({"GD_STOGO", "GD_STOGO_RAND", "LN_NEWUOA"})
 LIMIT = 5_000
 
 # How NLopt names the number that it returns.
