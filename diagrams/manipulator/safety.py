@@ -21,10 +21,10 @@ CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
 POSITION, VELOCITY = "joint_position", "joint_velocity"
 
 JUMP_TOLERANCE = {POSITION: 0.03, VELOCITY: 0.3, "joint_torque_measured": 50.0, "wrench": 100.0}
-"""In the signals' units."""
+"""The change of each sensor signal that is believed at any time, in the signal's unit."""
 
 DISAGREEMENT = 0.2
-"""How far the measured velocity may be from that of the positions (rad/s)."""
+"""The largest difference between the measured velocity and that of the positions (rad/s)."""
 
 SMOOTHING = 0.01
 """Time constant of the positions' velocity (s)."""

@@ -8,7 +8,7 @@ import time
 BURST = 5
 """So many messages of one kind are logged within `PERIOD`."""
 PERIOD = 10.0
-"""In seconds."""
+"""Length of the window in which messages of one kind are counted, in seconds."""
 
 
 class RateLimit(logging.Filter):
@@ -36,7 +36,7 @@ class RateLimit(logging.Filter):
 
 
 def limited_logger(name: str) -> logging.Logger:
-    """The logger of a module, at a limited rate."""
+    """Return the logger of a module, at a limited rate."""
     logger = logging.getLogger(name)
     if not any(isinstance(known, RateLimit) for known in logger.filters):
         logger.addFilter(RateLimit())
