@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.loop_rig import FRICTION
 from benchmarks.measure import LOWER, Benchmark, ratio, spread
 from diagrams.manipulator import ManipulatorScenario
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import MachineProcess
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = "diagrams.manipulator:ManipulatorScenario"

@@ -14,8 +14,8 @@ import lcm
 import numpy as np
 
 from benchmarks.measure import LOWER, Benchmark
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.lcm_connections import TcpqConnection
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.control.realtime import RealTime
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,9 +16,9 @@ from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import MachineProcess
-from vtbdrake.control.protocol import protocol_of
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed

@@ -12,11 +12,11 @@ import numpy as np
 
 from benchmarks.loop_rig import PERIOD, Rig, loop_rig
 from benchmarks.measure import HIGHER, LOWER, Benchmark, seconds, spread
-from vtbdrake.control.live.service import LiveService
-from vtbdrake.control.recording.control_log import ControlLog
-from vtbdrake.control.recording.log_reader import read_log
-from vtbdrake.control.recording.recorder import Recorder
-from vtbdrake.control.recording.replay import replay
+from vtbdrake.monitoring.live.service import LiveService
+from vtbdrake.recording.control_log import ControlLog
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.recorder import Recorder
+from vtbdrake.recording.replay import replay
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone
 
@@ -25,7 +25,7 @@ PATIENCE = 30.0  # s, until somebody watches
 
 _WATCH = """
 import sys
-from vtbdrake.control.live.client import watch
+from vtbdrake.monitoring.live.client import watch
 for _ in watch(sys.argv[1], sys.argv[2:], every=10):
     pass
 """

@@ -18,10 +18,10 @@ from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import MachineProcess
-from vtbdrake.control.protocol import protocol_of
-from vtbdrake.control.residuals import Calibration, ResidualMonitor
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone
 

@@ -1,7 +1,13 @@
 """What all tests have in common."""
 
+import importlib
 import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
 
+import pytest
 from hypothesis import settings
 
 # How long an example takes depends on what else the computer does.
@@ -11,3 +17,25 @@ settings.load_profile("patient")
 # What a shell starts in the background ignores Ctrl-C, and so would all that the tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Message types of a user, made by lcm-gen.
+TYPES = """
+package vtb_test_types;
+struct point_t { double x; double y; double z; }
+struct wind_t { int64_t utime; double speed; double direction; float gust[2]; int16_t level; point_t where; }
+struct mixed_t { int64_t utime; string name; int32_t n; int32_t m; double grid[n][m]; byte blob[m]; point_t points[n]; }
+"""
+
+
+@pytest.fixture(scope="session")
+def user_types(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    folder = tmp_path_factory.mktemp("lcm")
+    source = folder / "types.lcm"
+    source.write_text(TYPES)
+    lcm_gen = Path(sys.executable).with_name("lcm-gen")
+    subprocess.run([lcm_gen, "-p", "--ppath", folder, source], check=True, timeout=60)
+    sys.path.insert(0, str(folder))
+    try:
+        return importlib.import_module("vtb_test_types")
+    finally:
+        sys.path.remove(str(folder))

@@ -14,8 +14,8 @@ import vtbdrake, mine
 os.chdir(sys.argv[1])
 {changed}
 from vtbdrake.control.companion import Companion
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import MachineProcess
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
 from vtbdrake.rollout import ProcessExecutor, RolloutTask
 
 import select

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vtbdrake"
 
 # What each layer may import besides itself:
-# state <- testbed <- rollout <- optimization <- reasoning; testbed <- control.
+# state <- testbed <- rollout <- optimization <- reasoning; testbed <- control <- lcm <- recording, monitoring, machine.
 BELOW: dict[str, set[str]] = {
     "state": set(),
     "testbed": {"state"},
@@ -21,8 +21,12 @@ BELOW: dict[str, set[str]] = {
     "optimization": {"state", "testbed", "rollout"},
     "reasoning": {"state", "testbed", "rollout", "optimization"},
     "control": {"state", "testbed"},
+    "lcm": {"state", "testbed", "control"},
+    "recording": {"state", "testbed", "control", "lcm"},
+    "monitoring": {"state", "testbed", "control", "lcm"},
+    "machine": {"state", "testbed", "control", "lcm"},
     "components": {"state"},
-    "calibration": {"state", "testbed", "rollout", "optimization"},
+    "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
 # Two modules, which need nothing of ours and not Drake: how other processes start, and how objects travel to them.
 for _layers in BELOW.values():

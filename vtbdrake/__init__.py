@@ -10,18 +10,18 @@ import vtbdrake.interpreter as _interpreter  # noqa: F401  It notes where relati
 
 if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
-    from vtbdrake.control.hub import Hub
-    from vtbdrake.control.lcm_bridge import LcmBridge
-    from vtbdrake.control.live.client import LiveClient, watch
-    from vtbdrake.control.live.live_watch import LiveWatch
-    from vtbdrake.control.live.service import LiveService
-    from vtbdrake.control.machine import MachineProcess
+    from vtbdrake.lcm.hub import Hub
+    from vtbdrake.lcm.bridge import LcmBridge
+    from vtbdrake.monitoring.live.client import LiveClient, watch
+    from vtbdrake.monitoring.live.live_watch import LiveWatch
+    from vtbdrake.monitoring.live.service import LiveService
+    from vtbdrake.machine import MachineProcess
     from vtbdrake.control.operation import Operation
-    from vtbdrake.control.protocol import Protocol
-    from vtbdrake.control.recording.log_reader import read_log
-    from vtbdrake.control.recording.recorder import Recorder
-    from vtbdrake.control.recording.replay import replay
-    from vtbdrake.control.residuals import ResidualMonitor
+    from vtbdrake.lcm.protocol import Protocol
+    from vtbdrake.recording.log_reader import read_log
+    from vtbdrake.recording.recorder import Recorder
+    from vtbdrake.recording.replay import replay
+    from vtbdrake.monitoring.residuals import ResidualMonitor
     from vtbdrake.control.runtime import Runtime
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
@@ -81,18 +81,18 @@ __all__ = [
 
 _HOMES = {
     "control.guard": ("Guards",),
-    "control.hub": ("Hub",),
-    "control.lcm_bridge": ("LcmBridge",),
-    "control.live.client": ("LiveClient", "watch"),
-    "control.live.live_watch": ("LiveWatch",),
-    "control.live.service": ("LiveService",),
-    "control.machine": ("MachineProcess",),
+    "lcm.hub": ("Hub",),
+    "lcm.bridge": ("LcmBridge",),
+    "monitoring.live.client": ("LiveClient", "watch"),
+    "monitoring.live.live_watch": ("LiveWatch",),
+    "monitoring.live.service": ("LiveService",),
+    "machine": ("MachineProcess",),
     "control.operation": ("Operation",),
-    "control.protocol": ("Protocol",),
-    "control.recording.log_reader": ("read_log",),
-    "control.recording.recorder": ("Recorder",),
-    "control.recording.replay": ("replay",),
-    "control.residuals": ("ResidualMonitor",),
+    "lcm.protocol": ("Protocol",),
+    "recording.log_reader": ("read_log",),
+    "recording.recorder": ("Recorder",),
+    "recording.replay": ("replay",),
+    "monitoring.residuals": ("ResidualMonitor",),
     "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
     "rollout": ("Constraint", "Quality", "RolloutResult"),

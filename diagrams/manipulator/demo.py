@@ -18,11 +18,11 @@ from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, 
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.lcm_bridge import LcmBridge
-from vtbdrake.control.machine import MachineProcess
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.machine import MachineProcess
 from vtbdrake.control.operation import Operation
-from vtbdrake.control.protocol import protocol_of
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError

@@ -25,11 +25,11 @@ from vtbdrake.components.sensors import (
     SampledSensor,
     connect_to_plant,
 )
-from vtbdrake.control.lcm_types import iiwa_command, iiwa_status
-from vtbdrake.control.lcm_vectors import vector_map
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.control.operation import Operation
-from vtbdrake.control.protocol import Protocol
-from vtbdrake.control.residuals import ResidualConfig
+from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.testbed import (
     Interface,
     PlantFields,

@@ -11,7 +11,7 @@ import lcm
 import pytest
 
 from tests.cli.program import ROOT, run
-from vtbdrake.control.hub import Statistics
+from vtbdrake.lcm.hub import Statistics
 
 
 @contextlib.contextmanager

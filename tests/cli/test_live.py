@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import pytest
 from click.testing import CliRunner
 
-from tests.control.live.rig import PATIENCE, Rig, served
+from tests.monitoring.live.rig import PATIENCE, Rig, served
 from vtbdrake.cli import main
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.lcm_connections import TcpqConnection
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.connections import TcpqConnection
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 import pytest
 
 from tests.cli.program import ACROBOT, ROOT, run
-from tests.control.machine.robot import ELBOW, Listener, RobotScenario, state
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import DIED, Machine, MachineConfig
+from tests.machine.robot import ELBOW, Listener, RobotScenario, state
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import DIED, Machine, MachineConfig
 
-ROBOT = "tests.control.machine.robot:RobotScenario"
+ROBOT = "tests.machine.robot:RobotScenario"
 MASS = "sim.sys.Acrobot.lower_link.mass"
 
 

@@ -10,14 +10,14 @@ import pandas
 import pytest
 
 from tests.cli.program import run
-from tests.control.recording.servo import Servo
-from vtbdrake.control.lcm_wire import decode
-from vtbdrake.control.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
-from vtbdrake.control.recording.log_events import LogEvents
-from vtbdrake.control.recording.log_format import LOG, LogError, event
-from vtbdrake.control.recording.log_reader import read_log
-from vtbdrake.control.recording.recorder import Recorder
-from vtbdrake.control.recording.replay import replay
+from tests.recording.servo import Servo
+from vtbdrake.lcm.wire import decode
+from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
+from vtbdrake.recording.log_events import LogEvents
+from vtbdrake.recording.log_format import LOG, LogError, event
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.recorder import Recorder
+from vtbdrake.recording.replay import replay
 
 SCENARIO = ("--scenario", "tests.control.scripted:ServoScenario")
 
@@ -42,7 +42,7 @@ def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path
 
 
 def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
-    by_another_module = ("--scenario", "tests.control.recording.servo:ServoScenario")
+    by_another_module = ("--scenario", "tests.recording.servo:ServoScenario")
     assert "identical" in run("replay", path, *by_another_module, "--on", "testbed").stdout
     program = run("replay", path, *SCENARIO, "--set", "dps.gain=1.5")
     assert program.returncode == 0 and "not compared" in program.stdout

@@ -23,12 +23,12 @@ import pytest
 from drake import lcmt_iiwa_command
 from pydrake.systems.framework import BasicVector, Context, System
 
-from tests.control.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
+from tests.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.lcm_bridge import LcmBridge
-from vtbdrake.control.machine import ClockJump, Corrupt, Delay, Duplicate, Fault, Freeze, MachineProcess, Reorder
-from vtbdrake.control.protocol import protocol_of
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Fault, Freeze, MachineProcess, Reorder
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.state import parameter

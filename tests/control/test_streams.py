@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vtbdrake.control.hub.reader import Reader, publication
-from vtbdrake.control.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
+from vtbdrake.lcm.hub.reader import Reader, publication
+from vtbdrake.lcm.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
 from vtbdrake.control.streams import Frames
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from vtbdrake.cli.options import output
-from vtbdrake.control.recording.export import EXPORTS, export
-from vtbdrake.control.recording.log_reader import read_log
+from vtbdrake.recording.export import EXPORTS, export
+from vtbdrake.recording.log_reader import read_log
 
 
 @click.command("export")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.control.hub import HubConfig, HubServer, serve
-from vtbdrake.control.hub.config import MEBIBYTE
-from vtbdrake.control.live.messages import RESET, SET
+from vtbdrake.lcm.hub import HubConfig, HubServer, serve
+from vtbdrake.lcm.hub.config import MEBIBYTE
+from vtbdrake.monitoring.live.messages import RESET, SET
 
 if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
@@ -183,6 +183,6 @@ def run_hub(
 
 
 def _command_channels(scenario: Scenario) -> tuple[str, ...]:
-    from vtbdrake.control.protocol import protocol_of
+    from vtbdrake.lcm.protocol import protocol_of
 
     return tuple(map.channel for map in protocol_of(scenario).act)

@@ -11,7 +11,7 @@ import numpy as np
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.live.client import LiveClient, LiveError, SilenceError
+from vtbdrake.monitoring.live.client import LiveClient, LiveError, SilenceError
 
 
 @click.command("set")

@@ -19,9 +19,9 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.text import number
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.machine import Machine, MachineConfig
-from vtbdrake.control.machine.config import BRAKES
-from vtbdrake.control.machine.serve import epoch, serve
+from vtbdrake.machine import Machine, MachineConfig
+from vtbdrake.machine.config import BRAKES
+from vtbdrake.machine.serve import epoch, serve
 from vtbdrake.testbed import Scenario
 
 _DEFAULT = MachineConfig()

@@ -10,9 +10,9 @@ import numpy as np
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import Setting, output, set_option, settings
 from vtbdrake.cli.recording import WRITERS
-from vtbdrake.control.recording.log_reader import read_log
-from vtbdrake.control.recording.replay import replay
-from vtbdrake.control.recording.replay_report import DIFFERENT
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.replay import replay
+from vtbdrake.recording.replay_report import DIFFERENT
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.testbed.scenario import class_name, scenario_class
 

@@ -29,9 +29,9 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.text import number, write_whole
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.live.service import LiveService
+from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.control.operation import operation_of, take_over
-from vtbdrake.control.protocol import protocol_of
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
@@ -192,7 +192,7 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
 
 
 def _record(stack: ExitStack, runtime: Runtime, path: Path) -> None:
-    from vtbdrake.control.recording.recorder import Recorder
+    from vtbdrake.recording.recorder import Recorder
 
     recorder = Recorder(runtime, path)
     # Told when it is closed, for then it is known.

@@ -12,7 +12,7 @@ from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import timeout_option, url_option
 from vtbdrake.cli.text import finite
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.live.client import LiveError, SilenceError, watch
+from vtbdrake.monitoring.live.client import LiveError, SilenceError, watch
 
 
 @click.command("watch")

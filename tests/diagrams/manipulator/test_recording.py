@@ -11,12 +11,12 @@ import pytest
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, SWING
 from diagrams.manipulator.scenario import ManipulatorScenario
-from vtbdrake.control.hub import Hub
-from vtbdrake.control.machine import MachineProcess
-from vtbdrake.control.protocol import protocol_of
-from vtbdrake.control.recording.log_reader import read_log
-from vtbdrake.control.recording.recorder import Recorder
-from vtbdrake.control.recording.replay import replay
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.recorder import Recorder
+from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
 
 PATIENCE = 60.0  # s

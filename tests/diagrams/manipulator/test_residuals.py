@@ -11,11 +11,11 @@ import pytest
 
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.motions import CIRCLE
-from tests.control.residuals.line import Together
+from tests.monitoring.residuals.line import Together
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.control.machine.config import MachineConfig
-from vtbdrake.control.machine.machine import Machine
-from vtbdrake.control.residuals import ResidualMonitor
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.machine import Machine
+from vtbdrake.monitoring.residuals import ResidualMonitor
 
 TOOL = "sim.sys.arm.tool.mass"
 MASS = 0.4  # kg

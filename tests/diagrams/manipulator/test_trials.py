@@ -9,7 +9,7 @@ from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.protocol import protocol_of
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
 
 SCENARIO = trial_scenario("admittance")

@@ -1,9 +1,0 @@
-import pytest
-
-from vtbdrake.control.hub import Hub
-
-
-@pytest.fixture
-def hub():
-    with Hub(port=0) as hub:
-        yield hub

@@ -1,0 +1,147 @@
+"""The hub as a process, as a thread, and where it listens."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.lcm.hub.clients import TIMEOUT, Client, address, raw_client, receive, record, wait_until
+from vtbdrake.lcm.hub import Hub, HubAddressError, HubConfig, HubError, HubServer
+
+
+def listening(pid: int) -> list[str]:
+    """Local addresses of the TCP sockets on which a process listens, as hexadecimal ``address:port``."""
+    inodes = {os.readlink(fd) for fd in Path(f"/proc/{pid}/fd").iterdir()}
+    rows = [
+        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/{pid}/net/{name}").read_text().splitlines()
+    ]
+    return [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def test_it_listens_on_loopback_only(hub) -> None:
+    host, port = address(hub.url)
+    assert host == "127.0.0.1"
+    assert listening(hub.pid) == [f"0100007F:{port:04X}"]
+
+
+def test_another_address_is_asked_for_by_name() -> None:
+    with Hub(host="127.0.0.2", port=0) as hub:
+        assert address(hub.url)[0] == "127.0.0.2"
+        client = Client(hub.url, "A")
+        client.publish("A")
+        client.wait(lambda: bool(client.received))
+
+
+def test_a_port_in_use_is_an_error_that_says_so(hub) -> None:
+    port = address(hub.url)[1]
+    for attempt in (lambda: Hub(port=port).start(), lambda: HubServer(HubConfig(port=port))):
+        with pytest.raises(HubAddressError, match=f"port {port} of 127.0.0.1 is in use"):
+            attempt()
+    Client(hub.url)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such host", "::1"])
+def test_an_address_that_is_not_ours_is_an_error_that_names_it(host: str) -> None:
+    with pytest.raises(HubAddressError, match=host):
+        Hub(host=host, port=0).start()
+
+
+def test_it_ends_with_the_block_and_can_be_started_again() -> None:
+    hub = Hub(port=0)
+    for _ in range(2):
+        with hub:
+            pid, url = hub.pid, hub.url
+            Client(url)
+        assert is_gone(pid)
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(address(url))
+        for use in (lambda: hub.url, lambda: hub.pid, hub.statistics):
+            with pytest.raises(HubError, match="does not run"):
+                use()
+
+
+def test_it_ends_when_the_process_that_started_it_is_killed() -> None:
+    program = (
+        "from vtbdrake.lcm.hub import Hub\nhub = Hub(port=0)\nhub.start()\nprint(hub.pid, flush=True)\ninput()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=Path(__file__).resolve().parents[3],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        assert not is_gone(pid)
+        parent.kill()
+    wait_until(lambda: is_gone(pid))
+
+
+def test_a_hub_that_was_killed_says_so() -> None:
+    with Hub(port=0) as hub:
+        os.kill(hub.pid, signal.SIGKILL)
+        with pytest.raises(HubError, match=f"the hub at {hub.url} does not answer"):
+            for _ in range(2):
+                hub.statistics()
+
+
+def test_ctrl_c_is_the_business_of_the_process_that_started_it(hub) -> None:
+    lines = Path(f"/proc/{hub.pid}/status").read_text().splitlines()
+    ignored = next(int(line.split()[1], 16) for line in lines if line.startswith("SigIgn"))
+    assert ignored >> (signal.SIGINT - 1) & 1
+
+
+def test_a_misspelt_field_is_an_error() -> None:
+    with pytest.raises(TypeError, match="protected"):
+        Hub(protected=["A"])
+
+
+def test_it_runs_in_a_thread_for_clients_of_other_processes() -> None:
+    server = HubServer(HubConfig(port=0))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        with raw_client(server.url) as sock:
+            sock.sendall(record(2, b"A") + record(1, b"A", b"data"))
+            assert receive(sock, 8 + 17)[8:] == record(1, b"A", b"data")
+    finally:
+        server.stop()
+        thread.join(TIMEOUT)
+    assert not thread.is_alive()
+    assert server.statistics().messages == 1
+    server.stop()
+    server.close()
+
+
+def test_hub_runs_on_the_processors_that_it_is_told() -> None:
+    cpu = max(os.sched_getaffinity(0))
+    with Hub(port=0, cpus=[cpu]) as hub:
+        assert os.sched_getaffinity(hub.pid) == {cpu}
+
+
+def test_hub_that_is_told_processors_that_are_not_there_runs_on_any() -> None:
+    with Hub(port=0, cpus=[1023]) as hub:
+        assert os.sched_getaffinity(hub.pid) == os.sched_getaffinity(0)
+
+
+def test_real_time_scheduling_is_asked_for_and_not_insisted_on() -> None:
+    attempt = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))"
+    granted = subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode == 0
+    with Hub(port=0, priority=3) as hub:
+        Client(hub.url)
+        assert os.sched_getscheduler(hub.pid) == (os.SCHED_FIFO if granted else os.SCHED_OTHER)
+        assert os.sched_getparam(hub.pid).sched_priority == (3 if granted else 0)

@@ -1,0 +1,239 @@
+"""Images and point clouds, as Drake's own systems send them."""
+
+from __future__ import annotations
+
+import random
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from drake import lcmt_image, lcmt_image_array, lcmt_point_cloud
+from pydrake.common.value import Value
+from pydrake.lcm import DrakeLcm
+from pydrake.perception import BaseField, Fields, PointCloud, PointCloudToLcm
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.lcm import LcmPublisherSystem
+from pydrake.systems.primitives import ConstantValueSource
+from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U, ImageToLcmImageArrayT
+
+from vtbdrake.control.bridge import Reception
+from vtbdrake.lcm.point_clouds import point_cloud_map
+from vtbdrake.lcm.images import image_array_map, image_map
+from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.lcm.routes import Inlet
+from vtbdrake.testbed import Signal
+
+WIDTH, HEIGHT = 6, 4
+CHANNEL = "PICTURES"
+
+
+def sent_by_drake(system: System, values: list[Any], message_type: Any) -> bytes:
+    """The message that Drake publishes at 0.5 s."""
+    builder = DiagramBuilder()
+    builder.AddSystem(system)
+    for port, value in enumerate(values):
+        source = builder.AddSystem(ConstantValueSource(Value(value)))
+        builder.Connect(source.get_output_port(), system.get_input_port(port))
+    bus = DrakeLcm("memq://")
+    heard: list[bytes] = []
+    bus.Subscribe(CHANNEL, heard.append)
+    publisher = LcmPublisherSystem.Make(CHANNEL, message_type, bus, 0.5, use_cpp_serializer=True)
+    builder.AddSystem(publisher)
+    builder.Connect(system.get_output_port(0), publisher.get_input_port())
+    Simulator(builder.Build()).AdvanceTo(0.6)
+    while bus.HandleSubscriptions(0):
+        pass
+    return heard[-1]
+
+
+def take(map: LcmMap, signals: list[Signal], *messages: bytes) -> dict[str, Reception]:
+    receptions = {signal.name: Reception() for signal in signals}
+    inlet = Inlet(map, signals, receptions, 0.1)
+    for message in messages:
+        inlet.take(CHANNEL, message)
+    return receptions
+
+
+def noise(image_type: Any) -> Any:
+    image = image_type(WIDTH, HEIGHT)
+    image.mutable_data[:] = np.random.default_rng(1).integers(0, 200, image.shape)
+    return image
+
+
+def test_images_that_drake_sends_arrive_pixel_by_pixel() -> None:
+    types = {"color": ImageRgba8U, "depth": ImageDepth32F, "label": ImageLabel16I}
+    images = {name: noise(image_type) for name, image_type in types.items()}
+    data = sent_by_drake(ImageToLcmImageArrayT(*types), list(images.values()), lcmt_image_array)
+    signals = [Signal(f"camera_{name}", model_value=types[name](WIDTH, HEIGHT)) for name in types]
+    receptions = take(image_array_map(CHANNEL, {f"camera_{name}": name for name in types}), signals, data)
+    for name, image in images.items():
+        reception = receptions[f"camera_{name}"]
+        np.testing.assert_array_equal(reception.value.data, image.data)
+        assert (reception.count, reception.sent) == (1, 0.5)
+
+
+def message_of(image: ImageRgba8U) -> lcmt_image:
+    message = lcmt_image()
+    message.header.utime = 1
+    message.width, message.height, message.row_stride = image.width(), image.height(), 4 * image.width()
+    message.data = image.data.tobytes()
+    message.size = len(message.data)
+    message.pixel_format, message.channel_type = lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8
+    return message
+
+
+def compress(message: lcmt_image, content: bytes | None = None) -> None:
+    message.compression_method = lcmt_image.COMPRESSION_METHOD_ZLIB
+    message.data = zlib.compress(message.data if content is None else content)
+    message.size = len(message.data)
+
+
+def camera() -> Signal:
+    return Signal("camera", model_value=ImageRgba8U(WIDTH, HEIGHT))
+
+
+def test_compressed_image_arrives_pixel_by_pixel() -> None:
+    image = noise(ImageRgba8U)
+    message = message_of(image)
+    compress(message)
+    reception = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
+    np.testing.assert_array_equal(reception.value.data, image.data)
+
+
+def set_fields(**fields: Any) -> Callable[[lcmt_image], None]:
+    def change(message: Any) -> None:
+        for name, value in fields.items():
+            setattr(message, name, value)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_fields(width=WIDTH + 1), "size"),
+        (set_fields(width=-WIDTH, height=-HEIGHT), "size"),
+        (set_fields(row_stride=0), "size"),
+        (set_fields(size=10), "size"),
+        (set_fields(pixel_format=lcmt_image.PIXEL_FORMAT_BGRA), "type"),
+        (set_fields(compression_method=lcmt_image.COMPRESSION_METHOD_JPEG), "compression"),
+        (set_fields(compression_method=lcmt_image.COMPRESSION_METHOD_ZLIB), "compression"),
+        (lambda message: compress(message, bytes(1_000)), "size"),
+    ],
+)
+def test_image_that_is_not_what_the_signal_says_is_rejected(change: Callable[[lcmt_image], None], reason: str) -> None:
+    message = message_of(noise(ImageRgba8U))
+    change(message)
+    reception = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
+    assert (reception.count, reception.rejected) == (0, {reason: 1})
+
+
+def test_few_bytes_that_stand_for_many_are_not_unpacked() -> None:
+    message = message_of(noise(ImageRgba8U))
+    compress(message, bytes(50_000_000))
+    data = message.encode()
+    tracemalloc.start()
+    try:
+        take(image_map(CHANNEL, "camera"), [camera()], data)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_camera_that_is_not_in_a_message_is_missing() -> None:
+    message = lcmt_image_array()
+    message.num_images, message.images = 1, [message_of(noise(ImageRgba8U))]
+    message.images[0].header.frame_name = "color"
+    frames = {"camera": "color", "other": "colour"}
+    signals = [camera(), Signal("other", model_value=ImageRgba8U(WIDTH, HEIGHT))]
+    receptions = take(image_array_map(CHANNEL, frames), signals, message.encode())
+    assert receptions["camera"].count == 1
+    assert receptions["other"].rejected == {"missing": 1}
+
+
+def test_image_signal_without_a_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"signal camera on channel PICTURES needs an image of its size"):
+        image_map(CHANNEL, "camera").reader([Signal("camera", model_value=ImageRgba8U())])
+
+
+def cloud(points: int) -> PointCloud:
+    made = PointCloud(points, Fields(BaseField.kXYZs | BaseField.kRGBs | BaseField.kNormals))
+    chance = np.random.default_rng(2)
+    made.mutable_xyzs()[:] = chance.normal(size=(3, points))
+    made.mutable_normals()[:] = chance.normal(size=(3, points))
+    made.mutable_rgbs()[:] = chance.integers(0, 256, (3, points))
+    return made
+
+
+@pytest.mark.parametrize("points", [0, 1, 50])
+def test_point_cloud_that_drake_sends_arrives_point_by_point(points: int) -> None:
+    sent = cloud(points)
+    data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
+    reception = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=cloud(0))], data)["lidar"]
+    assert (reception.count, reception.sent) == (1, 0.5)
+    for name in ("xyzs", "normals", "rgbs"):
+        np.testing.assert_array_equal(getattr(reception.value, name)(), getattr(sent, name)())
+
+
+def test_points_that_see_nothing_stay_infinite() -> None:
+    sent = PointCloud(2)
+    sent.mutable_xyzs()[:] = np.inf
+    data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
+    reception = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=PointCloud(0))], data)["lidar"]
+    assert np.isinf(reception.value.xyzs()).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_fields(width=51, row_step=51 * 28), "size"),
+        (set_fields(width=-50, height=-1), "size"),
+        (set_fields(point_step=0, row_step=0), "size"),
+        (set_fields(point_step=8, row_step=400), "size"),
+        (lambda message: set_fields(name="w")(message.fields[0]), "missing"),
+        (lambda message: set_fields(byte_offset=2**31 - 1)(message.fields[0]), "size"),
+        (lambda message: set_fields(byte_offset=-4)(message.fields[0]), "size"),
+        (lambda message: set_fields(name="y")(message.fields[0]), "type"),
+        (lambda message: set_fields(datatype=77)(message.fields[0]), "missing"),
+        (lambda message: set_fields(datatype=7)(message.fields[3]), "type"),
+    ],
+)
+def test_point_cloud_that_contradicts_itself_is_rejected(change: Callable[[Any], None], reason: str) -> None:
+    message = lcmt_point_cloud.decode(sent_by_drake(PointCloudToLcm("lidar"), [cloud(50)], lcmt_point_cloud))
+    change(message)
+    signals = [Signal("lidar", model_value=cloud(0))]
+    reception = take(point_cloud_map(CHANNEL, "lidar"), signals, message.encode())["lidar"]
+    assert (reception.count, reception.rejected) == (0, {reason: 1})
+
+
+def test_signal_that_is_no_point_cloud_is_refused() -> None:
+    with pytest.raises(ValueError, match="needs a PointCloud as model_value"):
+        point_cloud_map(CHANNEL, "lidar").reader([camera()])
+
+
+@pytest.mark.parametrize("kind", ["images", "cloud"])
+def test_broken_pictures_are_counted_and_do_no_harm(kind: str) -> None:
+    chance = random.Random(3)
+    map: LcmMap
+    if kind == "images":
+        types = {"color": ImageRgba8U, "depth": ImageDepth32F, "label": ImageLabel16I}
+        images = [noise(image_type) for image_type in types.values()]
+        good = sent_by_drake(ImageToLcmImageArrayT(*types), images, lcmt_image_array)
+        map, signal = image_array_map(CHANNEL, {"camera": "color"}), camera()
+    else:
+        good = sent_by_drake(PointCloudToLcm("lidar"), [cloud(3)], lcmt_point_cloud)
+        map, signal = point_cloud_map(CHANNEL, "camera"), Signal("camera", model_value=cloud(0))
+    reception = Reception()
+    inlet = Inlet(map, [signal], {"camera": reception}, 0.0)
+    for _ in range(5_000):
+        data = bytearray(good)
+        for _ in range(chance.randrange(1, 6)):
+            at = chance.randrange(8, len(data))
+            data[at : at + chance.choice((1, 4))] = chance.choice((b"\xff", b"\x7f\xff\xff\xff", b"\0", b"\0\0\0\0"))
+        inlet.take(CHANNEL, bytes(data))
+    assert reception.count + sum(reception.rejected.values()) == 5_000
+    assert "decode" not in reception.rejected

@@ -1,0 +1,238 @@
+"""What faults do to messages, given as bytes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from drake import lcmt_iiwa_status
+
+from tests.control.arm import status
+from vtbdrake.lcm.wire import MalformedError, decode
+from vtbdrake.machine import (
+    ClockJump,
+    Corrupt,
+    Delay,
+    Drop,
+    Duplicate,
+    Fault,
+    FaultError,
+    Freeze,
+    NoBrake,
+    Reorder,
+    fault_from_dict,
+)
+from vtbdrake.machine.faults import FAULTS, Packet, whole_cycles
+from vtbdrake.machine.line import Line
+
+A, B = "A", "B"
+
+
+def message(number: int) -> bytes:
+    return status(number).encode()
+
+
+def line(*faults: Fault, delay: int = 0, seed: int = 0) -> Line:
+    made = Line("sense", delay=delay, period=0.001, random=np.random.default_rng(seed))
+    for fault in faults:
+        made.begin(fault)
+    return made
+
+
+def carry(way: Line, cycles: int, *channels: str) -> list[list[tuple[str, int]]]:
+    """Channel and number of what arrives in each cycle, if each channel is sent the cycle's number in each."""
+    arrived = []
+    for cycle in range(cycles):
+        for channel in channels or (A,):
+            way.send(Packet(channel, lcmt_iiwa_status, message(cycle), cycle))
+        arrived.append([(p.channel, lcmt_iiwa_status.decode(p.data).utime) for p in way.arrivals(cycle)])
+    return arrived
+
+
+def damaged(kind: str, count: int) -> list[bytes]:
+    way = line(Corrupt(kind=kind))
+    for _ in range(count):
+        way.send(Packet(A, lcmt_iiwa_status, message(1), 0))
+    return [packet.data for packet in way.arrivals(0)]
+
+
+def reason(data: bytes) -> str:
+    try:
+        decode(lcmt_iiwa_status, data)
+    except MalformedError as error:
+        return error.reason
+    return ""
+
+
+def test_line_without_faults_carries_everything_at_once() -> None:
+    assert carry(line(), 3, A, B) == [[(A, k), (B, k)] for k in range(3)]
+
+
+def test_line_with_a_delay() -> None:
+    assert carry(line(delay=2), 4) == [[], [], [(A, 0)], [(A, 1)]]
+
+
+def test_drop_of_all() -> None:
+    assert carry(line(Drop()), 3) == [[], [], []]
+
+
+def test_drop_of_a_fraction() -> None:
+    arrived = sum(map(len, carry(line(Drop(fraction=0.3)), 2000)))
+    assert abs(arrived - 1400) < 5 * math.sqrt(2000 * 0.3 * 0.7)
+
+
+def test_delay_is_whole_cycles_rounded_up() -> None:
+    assert carry(line(Delay(seconds=0.0011)), 4) == [[], [], [(A, 0)], [(A, 1)]]
+    assert [whole_cycles(k * 0.1, 0.1) for k in range(1000)] == list(range(1000))
+
+
+def test_freeze_repeats_the_first_message_of_each_channel() -> None:
+    way = line()
+    carry(way, 3, A, B)
+    way.begin(Freeze(channels=[A]))
+    frozen = carry(way, 3, A, B)
+    assert frozen == [[(A, 0), (B, k)] for k in range(3)]
+
+
+def test_duplicate() -> None:
+    assert carry(line(Duplicate(copies=2)), 2) == [[(A, k)] * 3 for k in range(2)]
+
+
+def test_reorder_swaps_two_messages_of_a_channel() -> None:
+    arrived = carry(line(Reorder()), 4, A, B)
+    assert arrived == [[], [(A, 1), (A, 0), (B, 1), (B, 0)], [], [(A, 3), (A, 2), (B, 3), (B, 2)]]
+
+
+def test_faults_act_together() -> None:
+    arrived = carry(line(Delay(seconds=0.001), Duplicate(), Freeze()), 3)
+    assert arrived == [[], [(A, 0), (A, 0)], [(A, 0), (A, 0)]]
+
+
+def test_duplicates_of_a_damaged_message_are_equal() -> None:
+    way = line(Duplicate(), Corrupt(kind="random"))
+    way.send(Packet(A, lcmt_iiwa_status, message(1), 0))
+    one, other = way.arrivals(0)
+    assert one == other
+
+
+def test_fault_takes_the_place_of_one_of_its_name() -> None:
+    way = line(Delay(seconds=0.005), Delay(seconds=0.001))
+    assert carry(way, 3) == [[], [(A, 0)], [(A, 1)]]
+
+
+def test_faults_end_and_what_is_on_its_way_arrives() -> None:
+    way = line(Delay(seconds=0.002))
+    way.send(Packet(A, lcmt_iiwa_status, message(7), 0))
+    way.end()
+    assert carry(way, 3) == [[(A, 0)], [(A, 1)], [(A, 7), (A, 2)]]
+
+
+def test_clock_error_is_that_of_the_channels_named() -> None:
+    way = line(ClockJump(seconds=-2.0, channels=[A]))
+    assert (way.clock_error(A), way.clock_error(B)) == (-2.0, 0.0)
+    way.end()
+    assert way.clock_error(A) == 0.0
+
+
+def test_flipped_bits_are_one_to_eight() -> None:
+    whole = np.frombuffer(message(1), np.uint8)
+    flips = Counter(int(np.unpackbits(np.frombuffer(data, np.uint8) ^ whole).sum()) for data in damaged("bits", 800))
+    assert set(flips) == set(range(1, 9))
+    assert min(flips.values()) > 50
+
+
+def test_truncated_messages_are_beginnings() -> None:
+    found = damaged("truncate", 200)
+    assert all(message(1).startswith(data) and len(data) < len(message(1)) for data in found)
+    assert {reason(data) for data in found} == {"truncated"}
+
+
+def test_trailing_bytes_follow() -> None:
+    found = damaged("trailing", 50)
+    assert all(data.startswith(message(1)) and 1 <= len(data) - len(message(1)) <= 64 for data in found)
+    assert {reason(data) for data in found} == {"trailing"}
+
+
+def test_wrong_type_differs_in_the_fingerprint_only() -> None:
+    [data] = damaged("type", 1)
+    assert data[8:] == message(1)[8:]
+    assert reason(data) == "fingerprint"
+
+
+def test_random_bytes() -> None:
+    one, other = damaged("random", 2)
+    assert len(one) == len(other) == len(message(1))
+    assert len({one, other, message(1)}) == 3
+
+
+def test_nan_is_in_every_number_that_can_be_one() -> None:
+    [data] = damaged("nan", 1)
+    found = decode(lcmt_iiwa_status, data)
+    assert (found.utime, found.num_joints) == (1, 7)
+    assert np.isnan([getattr(found, name) for name in found.__slots__[2:]]).all()
+
+
+def test_nan_reaches_messages_in_messages(user_types: Any) -> None:
+    wind = user_types.wind_t()
+    way = line(Corrupt(kind="nan"))
+    way.send(Packet(A, user_types.wind_t, wind.encode(), 0))
+    [packet] = way.arrivals(0)
+    found = user_types.wind_t.decode(packet.data)
+    assert np.isnan([found.speed, *found.gust, found.where.x, found.where.z]).all()
+    assert found.level == 0
+
+
+def test_corruption_of_a_fraction() -> None:
+    way = line(Corrupt(kind="type", fraction=0.25))
+    for _ in range(1000):
+        way.send(Packet(A, lcmt_iiwa_status, message(1), 0))
+    count = sum(packet.data != message(1) for packet in way.arrivals(0))
+    assert abs(count - 250) < 5 * math.sqrt(1000 * 0.25 * 0.75)
+
+
+EXAMPLES = [
+    Drop(fraction=0.5, channels=[A]),
+    Delay(seconds=0.05, side="act"),
+    Freeze(),
+    Corrupt(kind="nan"),
+    Duplicate(copies=3),
+    Reorder(),
+    ClockJump(seconds=-5.0),
+    NoBrake(),
+]
+
+
+@pytest.mark.parametrize("fault", EXAMPLES, ids=lambda fault: fault.name)
+def test_faults_travel_as_json(fault: Fault) -> None:
+    assert fault_from_dict(json.loads(json.dumps(fault.to_dict()))) == fault
+
+
+def test_all_faults_are_examples() -> None:
+    assert {fault.name for fault in EXAMPLES} == set(FAULTS)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"fault": "melt"}, "a fault is one of clock_jump, .*, not 'melt'"),
+        ({"fault": ["drop"]}, "a fault is one of"),
+        ({"fault": "drop", "share": 0.5}, "drop takes .*fraction.*, not share"),
+        ({"fault": "drop", "fraction": 1.5}, "fraction of the fault drop lies between 0 and 1, not at 1.5"),
+        ({"fault": "drop", "fraction": "all"}, "not at 'all'"),
+        ({"fault": "drop", "fraction": math.nan}, "not at nan"),
+        ({"fault": "drop", "side": "left"}, "sense or act, not 'left'"),
+        ({"fault": "drop", "channels": "A"}, r"a list of channels, such as \['A'\]"),
+        ({"fault": "delay"}, "the fault delay is not complete: .*seconds"),
+        ({"fault": "delay", "seconds": -1.0}, "seconds of the fault delay"),
+        ({"fault": "duplicate", "copies": 1.5}, "whole number"),
+        ({"fault": "corrupt", "kind": "burn"}, "one of bits, truncate, .*, not 'burn'"),
+        ({"fault": "clock_jump", "seconds": 1.0, "side": "act"}, "not one of received messages"),
+    ],
+)
+def test_faults_that_cannot_be_are_refused(data: dict[str, Any], message: str) -> None:
+    with pytest.raises(FaultError, match=message):
+        fault_from_dict(data)

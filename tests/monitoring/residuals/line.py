@@ -1,0 +1,140 @@
+"""A machine in the same process, in lock-step with the loop that commands it, and loops that listen to both."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from math import inf
+from typing import Any
+
+from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.guard import Guards
+from vtbdrake.lcm.routes import Inlet, Outlet, Transmission
+from vtbdrake.machine.machine import Machine
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.control.reported import reported_signals
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+
+Falsify = Callable[[str, bytes], bytes]
+
+
+class Ear(Bridge):
+    """Hears messages that somebody puts into ``heard``, as an `LcmBridge` would."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        protocol, self.interface = protocol_of(scenario), scenario.interface()
+        carriers = reported_signals(self.interface, protocol.reported)
+        self.sensed = {signal.name: Reception() for signal in self.interface.sense}
+        self.reported = {name: Reception() for name in carriers}
+        self.commanded = {}
+        self.heard: deque[tuple[str, bytes]] = deque()
+        signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
+        receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
+        self._inlets = {
+            map.channel: Inlet(map, [signals[name] for name in map.signals], receptions, 0.1) for map in protocol.sense
+        }
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def connected(self) -> bool:
+        return True
+
+    def poll(self, timeout: float = 0.0) -> int:
+        count = len(self.heard)
+        while self.heard:
+            channel, data = self.heard.popleft()
+            self._inlets[channel].take(channel, data)
+        return count
+
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+        raise AssertionError("who only listens commands nothing")
+
+
+class Line(Ear):
+    """The way to a machine: every poll but the first has it do one cycle, and tell its state.
+
+    Attributes:
+        falsify: changes messages of the machine on their way to all who listen.
+        ears: others that hear the machine.
+    """
+
+    def __init__(self, scenario: Scenario, machine: Machine) -> None:
+        super().__init__(scenario)
+        self.machine = machine
+        self.falsify: Falsify = lambda channel, data: data
+        self.ears: list[Ear] = []
+        signals = {signal.name: signal for signal in self.interface.act}
+        sent = {name: Transmission() for name in signals}
+        self._outlets = [Outlet(map, [signals[n] for n in map.signals], sent) for map in protocol_of(scenario).act]
+        self._begun = False
+        self._utime = 0
+
+    def poll(self, timeout: float = 0.0) -> int:
+        if self._begun:
+            self.machine.advance()
+        self._begun = True
+        for channel, data in self.machine.messages():
+            told = channel, self.falsify(channel, data)
+            for ear in (self, *self.ears):
+                ear.heard.append(told)
+        return super().poll()
+
+    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+        self._utime += 1
+        for outlet in self._outlets:
+            data = outlet.message(commands, self._utime)
+            assert data is not None
+            self.machine.receive(outlet.channel, data)
+        return ()
+
+
+def loop(
+    target: VirtualTestbed | DpsAlone, bridge: Bridge, period: float, *, begin: bool = True, **values: Any
+) -> Runtime:
+    """A runtime on a clock of its own, whose sensors never grow old; ``values`` of variables by address."""
+    context = target.default_context()
+    target.write(context, values)
+    guards = Guards(target.interface, period, max_missed=inf)
+    runtime = Runtime(target, bridge, period=period, context=context, clock=SimulatedClock(), guards=guards)
+    if not begin:
+        return runtime
+    if isinstance(target, DpsAlone):
+        runtime.begin()
+    for signal in target.interface.act:
+        if guards.needs_start(signal.name):
+            guards.start(signal.name, runtime.command(signal.name))
+    return runtime
+
+
+class Together:
+    """A machine, the loop that drives it, and one that shadows it."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        machine: Machine,
+        *,
+        shadowing: Scenario | None = None,
+        values: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.line = Line(scenario, machine)
+        period = machine.config.period
+        self.driver = loop(DpsAlone(scenario), self.line, period, **(values or {}))
+        self.shadow: Runtime | None = None
+        if shadowing is not None:
+            ear = Ear(shadowing)
+            self.line.ears.append(ear)
+            self.shadow = loop(shadowing.build(mode="shadow"), ear, period, **(values or {}))
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.driver.cycle()
+            if self.shadow is not None:
+                self.shadow.cycle()

@@ -1,0 +1,106 @@
+"""A driven pendulum that speaks the iiwa messages of an arm with one joint: cheap to simulate for an hour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
+from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
+
+from tests.testbeds import PENDULUM
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.machine import Machine
+from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.state import discrete_state
+from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+
+PERIOD = 0.1
+PAYLOAD, MASS = "sim.sys.Pendulum.arm_com.mass", 0.5
+
+
+class Rhythm(LeafSystem):
+    """A torque in time, and some against the motion; it remembers what it was told of the joint.
+
+    .. pydrake_system::
+
+        name: Rhythm
+        input_ports:
+        - position
+        - velocity
+        output_ports:
+        - torque
+    """
+
+    def __init__(self, period: float) -> None:
+        super().__init__()
+        self._position = self.DeclareVectorInputPort("position", 1)
+        self._velocity = self.DeclareVectorInputPort("velocity", 1)
+        torque = self.DeclareDiscreteState(BasicVector([0.0]))
+        seen = self.DeclareDiscreteState(BasicVector([0.0, 0.0]))
+        self.DeclareStateOutputPort("torque", torque)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.variables = (discrete_state("torque", torque), discrete_state("seen", seen, shape=(2,)))
+
+    def _update(self, context: Context, discrete: Any) -> None:
+        q, v = self._position.Eval(context), self._velocity.Eval(context)
+        discrete.set_value(0, 2.0 * np.sin(1.5 * context.get_time()) - 0.5 * v)
+        discrete.set_value(1, np.concatenate((q, v)))
+
+
+@dataclass
+class DrivenPendulum(Scenario):
+    """Drake's pendulum; a ``time_step`` of 0 is a continuous one, ``sampled`` sensors are a period late."""
+
+    simulator: SimulatorFields = field(default_factory=SimulatorFields)
+    time_step: float = PERIOD
+    sampled: bool = False
+    believes: bool = True
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[Signal("position", size=1, unit="rad"), Signal("velocity", size=1, unit="rad/s")],
+            act=[Signal("torque", size=1, unit="N m", lower=-10.0, upper=10.0, idle=0.0)],
+        )
+
+    def protocol(self) -> Protocol:
+        sense = {
+            "position": "joint_position_measured",
+            "velocity": "joint_velocity_estimated",
+            "torque_reported": "joint_torque_commanded",
+        }
+        return Protocol(
+            sense=[iiwa_status(sense)],
+            act=[iiwa_command({"torque": "joint_torque"})],
+            reported={"torque": "torque_reported"},
+        )
+
+    def make_dps(self) -> System:
+        return Rhythm(PERIOD)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(PlantFields(time_step=self.time_step, use_sampled_output_ports=False))
+        Parser(plant).AddModelsFromUrl(PENDULUM)
+        plant.Finalize()
+        split = builder.add("sense", "joint", Demultiplexer([1, 1]))
+        shown = plant.get_state_output_port()
+        if self.sampled:
+            hold = builder.add("sense", "hold", ZeroOrderHold(PERIOD, 2))
+            builder.builder.Connect(shown, hold.get_input_port())
+            shown = hold.get_output_port()
+        builder.builder.Connect(shown, split.get_input_port())
+        builder.sim_sensor("position", split.get_output_port(0))
+        builder.sim_sensor("velocity", split.get_output_port(1))
+        builder.sim_actuator("torque", plant.get_actuation_input_port())
+        if self.believes:
+            age = PERIOD if self.sampled else 0.0
+            builder.believe("sim.sys.Pendulum.theta.position", of=["dps.seen[0]"], age=age)
+            builder.believe("sim.sys.Pendulum.theta.velocity", of=["dps.seen"], by=lambda seen: seen[1], age=age)
+
+
+def machine(scenario: Scenario, **options: Any) -> Machine:
+    """One that is played by ``scenario``; ``options`` are those of `MachineConfig`."""
+    return Machine(scenario, MachineConfig(period=PERIOD, timeout=100.0, **options))

@@ -1,0 +1,188 @@
+"""Prediction and measurement line up: with a perfect model and exact sensors, there is no difference at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.monitoring.residuals.line import Together
+from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
+from vtbdrake.monitoring.residuals import Comparison, Predictor, ResidualConfig, ResidualMonitor, RowLayout, Sampler
+from vtbdrake.control.runtime import Runtime
+
+CONFIG = ResidualConfig(period=PERIOD, settle=0)
+EXACT = [
+    DrivenPendulum(),
+    DrivenPendulum(time_step=PERIOD / 2),
+    DrivenPendulum(sampled=True),
+    DrivenPendulum(time_step=0.0),
+    DrivenPendulum(time_step=0.0, sampled=True),
+]
+
+
+def monitored(runtime: Runtime | None, mode: str, config: ResidualConfig = CONFIG) -> ResidualMonitor:
+    assert runtime is not None
+    return ResidualMonitor(runtime, mode, config=config, learn=True, aside=False)
+
+
+def residuals(monitor: ResidualMonitor) -> np.ndarray:
+    monitor.close()
+    return np.array([window.residual for window in monitor.history])
+
+
+def twin(scenario: DrivenPendulum, config: ResidualConfig = CONFIG, cycles: int = 205, **options: Any) -> np.ndarray:
+    together = Together(scenario, machine(scenario, **options))
+    while not together.line.sensed["position"].count:
+        together.line.poll()
+    monitor = monitored(together.driver, "twin", config)
+    together.run(cycles)
+    found = residuals(monitor)
+    assert monitor.skipped == monitor.failed == 0
+    return found
+
+
+@pytest.mark.parametrize("scenario", EXACT, ids=str)
+def test_twin_of_a_perfect_model_leaves_nothing(scenario: DrivenPendulum) -> None:
+    found = twin(scenario)
+    assert found.shape == (20, 3)
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scenario", EXACT, ids=str)
+def test_shadow_of_a_perfect_model_leaves_nothing(scenario: DrivenPendulum) -> None:
+    together = Together(scenario, machine(scenario), shadowing=scenario)
+    monitor = monitored(together.shadow, "shadow")
+    together.run(205)
+    assert residuals(monitor).shape == (20, 3)
+    np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)
+    assert together.line.machine.status().accepted["torque"] == 204  # by the other loop
+
+
+@pytest.mark.parametrize("horizon", [1, 3, 50])
+def test_any_horizon_lines_up(horizon: int) -> None:
+    found = twin(DrivenPendulum(sampled=True), replace(CONFIG, horizon=horizon))
+    assert len(found) == 203 // horizon
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"act_delay": 2 * PERIOD}, {"sense_delay": 2 * PERIOD}])
+def test_declared_delay_of_the_way_lines_up(options: dict[str, float]) -> None:
+    found = twin(DrivenPendulum(), replace(CONFIG, delay=2), **options)
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+    assert np.abs(twin(DrivenPendulum(), **options)[:, 1]).max() > 1e-3
+
+
+def test_other_payload_leaves_what_the_equation_of_motion_says() -> None:
+    heavier = 1.05 * MASS
+    scenario = DrivenPendulum()
+    together = Together(scenario, machine(scenario, values={PAYLOAD: heavier}))
+    monitor = monitored(together.driver, "twin", replace(CONFIG, horizon=2))
+    read = together.driver.target.reader("dps.seen")
+    seen = []
+    for _ in range(201):
+        together.run(1)
+        seen.append(read(together.driver.context))
+    together.run(1)
+    # m l^2 q'' = u - m g l sin q - d v, with l = 0.5 m, d = 0.1 N m s/rad, and the mass of the arm itself.
+    states = np.array(seen)
+    q, v = states[:-1].T
+    torque = np.array([2.0 * np.sin(1.5 * k * PERIOD) for k in range(200)]) - 0.5 * v
+    acceleration = {
+        load: (torque - (0.5 + load) * 9.81 * 0.5 * np.sin(q) - 0.1 * v) / ((0.5 + load) * 0.25)
+        for load in (MASS, heavier)
+    }
+    more = (acceleration[heavier] - acceleration[MASS]).reshape(100, 2)
+    expected = PERIOD * np.cumsum(more, axis=1).mean(axis=1)
+    found = residuals(monitor)[:, 1]
+    assert np.abs(expected).max() > 5e-3
+    np.testing.assert_allclose(found, expected, atol=0.15 * np.abs(expected).max())
+
+
+def test_lost_messages_cost_their_windows_and_no_more() -> None:
+    scenario = DrivenPendulum()
+    together = Together(scenario, machine(scenario))
+    monitor = monitored(together.driver, "twin")
+    for k in range(30):
+        together.run(10)
+        if k == 12:
+            # In the middle of a window, the loop sees nothing of a cycle.
+            together.run(3)
+            together.line.machine.advance()
+            together.run(6)
+    np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)
+    assert monitor.skipped == 1
+
+
+def test_long_gap_has_it_begin_anew() -> None:
+    scenario = DrivenPendulum(sampled=True)
+    together = Together(scenario, machine(scenario))
+    monitor = monitored(together.driver, "twin", replace(CONFIG, settle=2))
+    together.run(102)
+    # Longer than a window, and shorter than AHEAD: this simulation runs faster than real time, and a sample that is
+    # further ahead than that would be rejected.
+    for _ in range(13):
+        together.line.machine.advance()
+    together.run(104)
+    found = residuals(monitor)
+    # Ten windows before the gap, less the two that settle; it costs two, and after it two settle again.
+    assert not together.line.sensed["position"].rejected
+    assert monitor.skipped == 2
+    assert len(monitor.history) == 8 + 7
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+
+
+def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
+    """What a comparison of a twin takes, and the rows of a heavier machine."""
+    scenario = DrivenPendulum()
+    runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
+    predictor = Predictor(scenario, period=PERIOD, values={})
+    layout = RowLayout(predictor.interface, ("torque",), {"dps.seen[0]": 1, "dps.seen": 2})
+    sampler = Sampler(runtime, layout, predictor.ages, mode="twin", horizon=CONFIG.horizon)
+    rows = layout.empty(cycles)
+    for row in rows:
+        assert sampler.fill(row[None], runtime.cycle()) == 1
+    return Comparison(predictor, layout, CONFIG, mode="twin"), rows
+
+
+def test_rows_may_come_in_any_portions_and_parts() -> None:
+    comparison, rows = rows_of(102)
+    expected = np.array([window.residual for window in comparison.take(rows)])
+    assert np.abs(expected).max() > 1e-2
+    again, _ = rows_of(1)
+    found = []
+    for row in rows:
+        # The velocity comes by itself, and then both again.
+        early, late = row.copy(), again._where.empty(1)[0]
+        velocity = again._where.sense["velocity"]
+        late[:2], late[velocity] = row[:2], row[velocity]
+        early[velocity] = np.nan
+        found += again.take(early[None]) + again.take(np.array([late, row]))
+    assert again.skipped == 0
+    np.testing.assert_array_equal([window.residual for window in found], expected)
+
+
+def test_second_command_for_one_period_is_the_one_that_acts() -> None:
+    comparison, rows = rows_of(102)
+    expected = np.array([window.residual for window in comparison.take(rows)])
+    again, _ = rows_of(1)
+    first = rows.copy()
+    first[:, again._where.command["torque"]] += 5.0
+    found = again.take(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
+    np.testing.assert_array_equal([window.residual for window in found], expected)
+
+
+def test_failed_prediction_is_told_and_begins_anew() -> None:
+    scenario = DrivenPendulum()
+    together = Together(scenario, machine(scenario))
+    monitor = monitored(together.driver, "twin")
+    together.run(50)
+    assert monitor._check is not None
+    predictor = monitor._check._comparison._predictor
+    predictor._now -= 100  # Drake does not go back in time.
+    together.run(60)
+    np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)
+    assert monitor.failed == 1
+    assert monitor.error

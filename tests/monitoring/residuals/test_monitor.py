@@ -1,0 +1,295 @@
+"""Residuals beside a loop, made by another process."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, System
+
+from tests.monitoring.residuals.line import Ear, Line, Together, loop
+from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
+from tests.control.scripted import ServoScenario
+from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor, residuals_of
+from vtbdrake.state import parameter
+from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
+
+TOLERANCE = {"sense.position": 1e-4, "sense.velocity": 1e-3, "act.torque": 1e-3}
+CONFIG = ResidualConfig(period=PERIOD, tolerance=TOLERANCE)
+SCENARIO = DrivenPendulum()
+PATIENCE = 60.0  # s
+
+
+def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -> None:
+    """Cycles, without haste, until so many windows are known to the loop."""
+    end = time.monotonic() + PATIENCE
+    while len(monitor.history) < count:
+        assert time.monotonic() < end, "no residuals come back"
+        together.run(10)
+        assert monitor._companion is not None
+        select.select((monitor._companion,), (), (), 0.05)
+
+
+def test_other_process_finds_what_the_own_one_does() -> None:
+    together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+    own = ResidualMonitor(together.driver, "twin", config=CONFIG, aside=False)
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as other:
+        assert other.running
+        together.run(305)
+    own.close()
+    assert not other.running
+    assert own.alarms
+    assert list(other.alarms) == list(own.alarms)
+    assert [w.time for w in other.history] == [w.time for w in own.history]
+    np.testing.assert_array_equal([w.residual for w in other.history], [w.residual for w in own.history])
+
+
+def test_newest_residuals_are_known_while_the_loop_runs() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor.newest is None
+        wait_for_windows(monitor, together, 10)
+        assert monitor.newest is not None
+        assert {name: value.shape for name, value in monitor.newest.items()} == dict.fromkeys(TOLERANCE, (1,))
+
+
+def test_arrays_show_how_an_alarm_came_about() -> None:
+    together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert {name: value.shape for name, value in monitor.arrays().items()} == {
+            "time": (0,),
+            **dict.fromkeys(TOLERANCE, (0, 1)),
+        }
+        together.run(305)
+    alarm, table = monitor.alarms[0], monitor.arrays()
+    entry = monitor.layout.places[alarm.signal].start + alarm.entry
+    begin = int(np.argmax(table["statistic"][:, entry] > alarm.threshold))
+    assert table["statistic"].shape == (len(monitor.history), monitor.layout.size)
+    assert table["statistic"][begin, entry] == alarm.statistic
+    assert (table["time"][begin], table[alarm.signal][begin, alarm.entry]) == (alarm.began, alarm.residual)
+
+
+def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor._companion is not None
+        together.run(100)
+        os.kill(monitor._companion.pid, signal.SIGKILL)
+        os.waitid(os.P_PID, monitor._companion.pid, os.WEXITED | os.WNOWAIT)
+        together.run(200)
+        assert together.driver.cycles == 300
+        assert not monitor.running
+        assert monitor.dropped > 0
+        assert "residuals" in caplog.text
+        assert "is gone" in caplog.text
+
+
+def test_process_that_is_stopped_leaves_windows_out() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        assert monitor._companion is not None
+        wait_for_windows(monitor, together, 10)
+        os.kill(monitor._companion.pid, signal.SIGSTOP)
+        together.run(2000)
+        os.kill(monitor._companion.pid, signal.SIGCONT)
+        before = monitor.history[-1].time
+        wait_for_windows(monitor, together, len(monitor.history) + 10)
+        assert monitor.skipped >= 50
+        assert np.diff([window.time for window in monitor.history]).max() > 50 * CONFIG.window
+        assert monitor.history[-1].time > before
+        assert not monitor.alarms
+
+
+def test_windows_that_lack_samples_are_told_of_while_the_loop_runs() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+        together.driver.unwatch(monitor)
+        together.driver.watch(lambda cycle: monitor(cycle) if cycle.number % 2 else None)
+        end = time.monotonic() + PATIENCE
+        while monitor.skipped < 20:
+            assert time.monotonic() < end, "nobody hears of it"
+            together.run(10)
+            assert monitor._companion is not None
+            select.select((monitor._companion,), (), (), 0.05)
+        assert not monitor.history
+
+
+def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
+    together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
+    assert together.shadow is not None
+    config = replace(CONFIG, settle=0)
+    monitor = ResidualMonitor(together.shadow, "shadow", config=config, aside=False)
+    together.run(105)
+    together.shadow.switch(sense="sim")
+    together.run(95)
+    together.shadow.switch(sense="real")
+    together.run(105)
+    monitor.close()
+    times = np.array([window.time for window in monitor.history]) / PERIOD
+    np.testing.assert_allclose(times, [*range(11, 92, 10), *range(211, 302, 10)])
+    np.testing.assert_allclose([window.residual for window in monitor.history], 0.0, atol=1e-12)
+
+
+def test_idle_dps_is_not_compared() -> None:
+    line = Line(SCENARIO, machine(SCENARIO))
+    runtime = loop(DpsAlone(SCENARIO), line, PERIOD, begin=False)
+    monitor = ResidualMonitor(runtime, "twin", config=CONFIG, aside=False)
+    for _ in range(200):
+        runtime.cycle()
+    monitor.close()
+    assert not monitor.history
+
+
+class Moody(Rhythm):
+    """A rhythm that commands only while it is in the mood."""
+
+    def __init__(self) -> None:
+        super().__init__(PERIOD)
+        mood = self.DeclareNumericParameter(BasicVector([1.0]))
+        self.DeclareVectorOutputPort("wish", 1, self._wish)
+        self.variables = (*self.variables, parameter("mood", mood))
+
+    def _wish(self, context: Context, output: BasicVector) -> None:
+        if not context.get_numeric_parameter(0).value()[0]:
+            raise RuntimeError("not in the mood")
+        output.SetFromVector(context.get_discrete_state(0).value())
+
+
+@dataclass
+class MoodyPendulum(DrivenPendulum):
+    believes: bool = False
+
+    def make_dps(self) -> System:
+        builder = DiagramBuilder()
+        rhythm = builder.AddNamedSystem("rhythm", Moody())
+        for name in ("position", "velocity"):
+            builder.ExportInput(rhythm.GetInputPort(name), name)
+        builder.ExportOutput(rhythm.GetOutputPort("wish"), "torque")
+        return builder.Build()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        builder.believe("sim.sys.Pendulum.theta.position", of=["dps.rhythm.seen[0]"])
+        builder.believe("sim.sys.Pendulum.theta.velocity", of=["dps.rhythm.seen[1]"])
+
+
+def test_shadow_goes_on_behind_a_dps_that_raised_and_tells_it_once(caplog: pytest.LogCaptureFixture) -> None:
+    together = Together(SCENARIO, machine(SCENARIO), shadowing=MoodyPendulum())
+    shadow = together.shadow
+    assert shadow is not None
+    monitor = ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+    together.run(200)
+    before = len(monitor.history)
+    shadow.write({"dps.rhythm.mood": 0.0})
+    together.run(20)
+    shadow.write({"dps.rhythm.mood": 1.0})
+    together.run(200)
+    assert caplog.text.count("the DPS raised RuntimeError when it was asked for its answer: ") == 1
+    assert len(monitor.history) - before >= 18 and monitor.skipped >= 2
+    assert "sense.position" not in [alarm.signal for alarm in monitor.alarms]
+
+
+class HalfTimeless(Line):
+    """A way on which only the position tells its time."""
+
+    def poll(self, timeout: float = 0.0) -> int:
+        count = super().poll(timeout)
+        self.sensed["velocity"].sent = float("nan")
+        return count
+
+
+def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
+    def residuals(kind: type[Line]) -> np.ndarray:
+        line = kind(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
+        driver = loop(DpsAlone(SCENARIO), line, PERIOD)
+        monitor = ResidualMonitor(driver, "twin", config=CONFIG, aside=False)
+        driver.run(cycles=300)
+        assert monitor.arrays()["time"].size > 10
+        return monitor.arrays()["sense.velocity"]
+
+    np.testing.assert_array_equal(residuals(HalfTimeless), residuals(Line))
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_world_of_other_signals_is_refused(aside: bool) -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match=r"ServoScenario predicts other signals than sense.position"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), aside=aside)
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_testbed_without_a_belief_is_refused(aside: bool) -> None:
+    scenario = DrivenPendulum(believes=False)
+    together = Together(scenario, machine(scenario))
+    with pytest.raises(ValueError, match=r"DrivenPendulum does not declare .* residuals need a belief"):
+        ResidualMonitor(together.driver, "twin", config=CONFIG, aside=aside)
+
+
+def test_unknown_variable_of_the_predicted_world_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    config = replace(CONFIG, values={"sim.sys.Pendulum.arm_com.mas": 1.0})
+    with pytest.raises(ValueError, match="arm_com.mass"):
+        ResidualMonitor(together.driver, "twin", config=config)
+
+
+def test_shadow_of_a_machine_that_reports_nothing_is_refused() -> None:
+    ear = Ear(SCENARIO)
+    ear.reported = {}
+    shadow = loop(SCENARIO.build(mode="shadow"), ear, PERIOD)
+    with pytest.raises(ValueError, match="does not report torque"):
+        ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+
+
+def test_other_mode_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match="shadow, twin, not of 'real'"):
+        ResidualMonitor(together.driver, "real", config=CONFIG)
+
+
+def test_other_period_than_the_loops_is_refused() -> None:
+    together = Together(SCENARIO, machine(SCENARIO))
+    with pytest.raises(ValueError, match=r"0.001 s do not fit a loop of 0.1 s"):
+        ResidualMonitor(together.driver, "twin")
+
+
+def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
+    scenario = DrivenPendulum(sampled=True)
+    together = Together(scenario, machine(scenario))
+    together.driver.period = 0.04
+    with pytest.raises(ValueError, match=r"0.1 s old, which is no whole number of periods of 0.04 s"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, period=0.04), aside=False)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"period": 0.0}, "period of residuals is positive"),
+        ({"horizon": 0}, "horizon of residuals is a whole number from 1"),
+        ({"delay": 0.5}, "delay of residuals is a whole number from 0"),
+        ({"false_alarm_interval": float("nan")}, "false_alarm_interval of residuals is positive"),
+        ({"tolerance": {"sense.position": -1.0}}, "tolerance of sense.position"),
+    ],
+)
+def test_impossible_config_is_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ResidualConfig(**fields)  # type: ignore[arg-type]
+
+
+def test_scenario_may_say_what_its_residuals_are_made_with() -> None:
+    class Own(DrivenPendulum):
+        def residuals(self) -> ResidualConfig:
+            return CONFIG
+
+    class Wrong(DrivenPendulum):
+        def residuals(self) -> dict[str, float]:
+            return {}
+
+    assert residuals_of(Own()) is CONFIG
+    assert residuals_of(SCENARIO) == ResidualConfig()
+    with pytest.raises(ValueError, match=r"Wrong.residuals\(\) returns a ResidualConfig"):
+        residuals_of(Wrong())

@@ -1,0 +1,51 @@
+"""Changes become events and changes again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vtbdrake.control.cycle import Change
+from vtbdrake.recording.changes import change_events, changes_of
+from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
+
+IMAGE = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"u.target": np.array([0.1, 1.0 / 3.0]), "dps.gain": 5e-324},
+        {"sense.position": "real", "act.größe": "twin"},
+        {"dps.perception": {"tick": 7, "image": IMAGE, "empty": np.zeros((0, 3)), "good": np.array(True)}},
+        {"dps.perception": {"tick": 7}},
+        {"a": np.array([[1, 2], [3, 4]], dtype=">i2"), "b": float("nan"), "c": -0.0},
+    ],
+)
+def test_values_come_back_as_they_were(values: dict[str, Any]) -> None:
+    messages = change_events([Change("first", {"x": 1.0}), Change("kind", values), Change("last", {})], 42, 1)
+    sent = [lcmt_vtb_change.decode(message.encode()) for message in messages]
+    (_, first), (number, change), (_, last) = changes_of(sent)
+    assert (first.kind, change.kind, last.kind, number) == ("first", "kind", "last", 42)
+    _assert_equal(change.values, values)
+
+
+def _assert_equal(found: Any, expected: Any) -> None:
+    if isinstance(expected, dict):
+        assert list(found) == list(expected)
+        for key in expected:
+            _assert_equal(found[key], expected[key])
+    elif isinstance(expected, str):
+        assert found == expected
+    else:
+        a, b = np.asarray(found), np.asarray(expected)
+        assert a.shape == b.shape and a.dtype.kind == b.dtype.kind and a.dtype.itemsize == b.dtype.itemsize
+        assert a.astype(b.dtype).tobytes() == b.tobytes()
+
+
+def test_changes_that_follow_each_other_in_two_cycles_stay_apart() -> None:
+    messages = [*change_events([Change("reset", {})], 1, 0), *change_events([Change("reset", {})], 2, 0)]
+    assert changes_of(messages) == [(1, Change("reset", {})), (2, Change("reset", {}))]

@@ -1,0 +1,340 @@
+"""Replay: the DPS does again, to the last bit, what it did; and whatever is not the same is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import Context, System
+
+from tests.recording.servo import Servo
+from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.control.scripted import Servo as ServoSystem
+from tests.control.slow import SlowScenario, chaotic, picky
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.recording.control_log import ControlLog
+from vtbdrake.recording.log_format import LogError
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.recorder import Recorder
+from vtbdrake.recording.replay import replay
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.state import AddressError
+from vtbdrake.testbed import DpsAlone
+
+
+def recorded(tmp_path: Path, servo: Servo, act: Callable[[], None] = lambda: None, *, cycles: int = 30) -> ControlLog:
+    """Cycles, what ``act`` does, and cycles, with a digest after each."""
+    with Recorder(servo.runtime, tmp_path / "run.lcm", digest_period=PERIOD, overwrite=True):
+        servo.runtime.run(cycles=cycles)
+        act()
+        servo.runtime.run(cycles=cycles)
+    return read_log(tmp_path / "run.lcm")
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["dps", "testbed"])
+def test_replay_is_identical(tmp_path: Path, alone: bool) -> None:
+    servo = Servo(alone=alone)
+    log = recorded(tmp_path, servo, partial(servo.runtime.write, {"u.target": [0.3, 1.0 / 3.0], "dps.gain": 4.7}))
+    report = replay(log)
+    assert report.outcome == "identical" and report.identical, report
+    assert (report.cycles, report.digests) == (60, 60)
+    assert np.array_equal(report.commands["velocity"], servo.commands[1:])
+    assert len(np.unique(report.commands["velocity"], axis=0)) >= 30
+
+
+def test_the_testbed_replays_every_switch(tmp_path: Path) -> None:
+    """Where the DPS is fed by the simulated world, by the machine, and by the world again, from what it believes."""
+    servo = Servo(alone=False, begun=False)
+    with Recorder(servo.runtime, tmp_path / "run.lcm", digest_period=PERIOD):
+        for mode in ("sim", "shadow", "real", "twin", "sim", "real"):
+            servo.runtime.switch(mode)
+            servo.runtime.run(cycles=10)
+    report = replay(tmp_path / "run.lcm", record=["sim.sys.axes.discrete_state_0"])
+    assert report.identical, report
+    assert np.isnan(report.commands["velocity"]).any(axis=1).tolist() == [
+        *[True] * 20, *[False] * 20, *[True] * 10, *[False] * 10,
+    ]  # fmt: skip
+    world = report.record["sim.sys.axes.discrete_state_0"]
+    assert np.array_equal(world[-1], servo.runtime.target.read(servo.runtime.context, "sim.sys.axes.discrete_state_0"))
+
+
+@pytest.mark.parametrize("before", [18, 19])
+def test_a_recording_that_began_in_the_middle_is_replayed(tmp_path: Path, before: int) -> None:
+    """With what lay at the real ports by then: the position comes in every other cycle only."""
+    servo = Servo()
+    servo.runtime.run(cycles=before)
+    report = replay(recorded(tmp_path, servo))
+    assert report.identical and report.times[0] == servo.cycles[before + 1].time
+
+
+class Prepared(ServoSystem):
+    """Counts from 100 on, which it does when it is initialized.
+
+    .. pydrake_system::
+
+        name: Prepared
+        input_ports:
+        - position
+        - speed
+        - target
+        output_ports:
+        - velocity
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareInitializationDiscreteUpdateEvent(lambda context, discrete: discrete.set_value(1, [100.0]))
+
+
+@dataclass
+class PreparedScenario(ServoScenario):
+    """With a DPS that has to be initialized."""
+
+    def make_dps(self) -> System:
+        return Prepared()
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["before", "after"])
+def test_initialization_is_replayed_if_it_was_recorded(tmp_path: Path, begun: bool) -> None:
+    servo = Servo(begun=begun, scenario=PreparedScenario(rate=0.0))
+    if begun:
+        servo.runtime.run(cycles=5)
+    else:
+        servo.runtime.cycle()
+        servo.runtime.switch("real")
+    report = replay(recorded(tmp_path, servo), record=["dps.ticks"])
+    assert report.identical, report
+    assert report.record["dps.ticks"][0] == (101.0 + 5 * begun)
+
+
+def test_a_dps_that_waits_to_begin_waits_in_the_replay(tmp_path: Path) -> None:
+    servo = Servo(begun=False)
+    report = replay(recorded(tmp_path, servo, lambda: servo.runtime.switch("real")))
+    assert report.identical
+    assert report.times[29] == 0.0 and report.times[30] == PERIOD
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_replayed_at_once_and_cycle_by_cycle_it_is_the_same_to_the_last_bit(
+    tmp_path: Path, begun: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="vtbdrake.recording.replay")
+    servo = Servo(begun=begun)
+
+    def act() -> None:
+        servo.runtime.run(cycles=1)  # so that both signals have come
+        servo.runtime.switch("real")
+        servo.runtime.write({"u.target": [0.3, 1.0 / 3.0], "dps.gain": 4.7})
+
+    log = recorded(tmp_path, servo, act, cycles=1200)
+    at_once, by_cycle = replay(log), replay(log, DpsAlone(servo.scenario))
+    assert "cycle by cycle" not in caplog.text
+    assert at_once.identical and by_cycle.identical and at_once.digests == by_cycle.digests == 2401
+    assert np.array_equal(at_once.times, by_cycle.times)
+    assert np.array_equal(at_once.commands["velocity"], by_cycle.commands["velocity"], equal_nan=True)
+
+
+def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="vtbdrake.recording.replay")
+    servo = Servo()
+
+    def trouble() -> None:
+        servo.runtime.write({"dps.trouble": 1.0})
+        servo.runtime.run(cycles=3)
+        servo.runtime.write({"dps.trouble": 0.0})
+
+    report = replay(recorded(tmp_path, servo, trouble))
+    assert report.identical, report
+    assert report.errors == dict.fromkeys([31, 32, 33], "RuntimeError: out of ideas")
+    assert "replayed cycle by cycle: " in caplog.text and "out of ideas" in caplog.text
+    assert report.times[33] - report.times[29] == pytest.approx(PERIOD)
+
+
+def test_commands_that_are_not_finite_are_compared_too(tmp_path: Path) -> None:
+    servo = Servo()
+    log = recorded(tmp_path, servo, lambda: servo.runtime.write({"dps.trouble": 2.0}))
+    assert np.isnan(log.commands["velocity"][30:, 0]).all() and log.commanded["velocity"].all()
+    assert replay(log).identical
+
+
+def test_the_dps_alone_replays_the_log_of_its_testbed(tmp_path: Path) -> None:
+    servo = Servo(alone=False)
+    servo.runtime.run(cycles=5)
+    log = recorded(tmp_path, servo, lambda: servo.runtime.switch("shadow"))
+    report = replay(log, DpsAlone(servo.scenario))
+    assert report.identical and report.digests == 60, report
+    assert not np.isnan(report.commands["velocity"]).any(), "in the shadow it commands as well"
+
+
+def test_the_testbed_replays_the_log_of_its_dps_alone(tmp_path: Path) -> None:
+    servo = Servo(begun=False)
+    servo.runtime.write({"u.target": [0.7, 0.1]})
+    log = recorded(tmp_path, servo, lambda: servo.runtime.switch("real"))
+    report = replay(log, servo.scenario.build(), record=["sim.sys.axes.discrete_state_0"])
+    assert report.identical and report.digests == 60, report
+    assert (report.record["sim.sys.axes.discrete_state_0"] == 0.0).all(), "the simulated world is idle"
+
+
+def test_the_dps_alone_is_refused_what_came_from_the_simulated_world(tmp_path: Path) -> None:
+    servo = Servo(alone=False)
+    log = recorded(tmp_path, servo, lambda: servo.runtime.switch(sense={"speed": "sim"}))
+    with pytest.raises(LogError, match="sense.speed came from the simulated world .* replay it through the testbed"):
+        replay(log, DpsAlone(servo.scenario))
+
+
+# -- abroad
+
+
+def test_variables_and_ports_are_read_after_every_cycle(tmp_path: Path) -> None:
+    servo = Servo()
+    report = replay(recorded(tmp_path, servo), record=["dps.ticks", "dps.velocity", "u.target"])
+    assert report.record["dps.ticks"].tolist() == list(range(1, 61))
+    assert np.array_equal(report.record["dps.velocity"], report.commands["velocity"])
+    assert report.record["u.target"].shape == (60, 2)
+
+
+def test_other_values_hold_whatever_the_log_says_and_nothing_is_compared(tmp_path: Path) -> None:
+    servo = Servo()
+    log = recorded(tmp_path, servo, lambda: servo.runtime.write({"dps.gain": 9.0, "u.target": [0.1, 0.1]}))
+    report = replay(log, values={"dps.gain": 2.5})
+    assert report.outcome == "not compared" and not report.identical and report.first_difference is None
+    position = log.fed["position"]
+    target = np.where(np.arange(60)[:, None] < 30, 0.0, 0.1)
+    assert np.array_equal(report.commands["velocity"], 2.5 * (target - position))
+
+
+def test_an_unknown_address_is_refused(tmp_path: Path) -> None:
+    log = recorded(tmp_path, Servo())
+    with pytest.raises(AddressError, match="did you mean dps.velocity"):
+        replay(log, record=["dps.velocit"])
+    with pytest.raises(AddressError, match="did you mean dps.gain"):
+        replay(log, values={"dps.gai": 1.0})
+
+
+# -- what is not the same
+
+
+class Worse(ServoSystem):
+    """It forgets a bit now and then.
+
+    .. pydrake_system::
+
+        name: Worse
+        input_ports:
+        - position
+        - speed
+        - target
+        output_ports:
+        - velocity
+    """
+
+    def _update(self, context: Context, discrete: object) -> None:
+        super()._update(context, discrete)
+        if round(context.get_time() / PERIOD) == 20:
+            velocity = discrete.value(0)  # type: ignore[attr-defined]
+            discrete.set_value(0, np.nextafter(velocity, np.inf))  # type: ignore[attr-defined]
+
+
+class Altered(DpsAlone):
+    """Says that it is of the recorded scenario, and has another DPS."""
+
+    def __init__(self, scenario: ServoScenario) -> None:
+        class Other(ServoScenario):
+            def make_dps(self) -> System:
+                return Worse()
+
+        super().__init__(Other(rate=scenario.rate))
+        self.scenario = scenario
+
+
+def test_one_bit_in_one_command_is_found(tmp_path: Path) -> None:
+    servo = Servo()
+    report = replay(recorded(tmp_path, servo), Altered(servo.scenario))
+    assert report.outcome == "different" and report.first_difference is not None
+    assert (report.first_difference.what, report.first_difference.cycle) == ("velocity", 21)
+    assert 0.0 < report.max_difference["velocity"] < 1e-15
+    assert "velocity in cycle 21 (t = 0.021 s)" in str(report)
+
+
+def test_a_state_that_no_command_shows_is_found_by_its_digest(tmp_path: Path) -> None:
+    servo = Servo()
+    log = recorded(tmp_path, servo)
+    # As if the DPS had counted otherwise when it was recorded.
+    object.__setattr__(log, "digests", [(i, bytes(16) if i >= 40 else digest) for i, digest in log.digests])
+    report = replay(log)
+    assert report.outcome == "different" and report.first_difference is not None
+    assert (report.first_difference.what, report.first_difference.cycle) == ("state", 41)
+
+
+def test_another_scenario_is_refused_and_told(tmp_path: Path) -> None:
+    log = recorded(tmp_path, Servo())
+    with pytest.raises(LogError, match="rate: 0.0 in the log, 2.0 here"):
+        replay(log, DpsAlone(ServoScenario(rate=2.0)))
+    with pytest.raises(LogError, match="scenario: '.*ServoScenario' in the log, '.*SlowScenario' here"):
+        replay(log, DpsAlone(SlowScenario()))
+
+
+def test_another_version_of_the_scenario_is_refused_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = recorded(tmp_path, Servo())
+
+    @dataclass
+    class Newer(ServoScenario):
+        rate: float = 2.0
+        lag: float = 0.1
+
+    Newer.__module__, Newer.__qualname__ = ServoScenario.__module__, ServoScenario.__qualname__
+    monkeypatch.setattr("tests.control.scripted.ServoScenario", Newer)
+    with pytest.raises(LogError, match="another version of it .lag: 'nothing' in the log, 0.1 here"):
+        replay(log)
+
+
+def test_a_scenario_that_is_not_to_be_had_any_more_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = recorded(tmp_path, Servo())
+    monkeypatch.delattr("tests.control.scripted.ServoScenario")
+    with pytest.raises(LogError, match="is not to be had in this version: .* has no scenario 'ServoScenario'"):
+        replay(log)
+
+
+def test_another_version_of_a_library_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = recorded(tmp_path, Servo())
+    monkeypatch.setitem(log.header.versions, "drake", "0.9")  # type: ignore[arg-type]
+    report = replay(log)
+    assert report.identical
+    assert report.versions[0].startswith("recorded with drake 0.9, replayed with 1.")
+
+
+# -- slow parts
+
+
+def rushing(t: float) -> Mapping[str, list[float]]:
+    return {"position": [np.sin(300.0 * t), np.cos(170.0 * t)]}
+
+
+@pytest.mark.parametrize("function", [chaotic, picky], ids=["results", "missing results"])
+def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[..., object]) -> None:
+    """And not computed anew: those that were missing are missing again."""
+    more: dict[str, object] = {} if function is picky else {"memory": np.array([0.3, 0.6])}
+    scenario = SlowScenario(function=function, period=0.004, latency=0.003, more=more)
+    clock = SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, rushing)
+    runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock)
+    runtime.cycle()
+    runtime.switch("real")
+    with Recorder(runtime, tmp_path / "run.lcm", digest_period=PERIOD):
+        for _ in range(60):
+            clock.advance(PERIOD)
+            runtime.slow_parts.wait(60.0)
+            runtime.cycle()
+    runtime.close()
+    log = read_log(tmp_path / "run.lcm")
+    results = [change for _, change in log.changes if change.kind == "result"]
+    missing = [change for change in results if len(change.values["dps.perception"]) == 1]
+    assert len(results) >= 14 and (len(missing) > 3) == (function is picky)
+
+    report = replay(log, DpsAlone(scenario))
+    assert report.identical and report.digests == 60, report
+    assert len(np.unique(report.commands["velocity"], axis=0)) > 10

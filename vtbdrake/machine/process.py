@@ -1,0 +1,276 @@
+"""A machine in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.faults import Fault
+from vtbdrake.machine.machine import MachineStatus
+from vtbdrake.control.statistics import Histogram, LoopStatistics
+from vtbdrake.interpreter import command
+from vtbdrake.testbed import Scenario
+
+_START_TIMEOUT = 60.0
+_ANSWER_TIMEOUT = 10.0
+
+
+class MachineError(RuntimeError):
+    """A machine that does not start, does not answer, or refuses a request."""
+
+
+@dataclass(frozen=True)
+class MachineStatistics:
+    """What a machine measured of its loop.
+
+    Attributes:
+        loop: its cycles; ``step`` is the simulation.
+        state_to_command: from telling a state to the next command's arrival, in seconds.
+        lost: seconds that the simulation could not keep up with.
+    """
+
+    loop: LoopStatistics
+    state_to_command: Histogram
+    lost: float
+
+
+class MachineProcess:
+    """A machine in a process of its own, which ends with `close`, and with the process that started it.
+
+        with Hub(port=0) as hub, MachineProcess(scenario, hub.url) as machine:
+            machine.begin(Delay(seconds=0.05))
+
+    Requests are answered between two cycles: what is begun holds from the next message on.
+
+    Args:
+        scenario: whose world it is; a class that other processes can import.
+        url: of the bus.
+        config: see there.
+        lock_step: cycles begin with commands, instead of with the clock; see `MachineLoop.run`.
+        cycles: after how many it ends by itself.
+        priority: of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
+        options: fields of the config, in its place or to change it.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        url: str,
+        config: MachineConfig | None = None,
+        *,
+        lock_step: bool = False,
+        cycles: int | None = None,
+        priority: int = 0,
+        **options: Any,
+    ) -> None:
+        self.scenario = scenario
+        self.url = url
+        self.config = replace(config or MachineConfig(), **options)
+        self._run = {"url": url, "lock_step": lock_step, "cycles": cycles, "priority": priority}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket | None = None
+        self._paused = False
+
+    def start(self) -> None:
+        """Returns when it has told its first state.
+
+        Raises:
+            MachineError: it does not start.
+        """
+        if self.alive:
+            raise MachineError("the machine runs already")
+        self.close()
+        control, theirs = socket.socketpair()
+        self._control = control
+        try:
+            with theirs, tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "scenario.yaml"
+                self.scenario.save(file)
+                order = {"scenario": f"{self.scenario.name()}@{file}", "config": _plain(self.config), **self._run}
+                self._process = subprocess.Popen(
+                    command("vtbdrake.machine.serve", str(theirs.fileno()), json.dumps(order)),
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                )
+                theirs.close()
+                self._ask({"request": "status"}, timeout=_START_TIMEOUT)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Of its process.
+
+        Raises:
+            MachineError: it has not been started.
+        """
+        if self._process is None:
+            raise MachineError("the machine does not run: start it, or use it in a with statement")
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether its process runs, or is paused."""
+        return self._process is not None and self._process.poll() is None
+
+    def status(self) -> MachineStatus:
+        """How it is now.
+
+        Raises:
+            MachineError: it does not answer.
+        """
+        return self._status({"request": "status"})
+
+    def statistics(self) -> MachineStatistics:
+        """What it measured since its start, or since `reset_statistics`."""
+        answer = self._ask({"request": "statistics"})
+        return MachineStatistics(
+            LoopStatistics.from_dict(answer["statistics"]),
+            Histogram.from_dict(answer["state_to_command"]),
+            answer["lost"],
+        )
+
+    def reset_statistics(self) -> None:
+        """Forgets what it measured, of a warm-up say."""
+        self._ask({"request": "reset statistics"})
+
+    def until(self, condition: Callable[[MachineStatus], bool], *, timeout: float = 10.0) -> MachineStatus:
+        """Waits for a status that fulfils the condition, and returns it.
+
+        Raises:
+            MachineError: there was none in ``timeout`` seconds.
+        """
+        limit = time.monotonic() + timeout
+        while not condition(status := self.status()):
+            if time.monotonic() > limit:
+                raise MachineError(f"the machine did not get there in {timeout} s; it is at {status}")
+        return status
+
+    def write(self, values: Mapping[str, Any]) -> MachineStatus:
+        """Sets variables of its world, by address: a tool that is changed while it runs, say.
+
+        Raises:
+            MachineError: an address is unknown, or a value impossible; nothing has changed.
+        """
+        return self._status({"set": _lists(values)})
+
+    # -- what goes wrong
+
+    def begin(self, *faults: Fault) -> MachineStatus:
+        """Begins faults; each lasts until `normal`, or until one of the same name and side takes its place."""
+        status = None
+        for fault in faults:
+            status = self._status(fault.to_dict())
+        return status or self.status()
+
+    def normal(self) -> MachineStatus:
+        """Ends all faults."""
+        return self._status({"request": "normal"})
+
+    def die(self) -> int:
+        """Has it end at once, without a farewell, and says with which exit code it did."""
+        self._send({"request": "die"})
+        return self.wait()
+
+    def kill(self) -> int:
+        """Kills it from outside (SIGKILL)."""
+        assert self.pid and self._process is not None
+        self._process.kill()
+        return self.wait()
+
+    def pause(self) -> None:
+        """Stops it in the middle of what it does (SIGSTOP)."""
+        os.kill(self.pid, signal.SIGSTOP)
+        self._paused = True
+
+    def resume(self) -> None:
+        """Lets it go on after `pause`; its world catches up with the time that has passed, if that was short, and loses
+        the rest (see `MachineStatistics.lost`)."""
+        os.kill(self.pid, signal.SIGCONT)
+        self._paused = False
+
+    def wait(self, timeout: float = _ANSWER_TIMEOUT) -> int:
+        """Waits for its end and returns the exit code.
+
+        Raises:
+            MachineError: it goes on.
+        """
+        assert self.pid and self._process is not None
+        try:
+            return self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise MachineError(f"the machine has not ended in {timeout} s") from None
+
+    def close(self) -> None:
+        """Ends it; it may be started again."""
+        if self._control is not None:
+            self._control.close()
+        if self._process is not None:
+            if self._paused:
+                self._process.kill()
+            try:
+                self._process.wait(_ANSWER_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._process = self._control = None
+        self._paused = False
+
+    def __enter__(self) -> MachineProcess:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- requests
+
+    def _status(self, request: dict[str, Any]) -> MachineStatus:
+        answer = self._ask(request)
+        return MachineStatus(**{item.name: answer[item.name] for item in fields(MachineStatus)})
+
+    def _send(self, request: dict[str, Any]) -> socket.socket:
+        if self._control is None:
+            raise MachineError("the machine does not run: start it, or use it in a with statement")
+        self._control.sendall(json.dumps(request).encode() + b"\n")
+        return self._control
+
+    def _ask(self, request: dict[str, Any], *, timeout: float = _ANSWER_TIMEOUT) -> dict[str, Any]:
+        answer = b""
+        try:
+            control = self._send(request)
+            control.settimeout(timeout)
+            while not answer.endswith(b"\n"):
+                part = control.recv(65536)
+                if not part:
+                    raise ConnectionResetError("it has ended")
+                answer += part
+        except OSError as error:
+            raise MachineError(f"the machine does not answer: {error}") from error
+        told: dict[str, Any] = json.loads(answer)
+        if "error" in told:
+            raise MachineError(told["error"])
+        return told
+
+
+def _plain(config: MachineConfig) -> dict[str, Any]:
+    plain = asdict(config)
+    plain["values"] = _lists(config.values)
+    return plain
+
+
+def _lists(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {address: np.asarray(value).tolist() for address, value in values.items()}
