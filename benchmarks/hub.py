@@ -14,9 +14,9 @@ import lcm
 import numpy as np
 
 from benchmarks.measure import LOWER, Benchmark
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.control.realtime import RealTime
+from vtbdrake.lcm.connections import TcpqConnection
+from vtbdrake.lcm.hub import Hub
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -16,11 +16,11 @@ from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.guard import Guards
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
 HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 72, 75, 70

@@ -18,11 +18,11 @@ from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.guard import Guards
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
-from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
+from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
 from vtbdrake.testbed import DpsAlone
 
 # Of the machine's sensors, in their units.

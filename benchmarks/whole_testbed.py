@@ -7,8 +7,8 @@ import signal
 import sys
 
 from vtbdrake.control.operation import operation_of, take_over
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import load_scenario
 

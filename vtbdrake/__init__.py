@@ -10,20 +10,20 @@ import vtbdrake.interpreter as _interpreter  # noqa: F401  It notes where relati
 
 if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
-    from vtbdrake.lcm.hub import Hub
+    from vtbdrake.control.operation import Operation
+    from vtbdrake.control.runtime import Runtime
     from vtbdrake.lcm.bridge import LcmBridge
+    from vtbdrake.lcm.hub import Hub
+    from vtbdrake.lcm.protocol import Protocol
+    from vtbdrake.machine import MachineProcess
     from vtbdrake.monitoring.live.client import LiveClient, watch
     from vtbdrake.monitoring.live.live_watch import LiveWatch
     from vtbdrake.monitoring.live.service import LiveService
-    from vtbdrake.machine import MachineProcess
-    from vtbdrake.control.operation import Operation
-    from vtbdrake.lcm.protocol import Protocol
+    from vtbdrake.monitoring.residuals import ResidualMonitor
+    from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.recording.log_reader import read_log
     from vtbdrake.recording.recorder import Recorder
     from vtbdrake.recording.replay import replay
-    from vtbdrake.monitoring.residuals import ResidualMonitor
-    from vtbdrake.control.runtime import Runtime
-    from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import (

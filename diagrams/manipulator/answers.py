@@ -15,10 +15,10 @@ from diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, r
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}

@@ -18,14 +18,14 @@ from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, 
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.bridge import LcmBridge
-from vtbdrake.machine import MachineProcess
 from vtbdrake.control.operation import Operation
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
 
 LAWS = ("cartesian_impedance", "admittance")

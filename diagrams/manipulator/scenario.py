@@ -25,10 +25,10 @@ from vtbdrake.components.sensors import (
     SampledSensor,
     connect_to_plant,
 )
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.control.operation import Operation
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.testbed import (
     Interface,

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from tests.monitoring.live.rig import PATIENCE, Rig, served
 from vtbdrake.cli import main
-from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.connections import TcpqConnection
+from vtbdrake.lcm.hub import Hub
 
 
 @pytest.fixture

@@ -24,11 +24,11 @@ from tests.control.scripted import PERIOD
 from tests.control.servo_machine import COMMAND, PATIENCE, ServoMachineScenario
 from tests.control.test_loop import Ear
 from vtbdrake.cli import main
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
 from vtbdrake.control.operation import operation_of
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.state import Snapshot
 
 SERVO = "tests.control.servo_machine:ServoMachineScenario"

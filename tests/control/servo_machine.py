@@ -8,10 +8,10 @@ from math import inf
 from drake import lcmt_scope
 
 from tests.control.scripted import PERIOD, ServoScenario
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.control.operation import Operation
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.testbed import Interface
 
 COMMAND = "IIWA_COMMAND"

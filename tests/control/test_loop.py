@@ -25,12 +25,12 @@ from pydrake.systems.framework import BasicVector, Context, System
 
 from tests.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
 from vtbdrake.control.guard import Guards
-from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.bridge import LcmBridge
-from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Fault, Freeze, MachineProcess, Reorder
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Fault, Freeze, MachineProcess, Reorder
 from vtbdrake.state import parameter
 from vtbdrake.testbed import DpsAlone, Interface, Signal, VirtualTestbed
 

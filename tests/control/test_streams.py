@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vtbdrake.control.streams import Frames
 from vtbdrake.lcm.hub.reader import Reader, publication
 from vtbdrake.lcm.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
-from vtbdrake.control.streams import Frames
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)
 LARGEST = 1000

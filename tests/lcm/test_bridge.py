@@ -23,9 +23,9 @@ import pytest
 
 from tests.control.arm import LIMIT, bridge, command, status
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, Statistics
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.connections import TcpqConnection
+from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, Statistics
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.ownership import Ownership
 from vtbdrake.lcm.routes import CommandWatch

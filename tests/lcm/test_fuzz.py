@@ -20,9 +20,9 @@ from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_sta
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
 from vtbdrake.control.bridge import Reception
+from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.routes import Inlet
-from vtbdrake.lcm.drake_messages import iiwa_status
 
 ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = 100_000

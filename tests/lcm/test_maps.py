@@ -11,8 +11,8 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 
 from tests.control.arm import ACT, SENSE, command, status
 from vtbdrake.lcm.bridge import LcmBridge
-from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.testbed import Interface, Signal
 

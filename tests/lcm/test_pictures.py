@@ -21,9 +21,9 @@ from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U, ImageToLcmImageArrayT
 
 from vtbdrake.control.bridge import Reception
-from vtbdrake.lcm.point_clouds import point_cloud_map
 from vtbdrake.lcm.images import image_array_map, image_map
 from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.lcm.point_clouds import point_cloud_map
 from vtbdrake.lcm.routes import Inlet
 from vtbdrake.testbed import Signal
 

@@ -14,9 +14,9 @@ from drake import lcmt_iiwa_status, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, interface, status
 from vtbdrake.control.bridge import Reception
+from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.routes import Inlet
-from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.testbed import Signal
 

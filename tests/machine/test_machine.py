@@ -13,6 +13,7 @@ from drake import lcmt_iiwa_status
 from tests.machine.robot import COMMAND, ELBOW, PERIOD, STATUS, RobotScenario, state, torque
 from tests.testbeds import AcrobotScenario
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.protocol import Protocol, ProtocolError
 from vtbdrake.machine import (
     PERTURBED,
     Delay,
@@ -23,7 +24,6 @@ from vtbdrake.machine import (
     NoBrake,
     perturbed_values,
 )
-from vtbdrake.lcm.protocol import Protocol, ProtocolError
 from vtbdrake.testbed import WorldAlone
 
 SHOULDER_RATE, ELBOW_RATE = "sim.sys.Acrobot.shoulder.velocity", "sim.sys.Acrobot.elbow.velocity"

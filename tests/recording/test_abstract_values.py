@@ -9,16 +9,16 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.recording.seeing import HEIGHT, WIDTH, SeeingScenario, brightness, picture
 from tests.control.scripted import PERIOD, ScriptedBridge
+from tests.recording.seeing import HEIGHT, WIDTH, SeeingScenario, brightness, picture
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.lcm.hub import Hub
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
-from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone
 
 SCENARIO = SeeingScenario()

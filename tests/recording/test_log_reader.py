@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.recording.servo import Servo
 from tests.control.scripted import PERIOD
+from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Change
 from vtbdrake.lcm.wire import decode

@@ -13,9 +13,9 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.recording.servo import Servo
 from tests.control.scripted import PERIOD
 from tests.control.test_loop import Loop
+from tests.recording.servo import Servo
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.recording.digest import StateDigest
 from vtbdrake.recording.log_reader import read_log

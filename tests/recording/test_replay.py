@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import Context, System
 
-from tests.recording.servo import Servo
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.scripted import Servo as ServoSystem
 from tests.control.slow import SlowScenario, chaotic, picky
+from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
-from vtbdrake.control.runtime import Runtime
 from vtbdrake.state import AddressError
 from vtbdrake.testbed import DpsAlone
 

@@ -29,12 +29,12 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.text import number, write_whole
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.guard import Guards
-from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.control.operation import operation_of, take_over
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone, Scenario
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, Reception
-from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
+from vtbdrake.control.reported import reported_signals
 from vtbdrake.lcm.connections import Handler
+from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.ownership import Ownership
 from vtbdrake.lcm.routes import CommandWatch, Inlet, Outlet, Transmission
-from vtbdrake.control.reported import reported_signals
 from vtbdrake.testbed import Interface, Signal
 
 _HUB = "tcpq://"

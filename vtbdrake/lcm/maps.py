@@ -8,8 +8,8 @@ from math import nan
 from typing import Any, NamedTuple
 
 from vtbdrake.control.kernels import Form, Intake, Reception
-from vtbdrake.lcm.wire import decode
 from vtbdrake.control.ranges import Range
+from vtbdrake.lcm.wire import decode
 from vtbdrake.testbed import Signal
 
 LONGEST_CHANNEL_NAME = 63

@@ -11,9 +11,9 @@ from typing import Any
 
 from vtbdrake.control.bridge import Reception
 from vtbdrake.control.kernels import Intake
+from vtbdrake.control.ranges import Range
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.wire import MalformedError
-from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
 _log = logging.getLogger(__name__)

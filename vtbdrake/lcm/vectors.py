@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.control.kernels import Form, Intake, Reception
+from vtbdrake.control.ranges import Range
 from vtbdrake.lcm.fields import Field, compose, find_field
 from vtbdrake.lcm.maps import LcmMap, Reader, Writer, never_sent
 from vtbdrake.lcm.wire import Layout, Place
-from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
 
 MICROSECOND = 1e-6

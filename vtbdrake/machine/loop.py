@@ -13,10 +13,10 @@ from typing import Any
 
 from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.json_object import json_object
+from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.machine.faults import FaultError, fault_from_dict
 from vtbdrake.machine.machine import Machine
-from vtbdrake.control.statistics import Histogram, LoopStatistics
 
 _log = logging.getLogger(__name__)
 

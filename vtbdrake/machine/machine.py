@@ -11,6 +11,7 @@ import numpy as np
 
 from vtbdrake.control import watchdog
 from vtbdrake.control.bridge import Reception
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.lcm.routes import Inlet
 from vtbdrake.machine.brake import Brake
 from vtbdrake.machine.config import MachineConfig
@@ -18,7 +19,6 @@ from vtbdrake.machine.faults import ACT, SENSE, Fault, FaultError, NoBrake, Pack
 from vtbdrake.machine.line import Line
 from vtbdrake.machine.perturbation import perturbed_values
 from vtbdrake.machine.sensors import Sensors
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.testbed import Scenario, WorldAlone
 
 _REORDER_WINDOW = 0.1  # s, see `LcmBridge`

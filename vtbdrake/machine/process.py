@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.control.statistics import Histogram, LoopStatistics
+from vtbdrake.interpreter import command
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import Fault
 from vtbdrake.machine.machine import MachineStatus
-from vtbdrake.control.statistics import Histogram, LoopStatistics
-from vtbdrake.interpreter import command
 from vtbdrake.testbed import Scenario
 
 _START_TIMEOUT = 60.0

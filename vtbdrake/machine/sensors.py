@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.control.reported import reported_signals
+from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import Packet
-from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.control.reported import reported_signals
 from vtbdrake.testbed import WorldAlone
 
 

@@ -13,10 +13,10 @@ from contextlib import nullcontext
 from math import inf
 
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.realtime import RealTime
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.loop import MachineLoop
 from vtbdrake.machine.machine import Machine
-from vtbdrake.control.realtime import RealTime
 from vtbdrake.testbed import load_scenario
 
 _log = logging.getLogger(__name__)

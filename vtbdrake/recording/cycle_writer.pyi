@@ -1,6 +1,6 @@
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.recording.log_format import CycleLayout
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.recording.log_format import CycleLayout
 
 class CycleWriter:
     def __init__(self, layout: CycleLayout, runtime: Runtime) -> None: ...

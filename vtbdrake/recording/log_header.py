@@ -13,8 +13,8 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.recording.log_format import MAX_SIZE, VERSION, LogError, LoggedSignal
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.recording.log_format import MAX_SIZE, VERSION, LogError, LoggedSignal
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, Signal, VirtualTestbed, load_scenario
 from vtbdrake.testbed.scenario import is_imported
 

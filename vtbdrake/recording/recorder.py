@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.recording.changes import change_events
 from vtbdrake.recording.cycle_writer import CycleWriter
 from vtbdrake.recording.digest import StateDigest
@@ -25,7 +26,6 @@ from vtbdrake.recording.log_header import LogHeader
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.log_writer import Loss, write_log
 from vtbdrake.recording.start import check_recordable
-from vtbdrake.control.runtime import Runtime
 from vtbdrake.state import snapshot as snapshots
 
 _log = logging.getLogger(__name__)

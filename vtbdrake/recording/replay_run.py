@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after
 from vtbdrake.control.parameters import parameters_at_hand
+from vtbdrake.control.switching import throw
 from vtbdrake.recording.abstract_values import abstract_values
 from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.digest import StateDigest
@@ -19,7 +20,6 @@ from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.log_header import kind_of
 from vtbdrake.recording.replay_report import Difference, differences
 from vtbdrake.recording.replay_start import Target, begin
-from vtbdrake.control.switching import throw
 from vtbdrake.testbed import VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 

@@ -17,10 +17,10 @@ from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, HOME
 from tests.control.scripted import ScriptedBridge
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.lcm.hub import Hub
 from vtbdrake.control.operation import operation_of
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone
 

@@ -12,8 +12,8 @@ from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, SWING
 from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
 from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay

@@ -9,8 +9,8 @@ from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.protocol import protocol_of
 
 SCENARIO = trial_scenario("admittance")
 

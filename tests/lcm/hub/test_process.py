@@ -74,9 +74,7 @@ def test_it_ends_with_the_block_and_can_be_started_again() -> None:
 
 
 def test_it_ends_when_the_process_that_started_it_is_killed() -> None:
-    program = (
-        "from vtbdrake.lcm.hub import Hub\nhub = Hub(port=0)\nhub.start()\nprint(hub.pid, flush=True)\ninput()"
-    )
+    program = "from vtbdrake.lcm.hub import Hub\nhub = Hub(port=0)\nhub.start()\nprint(hub.pid, flush=True)\ninput()"
     with subprocess.Popen(
         [sys.executable, "-c", program],
         cwd=Path(__file__).resolve().parents[3],

@@ -28,10 +28,10 @@ from tests.lcm.hub.clients import (
     record,
     wait_until,
 )
+from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.lcm.hub.shortcut import shortcut_name, take_shortcut
 from vtbdrake.lcm.hub.tcpq import address_name
-from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.link import LcmLink
 
 MEBIBYTE = 1024 * 1024

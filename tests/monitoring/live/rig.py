@@ -13,8 +13,8 @@ import numpy as np
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.testbed import DpsAlone
 
 PATIENCE = 30.0  # s for whatever has to happen

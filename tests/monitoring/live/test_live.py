@@ -14,10 +14,10 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.monitoring.live.rig import PATIENCE, Rig, served
 from tests.control.scripted import PERIOD
-from vtbdrake.lcm.hub import Hub, client_name
+from tests.monitoring.live.rig import PATIENCE, Rig, served
 from vtbdrake.lcm.connections import TcpqConnection
+from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, SilenceError, watch
 from vtbdrake.monitoring.live.desk import MAX_WAITING
 from vtbdrake.monitoring.live.live_watch import LiveWatch

@@ -10,11 +10,11 @@ from typing import Any
 from vtbdrake.control.bridge import Bridge, Reception
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guard import Guards
-from vtbdrake.lcm.routes import Inlet, Outlet, Transmission
-from vtbdrake.machine.machine import Machine
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.lcm.routes import Inlet, Outlet, Transmission
+from vtbdrake.machine.machine import Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
 Falsify = Callable[[str, bytes], bytes]

@@ -12,9 +12,9 @@ from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
 from tests.testbeds import PENDULUM
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.machine import Machine
-from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import discrete_state
 from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
 

@@ -10,8 +10,8 @@ import pytest
 
 from tests.monitoring.residuals.line import Together
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
-from vtbdrake.monitoring.residuals import Comparison, Predictor, ResidualConfig, ResidualMonitor, RowLayout, Sampler
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.monitoring.residuals import Comparison, Predictor, ResidualConfig, ResidualMonitor, RowLayout, Sampler
 
 CONFIG = ResidualConfig(period=PERIOD, settle=0)
 EXACT = [

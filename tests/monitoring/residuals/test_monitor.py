@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, System
 
+from tests.control.scripted import ServoScenario
 from tests.monitoring.residuals.line import Ear, Line, Together, loop
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
-from tests.control.scripted import ServoScenario
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor, residuals_of
 from vtbdrake.state import parameter
 from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder

@@ -17,11 +17,11 @@ from dataclasses import asdict, replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
+from vtbdrake.interpreter import command
 from vtbdrake.lcm.hub.config import HubConfig
 from vtbdrake.lcm.hub.server import HubServer, listen
 from vtbdrake.lcm.hub.statistics import Statistics
 from vtbdrake.lcm.hub.tcpq import address_name
-from vtbdrake.interpreter import command
 
 _log = logging.getLogger(__name__)
 

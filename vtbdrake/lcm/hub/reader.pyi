@@ -1,5 +1,5 @@
-from vtbdrake.lcm.hub.tcpq import Record
 from vtbdrake.control.streams import Stream
+from vtbdrake.lcm.hub.tcpq import Record
 
 def publication(channel: bytes, data: bytes) -> bytes: ...
 

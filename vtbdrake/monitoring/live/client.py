@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.control.json_object import json_object
 from vtbdrake.lcm.hub.statistics import Statistics
 from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
-from vtbdrake.control.json_object import json_object
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
 

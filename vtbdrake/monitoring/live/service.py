@@ -14,9 +14,9 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.monitoring.live.desk import VALUES, attend, text_frame, values_record
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.monitoring.live.desk import VALUES, attend, text_frame, values_record
 
 
 class LiveService:

@@ -12,6 +12,7 @@ import numpy as np
 
 from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import SWITCH, Cycle
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
 from vtbdrake.monitoring.residuals.calibration import Calibration, calibrate
 from vtbdrake.monitoring.residuals.check import Report, ResidualCheck, serve
@@ -19,7 +20,6 @@ from vtbdrake.monitoring.residuals.comparison import Comparison, ResidualLayout,
 from vtbdrake.monitoring.residuals.config import SHADOW, ResidualConfig, check_mode, residuals_of
 from vtbdrake.monitoring.residuals.predictor import Predictor
 from vtbdrake.monitoring.residuals.rows import Array, RowLayout, Sampler
-from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import Interface
 
 _log = logging.getLogger(__name__)

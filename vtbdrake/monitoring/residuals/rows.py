@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.monitoring.residuals.config import TWIN
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.monitoring.residuals.config import TWIN
 from vtbdrake.testbed import Interface, VirtualTestbed
 from vtbdrake.testbed.switch import REAL
 
