@@ -13,19 +13,19 @@ from pathlib import Path
 import vtbdrake, mine
 os.chdir(sys.argv[1])
 {changed}
-from vtbdrake.control.companion import Companion
+from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.rollout import ProcessExecutor, RolloutTask
 
 import select
-def files(companion):
-    select.select([companion], [], [])
-    frames = companion.take()
-    companion.close()
+def files(worker):
+    select.select([worker], [], [])
+    frames = worker.take()
+    worker.close()
     return frames
 
-print(files(Companion(mine.tell, name="a companion")))
+print(files(WorkerProcess(mine.tell, name="a worker")))
 task = RolloutTask(scenario=mine.PendulumScenario(), horizon=0.1)
 with ProcessExecutor(1) as executor:
     ((_, result),) = executor.run(task, [{{}}])

@@ -1,4 +1,4 @@
-"""Fresh interpreters that import the same modules as this one: what workers, companions, hubs and machines run in."""
+"""Fresh interpreters that import the same modules as this one: what workers, hubs and machines run in."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Fault, Freeze, MachineProcess, Reorder
+from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Freeze, InjectedFault, MachineProcess, Reorder
 from vtbdrake.state import parameter
 from vtbdrake.testbed import DpsAlone, Interface, Signal, VirtualTestbed
 
@@ -203,7 +203,7 @@ def hub() -> Iterator[Hub]:
         yield running
 
 
-def commands_in_lock_step(hub: Hub, *faults: Fault, cycles: int = 100) -> tuple[list[float], LcmBridge]:
+def commands_in_lock_step(hub: Hub, *faults: InjectedFault, cycles: int = 100) -> tuple[list[float], LcmBridge]:
     with Loop(hub, lock_step=True) as loop:
         loop.machine.begin(*faults)
         loop.sense()
@@ -266,9 +266,11 @@ def test_duplicates_change_nothing(hub: Hub) -> None:
         (ClockJump(seconds=-3600.0), "out of order"),
         (Delay(seconds=0.5), None),
     ],
-    ids=lambda value: value.name if isinstance(value, Fault) else "",
+    ids=lambda value: value.name if isinstance(value, InjectedFault) else "",
 )
-def test_machine_that_tells_nothing_new_is_stopped_until_reset(hub: Hub, fault: Fault, rejection: str | None) -> None:
+def test_machine_that_tells_nothing_new_is_stopped_until_reset(
+    hub: Hub, fault: InjectedFault, rejection: str | None
+) -> None:
     with Loop(hub, max_age=SHORT) as loop:
         loop.begin()
         loop.machine.begin(fault)

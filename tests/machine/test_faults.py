@@ -19,9 +19,9 @@ from vtbdrake.machine import (
     Delay,
     Drop,
     Duplicate,
-    Fault,
-    FaultError,
     Freeze,
+    InjectedFault,
+    InjectedFaultError,
     NoBrake,
     Reorder,
     fault_from_dict,
@@ -36,7 +36,7 @@ def message(number: int) -> bytes:
     return status(number).encode()
 
 
-def line(*faults: Fault, delay: int = 0, seed: int = 0) -> Line:
+def line(*faults: InjectedFault, delay: int = 0, seed: int = 0) -> Line:
     made = Line("sense", delay=delay, period=0.001, random=np.random.default_rng(seed))
     for fault in faults:
         made.begin(fault)
@@ -207,7 +207,7 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("fault", EXAMPLES, ids=lambda fault: fault.name)
-def test_faults_travel_as_json(fault: Fault) -> None:
+def test_faults_travel_as_json(fault: InjectedFault) -> None:
     assert fault_from_dict(json.loads(json.dumps(fault.to_dict()))) == fault
 
 
@@ -234,5 +234,5 @@ def test_all_faults_are_examples() -> None:
     ],
 )
 def test_faults_that_cannot_be_are_refused(data: dict[str, Any], message: str) -> None:
-    with pytest.raises(FaultError, match=message):
+    with pytest.raises(InjectedFaultError, match=message):
         fault_from_dict(data)

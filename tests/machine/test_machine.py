@@ -18,7 +18,7 @@ from vtbdrake.machine import (
     PERTURBED,
     Delay,
     Drop,
-    FaultError,
+    InjectedFaultError,
     Machine,
     MachineConfig,
     NoBrake,
@@ -311,7 +311,7 @@ def test_equal_seeds_give_equal_faults() -> None:
 
 
 def test_fault_of_an_unknown_channel_is_refused() -> None:
-    with pytest.raises(FaultError, match="no sense channel 'IIWA'; it has: IIWA_STATUS"):
+    with pytest.raises(InjectedFaultError, match="no sense channel 'IIWA'; it has: IIWA_STATUS"):
         machine().begin(Drop(channels=["IIWA"]))
 
 

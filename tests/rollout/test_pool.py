@@ -119,7 +119,7 @@ def test_a_worker_that_is_killed_while_it_starts_costs_nothing():
 
 def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch):
     killed = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
-    monkeypatch.setattr("vtbdrake.rollout.processes.command", lambda *_: [sys.executable, "-c", killed])
+    monkeypatch.setattr("vtbdrake.rollout.worker_processes.command", lambda *_: [sys.executable, "-c", killed])
     with ProcessExecutor(2) as executor, pytest.raises(WorkerError, match=r"does not start \(exit code -9\)"):
         list(executor.run(ANGLE, POINTS))
 

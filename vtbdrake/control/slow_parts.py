@@ -12,10 +12,10 @@ from typing import Any
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.clock import Clock
-from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import RESULT as CHANGE
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
 from vtbdrake.control.statistics import Histogram
+from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_function import Arrays, split_memory
 from vtbdrake.testbed.slow_part import SlowPart
@@ -138,7 +138,7 @@ class _Beside:
         self._asked = 0.0
         self._trouble = ""
         self._answers: list[bytes] = []
-        self._companion = Companion(
+        self._worker = WorkerProcess(
             keep,
             function,
             part.patience * part.latency,
@@ -147,7 +147,7 @@ class _Beside:
         )
 
     def receive(self, end: float) -> None:
-        answers, self._answers = self._answers + self._companion.take(), []
+        answers, self._answers = self._answers + self._worker.take(), []
         for answer in answers:
             self._take_in(*unpack(answer))
         for tick in [tick for tick in self._waiting if self._part.due(tick) <= end]:
@@ -199,29 +199,29 @@ class _Beside:
         self._changed(CHANGE, {self.path: {"tick": tick, **arrays}})
 
     def send(self) -> None:
-        self._companion.flush()
+        self._worker.flush()
         self._waiting = self._part.waiting(self._context)
         if self._ready and self._working is None and self._waiting:
             self._working = next(iter(self._waiting))
             self._asked = self._clock.now()
             arrays = {**self._waiting[self._working], **self._part.memory(self._context)}
-            if not self._companion.post(*pack((self._working, arrays))):
+            if not self._worker.post(*pack((self._working, arrays))):
                 _log.error("the slow part %s: its processes are gone, and nothing is computed any more", self.path)
 
     def wait(self, timeout: float) -> bool:
         end = time.monotonic() + timeout
         while (self._working is not None or not self._ready) and not self._answers:
             left = end - time.monotonic()
-            if left <= 0.0 or not self._companion.alive:
+            if left <= 0.0 or not self._worker.alive:
                 return False
-            line = [self._companion.fileno()]
-            select.select(line, line if self._companion.waiting else [], [], left)
-            self._companion.flush()
-            self._answers += self._companion.take()
+            line = [self._worker.fileno()]
+            select.select(line, line if self._worker.waiting else [], [], left)
+            self._worker.flush()
+            self._answers += self._worker.take()
         return True
 
     def close(self) -> None:
-        self._companion.close()
+        self._worker.close()
 
 
 def _sendable(path: str, part: SlowPart) -> bytes:

@@ -10,7 +10,7 @@ import traceback
 from math import inf
 from typing import Any
 
-from vtbdrake.control.companion import Channel, Companion
+from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 
 # What comes back: the first of a message, before what it is about.
 READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
@@ -19,7 +19,7 @@ _COUNT = struct.Struct("<I")
 _LENGTH = struct.Struct("<Q")
 
 
-def keep(channel: Channel, function: bytes, patience: float, name: str) -> None:
+def keep(channel: FrameConnection, function: bytes, patience: float, name: str) -> None:
     """Keeps a process that computes, and passes requests and answers on.
 
     To end a process and to start one takes milliseconds that the loop does not have: so it is done from here.
@@ -31,7 +31,7 @@ def keep(channel: Channel, function: bytes, patience: float, name: str) -> None:
     """
     while True:
         begin = time.monotonic()
-        worker = Companion(serve, function, name=f"the process of the slow part {name}")
+        worker = WorkerProcess(serve, function, name=f"the process of the slow part {name}")
         try:
             reason = _pass_on(channel, worker, patience)
         finally:
@@ -40,7 +40,7 @@ def keep(channel: Channel, function: bytes, patience: float, name: str) -> None:
         _pause(channel, begin + patience - time.monotonic())
 
 
-def _pass_on(channel: Channel, worker: Companion, patience: float) -> str:
+def _pass_on(channel: FrameConnection, worker: WorkerProcess, patience: float) -> str:
     """Until the worker is lost; says how."""
     deadline = inf
     while True:
@@ -60,7 +60,7 @@ def _pass_on(channel: Channel, worker: Companion, patience: float) -> str:
             return f"did not answer within {patience:g} s"
 
 
-def _pause(channel: Channel, seconds: float) -> None:
+def _pause(channel: FrameConnection, seconds: float) -> None:
     """A process that dies at its start must not be started all the time."""
     if seconds > 0.0:
         try:
@@ -69,7 +69,7 @@ def _pause(channel: Channel, seconds: float) -> None:
             return
 
 
-def serve(channel: Channel, function: bytes) -> None:
+def serve(channel: FrameConnection, function: bytes) -> None:
     """Computes: says that it is ready, then answers every request (tick, arrays) by (tick, arrays) or (tick, the error
     as text).
 

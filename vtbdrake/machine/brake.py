@@ -11,7 +11,7 @@ from vtbdrake.machine.config import HOLD, IDLE, LOCK
 from vtbdrake.testbed import WorldAlone
 
 
-class Brake:
+class HoldingBrake:
     """The machine's own way to be safe, independent of any controller.
 
     ``lock``: the joints that have actuators stand still at once, as if brakes fell in, and the actuators get their idle

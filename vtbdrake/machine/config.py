@@ -28,7 +28,7 @@ class MachineConfig:
     act_delay: float = 0.0  # s that messages from the controller take
     timeout: float = 0.1  # s without a command after which the machine brakes
     max_delay: float = 0.1  # s that a command may take longer than the quickest, by its sender's clock
-    brake: str = ""  # hold, idle or lock (see `Brake`); empty: lock if the plant is discrete, else idle
+    brake: str = ""  # hold, idle or lock (see `HoldingBrake`); empty: lock if the plant is discrete, else idle
     control_channel: str = "VTB_MACHINE"  # where it listens to requests
     status_channel: str = "VTB_MACHINE_STATUS"  # where it says how it is
     status_period: float = 0.1  # s

@@ -15,7 +15,7 @@ from vtbdrake.machine.damage import DAMAGE
 SENSE, ACT = "sense", "act"
 
 
-class FaultError(ValueError):
+class InjectedFaultError(ValueError):
     """A fault that does not exist, or is told something that it cannot do."""
 
 
@@ -40,7 +40,7 @@ Effect = Callable[[Packet], Iterable[Packet]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fault(ABC):
+class InjectedFault(ABC):
     """One thing that goes wrong with messages until it is ended.
 
     Attributes:
@@ -55,16 +55,16 @@ class Fault(ABC):
 
     def __post_init__(self) -> None:
         if self.side not in (SENSE, ACT):
-            raise FaultError(f"the side of the fault {self.name} is {SENSE} or {ACT}, not {self.side!r}")
+            raise InjectedFaultError(f"the side of the fault {self.name} is {SENSE} or {ACT}, not {self.side!r}")
         if isinstance(self.channels, str):
-            raise FaultError(f"the fault {self.name} takes a list of channels, such as [{self.channels!r}]")
+            raise InjectedFaultError(f"the fault {self.name} takes a list of channels, such as [{self.channels!r}]")
         object.__setattr__(self, "channels", tuple(self.channels))
         self.check()
 
     def check(self) -> None:  # noqa: B027 (most faults have nothing to check)
         """
         Raises:
-            FaultError: a value is out of its range.
+            InjectedFaultError: a value is out of its range.
         """
 
     @abstractmethod
@@ -78,11 +78,13 @@ class Fault(ABC):
     def _check_range(self, name: str, lower: float, upper: float) -> None:
         value = getattr(self, name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not lower <= value <= upper:
-            raise FaultError(f"{name} of the fault {self.name} lies between {lower:g} and {upper:g}, not at {value!r}")
+            raise InjectedFaultError(
+                f"{name} of the fault {self.name} lies between {lower:g} and {upper:g}, not at {value!r}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Freeze(Fault):
+class Freeze(InjectedFault):
     """The first message on a channel is repeated, byte for byte, in place of all that follow."""
 
     name = "freeze"
@@ -93,7 +95,7 @@ class Freeze(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Corrupt(Fault):
+class Corrupt(InjectedFault):
     """Messages arrive damaged.
 
     Attributes:
@@ -108,7 +110,7 @@ class Corrupt(Fault):
     def check(self) -> None:
         self._check_range("fraction", 0.0, 1.0)
         if self.kind not in DAMAGE:
-            raise FaultError(f"the kind of corruption is one of {', '.join(DAMAGE)}, not {self.kind!r}")
+            raise InjectedFaultError(f"the kind of corruption is one of {', '.join(DAMAGE)}, not {self.kind!r}")
 
     def begin(self, random: np.random.Generator, period: float) -> Effect:
         damage = DAMAGE[self.kind]
@@ -122,7 +124,7 @@ class Corrupt(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Duplicate(Fault):
+class Duplicate(InjectedFault):
     """Every message arrives ``copies`` times more."""
 
     name = "duplicate"
@@ -131,14 +133,14 @@ class Duplicate(Fault):
     def check(self) -> None:
         self._check_range("copies", 1, 1000)
         if not isinstance(self.copies, int):
-            raise FaultError(f"copies of the fault {self.name} is a whole number, not {self.copies!r}")
+            raise InjectedFaultError(f"copies of the fault {self.name} is a whole number, not {self.copies!r}")
 
     def begin(self, random: np.random.Generator, period: float) -> Effect:
         return lambda packet: (packet,) * (1 + self.copies)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drop(Fault):
+class Drop(InjectedFault):
     """Messages are lost, each with the probability ``fraction``."""
 
     name = "drop"
@@ -152,7 +154,7 @@ class Drop(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Delay(Fault):
+class Delay(InjectedFault):
     """Messages arrive ``seconds`` later, in whole cycles of the machine, rounded up."""
 
     name = "delay"
@@ -167,7 +169,7 @@ class Delay(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reorder(Fault):
+class Reorder(InjectedFault):
     """Of every two messages of a channel the second arrives first, and the first right after it.
 
     One that waits for its partner when the fault ends is lost.
@@ -189,7 +191,7 @@ class Reorder(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClockJump(Fault):
+class ClockJump(InjectedFault):
     """The time that messages tell is wrong by ``seconds``; it is the machine's own, so the side is ``sense``."""
 
     name = "clock_jump"
@@ -205,7 +207,7 @@ class ClockJump(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoBrake(Fault):
+class NoBrake(InjectedFault):
     """The machine does not brake when commands stop: it goes on with the last ones."""
 
     name = "no_brake"
@@ -217,35 +219,37 @@ class NoBrake(Fault):
         return lambda packet: (packet,)
 
 
-def _only_sense(fault: Fault) -> None:
+def _only_sense(fault: InjectedFault) -> None:
     if fault.side != SENSE:
-        raise FaultError(f"the fault {fault.name} is not one of received messages: leave out side={fault.side!r}")
+        raise InjectedFaultError(
+            f"the fault {fault.name} is not one of received messages: leave out side={fault.side!r}"
+        )
 
 
 # In the order in which they act where there are several.
-FAULTS: dict[str, type[Fault]] = {
+FAULTS: dict[str, type[InjectedFault]] = {
     kind.name: kind for kind in (ClockJump, NoBrake, Freeze, Corrupt, Duplicate, Drop, Delay, Reorder)
 }
 
 
-def fault_from_dict(data: Mapping[str, Any]) -> Fault:
-    """What `Fault.to_dict` gave, or somebody wrote: ``{"fault": "drop", "fraction": 0.5}``.
+def fault_from_dict(data: Mapping[str, Any]) -> InjectedFault:
+    """What `InjectedFault.to_dict` gave, or somebody wrote: ``{"fault": "drop", "fraction": 0.5}``.
 
     Raises:
-        FaultError: there is no such fault, or it does not take this.
+        InjectedFaultError: there is no such fault, or it does not take this.
     """
     name = data.get("fault")
     kind = FAULTS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise FaultError(f"a fault is one of {', '.join(FAULTS)}, not {name!r}")
+        raise InjectedFaultError(f"a fault is one of {', '.join(FAULTS)}, not {name!r}")
     given = {key: value for key, value in data.items() if key != "fault"}
     known = [item.name for item in fields(kind)]
     if unknown := sorted(map(str, given.keys() - set(known))):
-        raise FaultError(f"the fault {name} takes {', '.join(known)}, not {', '.join(unknown)}")
+        raise InjectedFaultError(f"the fault {name} takes {', '.join(known)}, not {', '.join(unknown)}")
     try:
         return kind(**given)
     except TypeError as error:
-        raise FaultError(f"the fault {name} is not complete: {error}") from None
+        raise InjectedFaultError(f"the fault {name} is not complete: {error}") from None
 
 
 def whole_cycles(seconds: float, period: float) -> int:

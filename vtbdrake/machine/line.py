@@ -7,7 +7,7 @@ from itertools import count
 
 import numpy as np
 
-from vtbdrake.machine.faults import FAULTS, ClockJump, Effect, Fault, Packet
+from vtbdrake.machine.faults import FAULTS, ClockJump, Effect, InjectedFault, Packet
 
 
 class Line:
@@ -25,15 +25,15 @@ class Line:
             period: of a cycle, in seconds.
         """
         self.side = side
-        self.faults: dict[str, Fault] = {}
-        self._effects: list[tuple[Fault, Effect]] = []
+        self.faults: dict[str, InjectedFault] = {}
+        self._effects: list[tuple[InjectedFault, Effect]] = []
         self._delay = delay
         self._period = period
         self._random = random
         self._waiting: list[tuple[int, int, Packet]] = []
         self._numbers = count()
 
-    def begin(self, fault: Fault) -> None:
+    def begin(self, fault: InjectedFault) -> None:
         """Begins a fault; it takes the place of one of the same name."""
         self.faults[fault.name] = fault
         effect = fault.begin(self._random, self._period)
@@ -70,5 +70,5 @@ class Line:
         return arrived
 
 
-def _concerns(fault: Fault, channel: str) -> bool:
+def _concerns(fault: InjectedFault, channel: str) -> bool:
     return not fault.channels or channel in fault.channels

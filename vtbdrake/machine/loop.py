@@ -15,7 +15,7 @@ from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.json_object import json_object
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.lcm.link import LcmLink
-from vtbdrake.machine.faults import FaultError, fault_from_dict
+from vtbdrake.machine.faults import InjectedFaultError, fault_from_dict
 from vtbdrake.machine.machine import Machine
 
 _log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ _CATCH_UP = 0.05  # s
 class MachineLoop:
     """A machine and its connection to the bus.
 
-    Requests come on the config's ``control_channel``, or by ``control``, as JSON: a fault, as `Fault.to_dict` gives it
+    Requests come on the config's ``control_channel``, or by ``control``, as JSON: a fault, as `to_dict` gives it
     (``{"fault": "drop", "fraction": 0.5}``), variables of its world to set (``{"set": {"sim.sys.payload.mass": 1}}``),
     or ``{"request": NAME}``:
 
@@ -253,7 +253,7 @@ class MachineLoop:
 
     def _answer(self, text: bytes) -> dict[str, Any]:
         try:
-            more = self._do(json_object(text, FaultError))
+            more = self._do(json_object(text, InjectedFaultError))
         except ValueError as error:
             _log.warning("request refused: %s", error)
             return {"error": str(error)}
@@ -282,7 +282,7 @@ class MachineLoop:
                 "lost": self.lost,
             }
         elif name != "status":
-            raise FaultError(
+            raise InjectedFaultError(
                 "a request is a fault, values to set, or one of status, normal, statistics, reset statistics, die; it "
                 f"cannot be {request!r}"
             )
@@ -291,5 +291,5 @@ class MachineLoop:
 
 def _values(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
-        raise FaultError(f"what is set is given by address, unlike {given!r}")
+        raise InjectedFaultError(f"what is set is given by address, unlike {given!r}")
     return given

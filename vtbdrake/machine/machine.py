@@ -13,9 +13,9 @@ from vtbdrake.control import watchdog
 from vtbdrake.control.bridge import Reception
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.lcm.routes import Inlet
-from vtbdrake.machine.brake import Brake
+from vtbdrake.machine.brake import HoldingBrake
 from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.faults import ACT, SENSE, Fault, FaultError, NoBrake, Packet, whole_cycles
+from vtbdrake.machine.faults import ACT, SENSE, InjectedFault, InjectedFaultError, NoBrake, Packet, whole_cycles
 from vtbdrake.machine.line import Line
 from vtbdrake.machine.perturbation import perturbed_values
 from vtbdrake.machine.sensors import Sensors
@@ -37,7 +37,7 @@ class MachineStatus:
         accepted: by actuator signal, how many commands it took.
         rejected: by actuator signal, how many it did not, by the reason; see `Reception`, and `Machine.refuse_late` for
             those that are ``late``.
-        faults: those that have begun, as `Fault.to_dict` gives them.
+        faults: those that have begun, as `InjectedFault.to_dict` gives them.
     """
 
     cycle: int
@@ -95,7 +95,7 @@ class Machine:
             side: Line(side, delay=whole_cycles(delay, config.period), period=config.period, random=random)
             for side, delay, random in ((SENSE, config.sense_delay, sense), (ACT, config.act_delay, act))
         }
-        self._brake = Brake(world, config.brake)
+        self._brake = HoldingBrake(world, config.brake)
         self._given = dict(self._brake.idle())
         self._feed = world.feed(self._context)
         self._sensors = Sensors(world, self.protocol, config, noise, given=self._given)
@@ -211,17 +211,19 @@ class Machine:
 
     # -- faults
 
-    def begin(self, fault: Fault) -> None:
+    def begin(self, fault: InjectedFault) -> None:
         """Begins a fault, from the next message on; it takes the place of one of the same name and side.
 
         Raises:
-            FaultError: it names a channel that there is not.
+            InjectedFaultError: it names a channel that there is not.
         """
         line = self._lines[fault.side]
         known = self._sensors.channels if fault.side == SENSE else self.channels
         for channel in fault.channels:
             if channel not in known:
-                raise FaultError(f"the machine has no {fault.side} channel {channel!r}; it has: {', '.join(known)}")
+                raise InjectedFaultError(
+                    f"the machine has no {fault.side} channel {channel!r}; it has: {', '.join(known)}"
+                )
         line.begin(fault)
 
     def normal(self) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.interpreter import command
 from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.faults import Fault
+from vtbdrake.machine.faults import InjectedFault
 from vtbdrake.machine.machine import MachineStatus
 from vtbdrake.testbed import Scenario
 
@@ -169,7 +169,7 @@ class MachineProcess:
 
     # -- what goes wrong
 
-    def begin(self, *faults: Fault) -> MachineStatus:
+    def begin(self, *faults: InjectedFault) -> MachineStatus:
         """Begins faults; each lasts until `normal`, or until one of the same name and side takes its place."""
         status = None
         for fault in faults:

@@ -6,7 +6,7 @@ import os
 import time
 from typing import NamedTuple
 
-from vtbdrake.control.companion import Channel
+from vtbdrake.control.worker_process import FrameConnection
 
 PAUSE = 0.02
 """Seconds between two looks whether there is something to write; the line holds more than comes meanwhile."""
@@ -27,7 +27,7 @@ class Loss(NamedTuple):
         return cls(int(frames), reason)
 
 
-def write_log(channel: Channel, path: str) -> None:
+def write_log(channel: FrameConnection, path: str) -> None:
     """Writes every frame at the end of a file that exists, whole or not at all; tells of those that it could not."""
     file = os.open(path, os.O_WRONLY | os.O_APPEND)
     end, lost = os.fstat(file).st_size, 0
@@ -48,7 +48,7 @@ def write_log(channel: Channel, path: str) -> None:
         os.close(file)
 
 
-def _next(channel: Channel) -> bytes:
+def _next(channel: FrameConnection) -> bytes:
     """The next frame. Nobody waits at the line for it: to wake him up would cost the loop more than all the rest."""
     while True:
         try:

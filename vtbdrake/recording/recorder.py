@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
-from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.recording.changes import change_events
 from vtbdrake.recording.cycle_writer import CycleWriter
 from vtbdrake.recording.digest import StateDigest
@@ -91,10 +91,10 @@ class Recorder:
             self.path.open("wb" if overwrite else "xb").close()
         except FileExistsError:
             raise FileExistsError(f"{self.path} exists: record to another file, or with overwrite=True") from None
-        self._companion = Companion(
+        self._worker = WorkerProcess(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
-        self._companion.post(*begin)
+        self._worker.post(*begin)
         self._next_tap: Callable[[str, bytes], None] | None = runtime.bridge.tap
         runtime.bridge.tap = self._tap
         runtime.watch(self)
@@ -102,12 +102,12 @@ class Recorder:
     @property
     def lost(self) -> int:
         """How many cycles (with their messages) are not in the file; exact once the recorder is closed."""
-        return self._companion.dropped + self._unwritten if self._missing is None else self._missing
+        return self._worker.dropped + self._unwritten if self._missing is None else self._missing
 
     @property
     def pid(self) -> int:
         """Of the process that writes."""
-        return self._companion.pid
+        return self._worker.pid
 
     def __enter__(self) -> Self:
         return self
@@ -150,7 +150,7 @@ class Recorder:
         self._events.clear()
         self._recorded += 1
         self._last = cycle.number
-        if not self._companion.post(frame, zlib.crc32(frame).to_bytes(4, "big")):
+        if not self._worker.post(frame, zlib.crc32(frame).to_bytes(4, "big")):
             self._tell("its process does not take them")
 
     def _note(self, cycle: Cycle, utime: int) -> None:
@@ -171,7 +171,7 @@ class Recorder:
         return bytes(message.encode())
 
     def _take_losses(self) -> None:
-        for data in self._companion.take():
+        for data in self._worker.take():
             loss = Loss.from_bytes(data)
             self._unwritten = loss.frames
             self._tell(loss.reason)
@@ -214,15 +214,15 @@ class Recorder:
         if self._runtime.bridge.tap == self._tap:
             self._runtime.bridge.tap = self._next_tap
         # So that there is room for the last frame.
-        self._companion.drain()
+        self._worker.drain()
         self._take_losses()
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
         message.crc = _signed_crc(message.encode()[:-4])
         self._events.append(self._single(END, message))
-        self._companion.post(*self._events)
+        self._worker.post(*self._events)
         self._events.clear()
-        code = self._companion.close()
+        code = self._worker.close()
         self._take_losses()
         if code or self.lost:
             # What was on its way to a process that died is lost as well: the file tells what has arrived.

@@ -13,10 +13,10 @@ import numpy as np
 
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
-from vtbdrake.rollout.processes import ProcessExecutor
 from vtbdrake.rollout.quality import QualityError
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.worker_processes import ProcessExecutor
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
 from vtbdrake.testbed import VirtualTestbed

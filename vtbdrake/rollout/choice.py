@@ -10,7 +10,7 @@ from typing import Any
 
 from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, checked_workers
 from vtbdrake.rollout.futures import FuturesExecutor
-from vtbdrake.rollout.processes import ProcessExecutor
+from vtbdrake.rollout.worker_processes import ProcessExecutor
 from vtbdrake.testbed import VirtualTestbed
 
 NAMES = ("auto", "serial", "threads", "processes", "dask")

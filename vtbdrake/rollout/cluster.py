@@ -16,11 +16,11 @@ from typing import Any
 
 from vtbdrake.rollout.blob import Blob, Blobs, pack, unpack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
-from vtbdrake.rollout.processes import ProcessExecutor, checked_time_limit
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import failed
 from vtbdrake.rollout.worker import answer
+from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker

@@ -13,11 +13,11 @@ from functools import partial
 
 from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
-from vtbdrake.rollout.processes import ProcessExecutor
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import failed
 from vtbdrake.rollout.worker import answer
+from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 _log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""A loop that others look at: it runs in this thread, they in another, and the companion in its process."""
+"""A loop that others look at: it runs in this thread, they in another, and the worker process in its process."""
 
 from __future__ import annotations
 

@@ -229,7 +229,7 @@ def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
     bus, answers = lcm.LCM(hub.url), []
     bus.subscribe("VTB_SET_ANSWER", lambda _, data: answers.append(json.loads(data)))
     with served(hub.url) as (rig, service):
-        rig.during(asked, hub.url, "get", ["dps.gain"])  # The companion listens.
+        rig.during(asked, hub.url, "get", ["dps.gain"])  # The worker process listens.
         bus.publish("VTB_RESET", b'{"id": "me", "reset": 1}')
         for data in (b"", b"\x00\xff", b" " * 100_000, b'{"id": "me", "set": {"x": Infinity}}', b'{"id": "me"}'):
             bus.publish("VTB_SET", data)
@@ -421,11 +421,11 @@ def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
     assert live.arrays()["dps.ticks"].size >= 5
 
 
-def test_the_loop_goes_on_when_the_companion_is_gone(hub: Hub) -> None:
+def test_the_loop_goes_on_when_the_worker_process_is_gone(hub: Hub) -> None:
     with served(hub.url, **AMPLE) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
             rig.during(live.wait, 5, timeout=PATIENCE)
-            service._companion.kill()
+            service._worker.kill()
             rig.until(lambda: service.watches == 0)
         before = len(rig.bridge.sent)
         rig.until(lambda: len(rig.bridge.sent) > before + 10)

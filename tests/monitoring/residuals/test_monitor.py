@@ -31,8 +31,8 @@ def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -
     while len(monitor.history) < count:
         assert time.monotonic() < end, "no residuals come back"
         together.run(10)
-        assert monitor._companion is not None
-        select.select((monitor._companion,), (), (), 0.05)
+        assert monitor._worker is not None
+        select.select((monitor._worker,), (), (), 0.05)
 
 
 def test_other_process_finds_what_the_own_one_does() -> None:
@@ -77,10 +77,10 @@ def test_arrays_show_how_an_alarm_came_about() -> None:
 def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixture) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
-        assert monitor._companion is not None
+        assert monitor._worker is not None
         together.run(100)
-        os.kill(monitor._companion.pid, signal.SIGKILL)
-        os.waitid(os.P_PID, monitor._companion.pid, os.WEXITED | os.WNOWAIT)
+        os.kill(monitor._worker.pid, signal.SIGKILL)
+        os.waitid(os.P_PID, monitor._worker.pid, os.WEXITED | os.WNOWAIT)
         together.run(200)
         assert together.driver.cycles == 300
         assert not monitor.running
@@ -92,11 +92,11 @@ def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixtur
 def test_process_that_is_stopped_leaves_windows_out() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
-        assert monitor._companion is not None
+        assert monitor._worker is not None
         wait_for_windows(monitor, together, 10)
-        os.kill(monitor._companion.pid, signal.SIGSTOP)
+        os.kill(monitor._worker.pid, signal.SIGSTOP)
         together.run(2000)
-        os.kill(monitor._companion.pid, signal.SIGCONT)
+        os.kill(monitor._worker.pid, signal.SIGCONT)
         before = monitor.history[-1].time
         wait_for_windows(monitor, together, len(monitor.history) + 10)
         assert monitor.skipped >= 50
@@ -114,8 +114,8 @@ def test_windows_that_lack_samples_are_told_of_while_the_loop_runs() -> None:
         while monitor.skipped < 20:
             assert time.monotonic() < end, "nobody hears of it"
             together.run(10)
-            assert monitor._companion is not None
-            select.select((monitor._companion,), (), (), 0.05)
+            assert monitor._worker is not None
+            select.select((monitor._worker,), (), (), 0.05)
         assert not monitor.history
 
 

@@ -1,6 +1,6 @@
-"""The companion's part: it speaks with those on the bus, so that the loop need not.
+"""The worker process's part: it speaks with those on the bus, so that the loop need not.
 
-Between the loop and its companion go frames of `pickle`, and those of `Values`, many and quick.
+Between the loop and its worker process go frames of `pickle`, and those of `Values`, many and quick.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from math import prod
 from typing import Any
 
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.companion import Channel
+from vtbdrake.control.worker_process import FrameConnection
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.monitoring.live.messages import (
     ANSWER,
@@ -84,7 +84,7 @@ class Desk:
         refused: how many requests were.
     """
 
-    def __init__(self, channel: Channel, url: str, addresses: Sequence[str]) -> None:
+    def __init__(self, channel: FrameConnection, url: str, addresses: Sequence[str]) -> None:
         self.refused = 0
         self._loop = channel
         self._addresses = addresses
@@ -263,6 +263,6 @@ def _order(request: Request) -> tuple[Any, ...]:
     return ("read", request.addresses, request.every)
 
 
-def attend(channel: Channel, url: str, addresses: Sequence[str]) -> None:
-    """The main program of the companion."""
+def attend(channel: FrameConnection, url: str, addresses: Sequence[str]) -> None:
+    """The main program of the worker process."""
     Desk(channel, url, addresses).run()

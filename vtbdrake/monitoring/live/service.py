@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.monitoring.live.desk import VALUES, attend, text_frame, values_record
 
 
@@ -28,7 +28,7 @@ class LiveService:
         with LiveService(runtime, "tcpq://127.0.0.1:7700"):
             runtime.run()
 
-    The bus is a companion's business (see `messages` for what is said there): the loop gets requests that are well
+    The bus is a worker process's business (see `messages` for what is said there): the loop gets requests that are well
     formed, one in a cycle, after the commands have left; what is set takes effect in the next one, as `Runtime.write`
     does. What is read is read there and then, for ``budget`` seconds of computing at most; what is left over waits for
     the next cycle. Reading changes nothing of what the DPS does.
@@ -38,7 +38,7 @@ class LiveService:
         url: the bus.
         budget: seconds of computing per cycle for reading; one value is always read.
         longest: seconds of computing beyond which a single value is not read again.
-        pause: seconds between two times that values are sent to those who watch: to wake the companion costs more
+        pause: seconds between two times that values are sent to those who watch: to wake the worker process costs more
             than to read a value.
 
     Attributes:
@@ -61,7 +61,7 @@ class LiveService:
         self._records: list[bytes] = []
         self._flush_at = -inf
         self._pause = pause
-        self._companion = Companion(attend, url, addresses, name="the live service")
+        self._worker = WorkerProcess(attend, url, addresses, name="the live service")
         runtime.watch(self)
 
     @property
@@ -72,7 +72,7 @@ class LiveService:
     def close(self) -> None:
         """Tells those who watch that it is over."""
         self._runtime.unwatch(self)
-        self._companion.close()
+        self._worker.close()
 
     def __enter__(self) -> LiveService:
         return self
@@ -82,7 +82,7 @@ class LiveService:
 
     def __call__(self, cycle: Cycle) -> None:
         """After a cycle."""
-        self._orders += self._companion.take()
+        self._orders += self._worker.take()
         if self._orders:
             self._begin(*pickle.loads(self._orders.popleft()))
         busy = bool(self._readings) and self._read(cycle)
@@ -99,15 +99,15 @@ class LiveService:
             self.refused = what
             return
         if kind == "reset":
-            self._companion.post(text_frame(number, **self._reset()))
+            self._worker.post(text_frame(number, **self._reset()))
             return
         # Asked first: what the others do for an unknown address, looking for similar ones, takes long.
         known = self._runtime.target.variables() if kind == "set" else self
         unknown = next((address for address in what if address not in known), None)
         if unknown is not None:
-            self._companion.post(text_frame(number, unknown=unknown))
+            self._worker.post(text_frame(number, unknown=unknown))
         elif kind == "set":
-            self._companion.post(text_frame(number, **self._set(what)))
+            self._worker.post(text_frame(number, **self._set(what)))
         else:
             readers = [self._runtime.target.reader(address) for address in what]
             self._readings.append(_Reading(number, what, readers, *rest))
@@ -163,19 +163,19 @@ class LiveService:
     def _conclude(self, reading: _Reading, cycle: Cycle) -> bool:
         """Sends what was read; whether it is to be read again."""
         if reading.error:
-            self._companion.post(text_frame(reading.number, error=reading.error))
+            self._worker.post(text_frame(reading.number, error=reading.error))
             return False
         if not reading.told:
             reading.told = True
-            self._companion.post(text_frame(reading.number, shapes=reading.shapes))
+            self._worker.post(text_frame(reading.number, shapes=reading.shapes))
         self._records.append(values_record(reading.number, cycle.number, reading.since, cycle.time, reading.entries))
         return reading.every > 0
 
     def _flush(self, now: float) -> None:
-        self._companion.post(VALUES, *self._records)
+        self._worker.post(VALUES, *self._records)
         self._records.clear()
         self._flush_at = now + self._pause
-        if self._companion.dropped and not self._companion.alive:
+        if self._worker.dropped and not self._worker.alive:
             self._readings.clear()
 
 

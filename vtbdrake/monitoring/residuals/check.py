@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vtbdrake.control.companion import Channel
+from vtbdrake.control.worker_process import FrameConnection
 from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
 from vtbdrake.monitoring.residuals.comparison import Comparison, Window
 from vtbdrake.monitoring.residuals.config import ResidualConfig
@@ -58,9 +58,12 @@ class ResidualCheck:
         return Report(windows, alarms, compared.skipped, compared.failed, compared.error)
 
 
-def serve(channel: Channel, scenario: Scenario, config: ResidualConfig, mode: str, judge: Judge | None) -> None:
-    """What a companion does for a monitor. It sends what the predictor asks of a row, or why there is none; it is sent
-    the layout of rows, and then rows; it sends reports."""
+def serve(channel: FrameConnection, scenario: Scenario, config: ResidualConfig, mode: str, judge: Judge | None) -> None:
+    """Run the worker process of a monitor.
+
+    It sends what the predictor asks of a row, or why there is none; it is sent the layout of rows, and then rows; it
+    sends reports.
+    """
     try:
         predictor = Predictor(scenario, period=config.period, values=config.values)
     except ValueError as error:
@@ -86,7 +89,7 @@ def serve(channel: Channel, scenario: Scenario, config: ResidualConfig, mode: st
     channel.send(pickle.dumps(pending))
 
 
-def _blocks(channel: Channel) -> tuple[list[bytes], bool]:
+def _blocks(channel: FrameConnection) -> tuple[list[bytes], bool]:
     """All that has come, at least one unless there will be no more; and whether there will."""
     blocks: list[bytes] = []
     try:

@@ -10,9 +10,9 @@ from math import inf, prod
 
 import numpy as np
 
-from vtbdrake.control.companion import Companion
 from vtbdrake.control.cycle import SWITCH, Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
 from vtbdrake.monitoring.residuals.calibration import Calibration, calibrate
 from vtbdrake.monitoring.residuals.check import Report, ResidualCheck, serve
@@ -106,12 +106,12 @@ class ResidualMonitor:
         self.history: deque[Window] = deque(maxlen=memory)
         self.skipped = self.failed = 0
         self.error = ""
-        self._companion: Companion | None = None
+        self._worker: WorkerProcess | None = None
         self._check: ResidualCheck | None = None
         judge = None if learn else Judge(self.layout, config, calibration)
         if aside:
-            self._companion = Companion(serve, scenario, config, mode, judge, name="residuals")
-            ages = self._await_ages(self._companion)
+            self._worker = WorkerProcess(serve, scenario, config, mode, judge, name="residuals")
+            ages = self._await_ages(self._worker)
         else:
             predictor = Predictor(scenario, period=config.period, values=config.values)
             ages = predictor.ages
@@ -119,8 +119,8 @@ class ResidualMonitor:
         addresses = dict.fromkeys(address for group in ages.values() for address in group)
         sizes = {address: prod(variables[address].shape) for address in addresses}
         rows = RowLayout(runtime.target.interface, reported, sizes)
-        if self._companion is not None:
-            self._companion.post(pickle.dumps(rows))
+        if self._worker is not None:
+            self._worker.post(pickle.dumps(rows))
         else:
             self._check = ResidualCheck(Comparison(predictor, rows, config, mode=mode), judge)
         self._sampler = Sampler(runtime, rows, ages, mode=mode, horizon=config.horizon)
@@ -130,15 +130,15 @@ class ResidualMonitor:
         runtime.watch(self)
 
     @staticmethod
-    def _await_ages(companion: Companion) -> dict[int, tuple[str, ...]]:
-        select.select((companion,), (), (), _START)
-        frames = companion.take()
+    def _await_ages(worker: WorkerProcess) -> dict[int, tuple[str, ...]]:
+        select.select((worker,), (), (), _START)
+        frames = worker.take()
         if not frames:
-            companion.kill()
+            worker.kill()
             raise ResidualError(f"the process that makes the residuals has ended, or said nothing for {_START:g} s")
         answer = pickle.loads(frames[0])
         if isinstance(answer, str):
-            companion.close()
+            worker.close()
             raise ValueError(answer)
         ages: dict[int, tuple[str, ...]] = answer
         return ages
@@ -166,10 +166,10 @@ class ResidualMonitor:
         block = self._block[: self._filled]
         if self._check is not None:
             self._absorb(self._check.take(block))
-        elif self._companion is not None:
+        elif self._worker is not None:
             if self._filled:
-                self._companion.post(block.tobytes())
-            for frame in self._companion.take():
+                self._worker.post(block.tobytes())
+            for frame in self._worker.take():
                 self._absorb(pickle.loads(frame))
         self._begin_block()
 
@@ -190,12 +190,12 @@ class ResidualMonitor:
     @property
     def running(self) -> bool:
         """Whether residuals are being made; False once the process that does is gone."""
-        return self._open and (self._companion is None or self._companion.alive)
+        return self._open and (self._worker is None or self._worker.alive)
 
     @property
     def dropped(self) -> int:
         """Windows that the process did not take, for it is gone, or far too slow."""
-        return self._companion.dropped if self._companion is not None else 0
+        return self._worker.dropped if self._worker is not None else 0
 
     @property
     def newest(self) -> dict[str, Array] | None:
@@ -234,9 +234,9 @@ class ResidualMonitor:
             return
         self._open = False
         self._pass_on()
-        if self._companion is not None:
-            self._companion.close()
-            for frame in self._companion.take():
+        if self._worker is not None:
+            self._worker.close()
+            for frame in self._worker.take():
                 self._absorb(pickle.loads(frame))
 
     def __enter__(self) -> ResidualMonitor:

@@ -26,7 +26,7 @@ _CHUNK = 1 << 18
 _BUFFER = 1 << 20  # of the socket, in bytes; the system may grant less
 
 
-class Channel:
+class FrameConnection:
     """The companion's own end of the line; its calls wait."""
 
     def __init__(self, line: socket.socket) -> None:
@@ -62,7 +62,7 @@ class Channel:
         self._line.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
 
-class Companion:
+class WorkerProcess:
     """A process of its own at the other end of a socket: a fresh interpreter that runs ``function(channel,
     *arguments)``.
 
@@ -71,7 +71,7 @@ class Companion:
     process.
 
     Args:
-        function: of a `Channel` and the arguments; travels by cloudpickle, with them.
+        function: of a `FrameConnection` and the arguments; travels by cloudpickle, with them.
         name: what it is called in errors and logs.
         backlog: bytes that may wait for it; frames beyond that are dropped.
 
@@ -95,7 +95,7 @@ class Companion:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
             self._line.setblocking(False)
             self._process = subprocess.Popen(
-                command("vtbdrake.control.companion", str(theirs.fileno())),
+                command("vtbdrake.control.worker_process", str(theirs.fileno())),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
             )
@@ -246,7 +246,7 @@ def main() -> None:
     # The loop may be confined to processors of its own, where nothing else is to work.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     with socket.socket(fileno=int(sys.argv[1])) as line:
-        channel = Channel(line)
+        channel = FrameConnection(line)
         try:
             function, arguments = pickle.loads(channel.receive())
             function(channel, *arguments)

@@ -1,0 +1,148 @@
+"""The process beside the loop: frames arrive whole and in order, nothing waits for it, its end is noticed."""
+
+import os
+import select
+import signal
+import time
+
+import numpy as np
+
+from vtbdrake.control.worker_process import WorkerProcess
+
+TIMEOUT = 30.0
+
+
+def echo(channel):
+    while True:
+        channel.send(channel.receive())
+
+
+def sum_up(channel):
+    total = 0
+    try:
+        while True:
+            total += len(channel.receive())
+    except EOFError:
+        channel.send(str(total).encode())
+
+
+def fall_asleep(channel):
+    signal.pause()
+
+
+def tell_scheduling(channel):
+    handler = signal.getsignal(signal.SIGINT)
+    processors = len(os.sched_getaffinity(0))
+    channel.send(f"{os.sched_getscheduler(0)} {processors} {handler == signal.SIG_IGN}".encode())
+
+
+def fail(channel, code):
+    os._exit(code)
+
+
+def taken(worker, count):
+    """The first ``count`` frames that come back."""
+    frames, end = [], time.monotonic() + TIMEOUT
+    while len(frames) < count:
+        worker.flush()
+        ready, _, _ = select.select((worker,), (), (), 0.05)
+        frames += worker.take() if ready else []
+        assert time.monotonic() < end, f"{len(frames)} frames of {count} came back"
+    return frames
+
+
+def test_frames_come_back_whole_and_in_order():
+    random = np.random.default_rng(0)
+    sent = [random.bytes(int(size)) for size in random.integers(0, 300_000, 60)]
+    worker = WorkerProcess(echo, name="echo")
+    try:
+        back = []
+        for frame in sent:
+            assert worker.post(frame[:10], frame[10:])
+            back += worker.take()
+        back += taken(worker, len(sent) - len(back))
+        assert back == sent and worker.dropped == 0
+    finally:
+        assert worker.close() == 0
+
+
+def test_what_waits_is_sent_before_it_ends():
+    worker = WorkerProcess(sum_up, name="sum", backlog=1 << 26)
+    for _ in range(100):
+        assert worker.post(bytes(100_000))
+    assert worker.close() == 0
+    assert worker.take() == [b"10000000"]
+
+
+def test_one_that_waits_to_say_something_hears_the_rest():
+    worker = WorkerProcess(echo, name="echo", backlog=1 << 26)
+    frames = [bytes([k]) * 100_000 for k in range(100)]
+    for frame in frames:
+        assert worker.post(frame)
+    assert worker.close() == 0
+    assert worker.take() == frames
+
+
+def test_a_long_frame_goes_piece_by_piece():
+    worker = WorkerProcess(sum_up, name="sum")
+    waiting = []
+    worker.post(bytes(1 << 20))
+    while worker.waiting:
+        waiting.append(worker.waiting)
+        worker.flush()
+    assert worker.close() == 0
+    assert worker.take() == [b"1048576"]
+    assert np.diff(waiting, prepend=1 << 20).min() >= -(1 << 18)
+
+
+def test_a_full_backlog_drops_and_counts_and_does_not_wait():
+    worker = WorkerProcess(fall_asleep, name="sleeper", backlog=1 << 20)
+    accepted = [worker.post(bytes(1 << 16)) for _ in range(200)]
+    worker.kill()
+    assert worker.dropped == accepted.count(False) > 0
+    assert sum(accepted) <= 200 and worker.waiting <= 1 << 20
+
+
+def test_one_that_is_killed_is_noticed_and_frames_are_counted():
+    worker = WorkerProcess(echo, name="victim")
+    worker.post(b"hello")
+    assert taken(worker, 1) == [b"hello"]
+    os.kill(worker.pid, signal.SIGKILL)
+    select.select((worker,), (), (), TIMEOUT)
+    assert worker.take() == [] and not worker.alive
+    assert not worker.post(b"again") and worker.dropped == 1
+    assert worker.close() == -signal.SIGKILL
+
+
+def test_one_that_ends_is_told_to_who_only_listens(caplog):
+    worker = WorkerProcess(fail, 3, name="failure")
+    select.select((worker,), (), (), TIMEOUT)
+    assert worker.take() == worker.take() == [] and not worker.alive
+    assert caplog.text.count(f"failure (process {worker.pid}) is gone: ") == 1
+    assert worker.close() == 3
+
+
+def test_one_that_is_closed_or_killed_is_no_news(caplog):
+    WorkerProcess(echo, name="echo").close()
+    WorkerProcess(fall_asleep, name="sleeper").kill()
+    assert not caplog.text
+
+
+def test_one_that_does_not_end_is_killed():
+    worker = WorkerProcess(fall_asleep, name="sleeper")
+    assert worker.close(timeout=1.0) == -signal.SIGKILL
+
+
+def test_its_exit_code_is_told():
+    assert WorkerProcess(fail, 3, name="failure").close() == 3
+
+
+def test_it_has_ordinary_scheduling_all_processors_and_leaves_interrupts_to_the_main_process():
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(processors)})
+    try:
+        worker = WorkerProcess(tell_scheduling, name="teller")
+        assert taken(worker, 1) == [f"{os.SCHED_OTHER} {len(processors)} True".encode()]
+        worker.close()
+    finally:
+        os.sched_setaffinity(0, processors)
