@@ -381,6 +381,23 @@ def test_after_an_outage_nothing_is_sent_until_what_it_departs_from_is_fresh() -
     assert loop.cycle({"torque": [0.1, 0.1]}).commands["torque"] == pytest.approx([3.9, 3.9])
 
 
+@pytest.mark.parametrize("wanted", [[0.0, 0.0], [nan, 0.0]])
+def test_until_a_first_command_leaves_it_departs_from_what_is_measured(wanted: list[float]) -> None:
+    sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
+    loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()}, start=False)
+    loop.guards.departures = {"torque": "acting"}
+    loop.guards.start("torque", [1.0, 1.0])
+    for measured in (2.0, 3.0, 4.0):
+        loop.receptions["acting"].value = np.array([measured, measured])
+        sent = loop.cycle({"torque": wanted}).commands["torque"]
+        assert abs(sent - measured).max() <= RATE * T + 1e-12
+        loop.guards.withheld(("torque",))
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.guards.withheld(())
+    loop.receptions["acting"].value = np.array([9.0, 9.0])
+    assert loop.cycle({"torque": wanted}).commands["torque"].max() <= 4.0
+
+
 def test_first_command_that_did_not_leave_is_nothing_to_hold() -> None:
     free = Signal("free", size=1, unit="rad", idle=0.0)
     loop = Loop(free, start=False)
@@ -589,7 +606,7 @@ happenings = st.sampled_from(["go", "go", "wild", "nan", "raise", "lost", "back"
 def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_acts(
     script: list[tuple[str, int, float]],
 ) -> None:
-    """The machine goes where it likes once it has heard nothing for more than ten cycles since it was switched on."""
+    """The machine goes where it likes once it has heard nothing for more than ten cycles."""
     mute = False
     quiet = FallbackController(lambda *_: NO_COMMAND if mute else [8.0, -8.0], otherwise=Hold())
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
@@ -606,7 +623,6 @@ def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_act
             loop.receptions["acting"].value = acting
             if event == "on" and not on:
                 loop.guards.start("torque", acting)
-                heard = loop.now
             on = {"on": True, "off": False}.get(event, on)
             wanted = {"wild": [9.0, -9.0], "nan": [nan, 0.0]}.get(event, [0.3, 0.3])
             options: dict[str, Any] = {"error": RuntimeError("x")} if event == "raise" else {}

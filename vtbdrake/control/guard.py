@@ -53,10 +53,11 @@ class Guards:
     Fallbacks go on when the machine is gone: they get the sensor signals that are still fresh, and the last accepted
     sample of each with its age. `Brake` turns into `Zero` when its velocity is stale.
 
-    A command that did not leave does not count (see `withheld`). After more than `MOST_UNSENT` of them in a row, or as
-    long a silence of a fallback or of the loop itself, nobody knows what the machine did meanwhile: its commands depart
-    anew, from what `departures` measures. Until that is fresh, nothing is sent. A pause of the loop counts if it is
-    longer than the `max_age` of what is measured, too: in lock-step, where that is infinite, time stands still in it.
+    A command that did not leave does not count (see `withheld`). From `start` until a first command has left, commands
+    depart in every cycle from what `departures` measures then, since the machine is free to move meanwhile. So they do
+    after more than `MOST_UNSENT` commands in a row that did not leave, or as long a silence of a fallback or of the
+    loop itself. Until what is measured is fresh, nothing is sent. A pause of the loop counts if it is longer than the
+    `max_age` of what is measured, too: in lock-step, where that is infinite, time stands still in it.
 
     Args:
         interface: of the DPS.
@@ -122,8 +123,8 @@ class Guards:
         # By actuator signal, for how many cycles nothing left: because it could not, or because a fallback is silent.
         self._unsent: dict[str, int] = {}
         self._held_back: frozenset[str] = frozenset()
-        # Those of which nothing has left since the loop itself has paused.
-        self._paused: frozenset[str] = frozenset()
+        # Those of which no command has left since their start, or since the loop itself has paused.
+        self._departing: frozenset[str] = frozenset()
         self._silent: frozenset[str] = frozenset()
 
     @property
@@ -149,6 +150,7 @@ class Guards:
             ValueError: it has another size or is not finite.
         """
         self.commands[name].start_from(value)
+        self._departing |= {name}
 
     def doubts(self, name: str, now: float, reception: Reception) -> list[str]:
         """What is wrong with a sensor signal now."""
@@ -167,7 +169,7 @@ class Guards:
         not_ready: str | None = None,
         others: Mapping[str, Reception] = MappingProxyType({}),
     ) -> Verdict:
-        """Judge one cycle. What it returns counts as sent, unless `withheld` says otherwise.
+        """Judge one cycle. Call `withheld` after it, with the commands that could not be sent.
 
         Args:
             now: the time on the clock of `Reception.arrived`, in seconds.
@@ -214,13 +216,14 @@ class Guards:
         Args:
             names: their actuator signals; empty if all have left.
         """
-        if not names and not self._unsent and not self._silent and not self._paused:
+        if not names and not self._unsent and not self._silent and not self._departing:
             return
         for name in names:
             self.commands[name].take_back()
         self._held_back = frozenset(names)
-        self._unsent = {name: self._unsent.get(name, 0) + 1 for name in (*names, *(self._silent - self._held_back))}
-        self._paused &= self._unsent.keys()
+        left = frozenset(self._active) - self._held_back - self._silent
+        self._unsent = {name: self._unsent.get(name, 0) + 1 for name in self._active if name not in left}
+        self._departing -= left
 
     def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
@@ -256,6 +259,7 @@ class Guards:
         if names != self._active:
             for name in set(self._active) - set(names):
                 self.commands[name].release()
+                self._departing -= {name}
             self._active = names
         return names
 
@@ -287,8 +291,8 @@ class Guards:
     ) -> list[Fault]:
         """Have commands that have not left for long depart from what is measured now, and return what is wrong."""
         if self._last is not None and now - self._last > self._longest_pause:
-            self._paused = self._lapsed(now - self._last)
-        if not self._unsent and not self._paused:
+            self._departing |= self._lapsed(now - self._last)
+        if not self._unsent and not self._departing:
             return []
         causes = []
         for name in self._active:
@@ -300,7 +304,7 @@ class Guards:
             sensor = self.departures.get(name)
             if not guard.needs_start or sensor is None:
                 continue
-            if not unsent and name not in self._paused:
+            if not unsent and name not in self._departing:
                 continue
             reception = receptions.get(sensor) or others.get(sensor)
             if reception is not None and self.watchdogs[sensor].check(now, reception) is None:
