@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, ZeroOrderHold
 
-from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.clock import Clock
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
@@ -23,7 +23,7 @@ class ScriptedBridge(Bridge):
 
     def __init__(self, interface: Interface, clock: Clock, sensors: Callable[[float], Mapping[str, Any]]) -> None:
         self.interface = interface
-        self.sensed = {signal.name: Reception() for signal in interface.sense}
+        self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.commanded = {}
         self.sent: list[tuple[float, dict[str, Any]]] = []
         self.sensors = sensors

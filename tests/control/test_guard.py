@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
 from vtbdrake.control.guard import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal
@@ -37,7 +37,7 @@ class Loop:
 
     def __init__(self, *act: Signal, sense: Signal = VELOCITY, start: bool = True, **options: Any) -> None:
         self.guards = Guards(Interface(sense=[sense], act=act), T, **options)
-        self.receptions = {sense.name: Reception(value=np.zeros(2), arrived=0.0, count=1)}
+        self.receptions = {sense.name: ReceivedSignal(value=np.zeros(2), arrived=0.0, count=1)}
         self.now = 0.0
         self.silent = False
         if start:
@@ -302,7 +302,7 @@ def test_fallback_gets_the_last_accepted_samples_with_their_age_whatever_the_fau
 
 def test_fallback_gets_what_the_machine_senses_though_the_dps_listens_to_the_simulation() -> None:
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
-    sensed = {"velocity": Reception(value=np.array([2.0, -2.0]), arrived=T, count=1)}
+    sensed = {"velocity": ReceivedSignal(value=np.array([2.0, -2.0]), arrived=T, count=1)}
     verdict = loop.guards.check(T, {}, {"torque": [nan, nan]}, others=sensed)
     assert verdict.commands["torque"] == pytest.approx([-0.1, 0.1])
 
@@ -436,7 +436,7 @@ def test_farewell_after_a_pause_departs_from_what_is_measured_or_is_left_out(fre
         loop.guards.withheld(())
     loop.now += 0.5
     if fresh:
-        loop.receptions["acting"] = Reception(value=np.array([-5.0, 1.0]), arrived=loop.now, count=99)
+        loop.receptions["acting"] = ReceivedSignal(value=np.array([-5.0, 1.0]), arrived=loop.now, count=99)
     commands = loop.guards.fault("the time is up", loop.now, loop.receptions).commands
     assert [command.tolist() for command in commands.values()] == ([[-5.0, 1.0]] if fresh else [])
 
@@ -535,7 +535,7 @@ def test_log_has_each_fault_once_while_it_lasts_and_is_bounded() -> None:
 def test_doubts_are_what_is_wrong_with_a_sensor_now() -> None:
     loop = Loop(TORQUE)
     assert loop.guards.doubts("velocity", 0.0, loop.receptions["velocity"]) == []
-    assert loop.guards.doubts("velocity", 0.0, Reception()) == ["sensor signal velocity has never arrived"]
+    assert loop.guards.doubts("velocity", 0.0, ReceivedSignal()) == ["sensor signal velocity has never arrived"]
 
 
 def test_abstract_actuator_signal_passes_and_is_held() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.operation import take_over
@@ -595,7 +595,7 @@ def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
 
 def test_commands_u_that_come_by_the_bridge_reach_the_dps_and_those_that_the_dps_refuses_are_counted():
     runtime, bridge, _ = make()
-    bridge.commanded["target"] = Reception()
+    bridge.commanded["target"] = ReceivedSignal()
     runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
     bridge.commanded["target"].value, bridge.commanded["target"].count = np.array([0.3, 0.2]), 1
     runtime.cycle()

@@ -7,7 +7,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.ranges import Range
 from vtbdrake.control.watchdog import Watchdog
 from vtbdrake.testbed import Signal
@@ -17,11 +17,11 @@ def signal(size: int = 2, **options: object) -> Signal:
     return Signal("encoders", size=size, unit="rad", max_age=0.05, **options)
 
 
-def received(value: object, arrived: float = 0.0, count: int = 1) -> Reception:
-    return Reception(value=value, arrived=arrived, count=count)
+def received(value: object, arrived: float = 0.0, count: int = 1) -> ReceivedSignal:
+    return ReceivedSignal(value=value, arrived=arrived, count=count)
 
 
-def kind(watchdog: Watchdog, now: float, reception: Reception) -> str | None:
+def kind(watchdog: Watchdog, now: float, reception: ReceivedSignal) -> str | None:
     fault = watchdog.check(now, reception)
     return fault and fault.kind
 
@@ -29,7 +29,7 @@ def kind(watchdog: Watchdog, now: float, reception: Reception) -> str | None:
 @pytest.mark.parametrize("max_age", [0.05, inf])
 def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
     watchdog = Watchdog(Signal("encoders", size=2, max_age=max_age))
-    fault = watchdog.check(7.0, Reception())
+    fault = watchdog.check(7.0, ReceivedSignal())
     assert (fault.kind, fault.signal, fault.time) == ("stale", "encoders", 7.0)
     assert "never arrived" in str(fault)
 
@@ -147,7 +147,7 @@ def test_abstract_signal_is_watched_for_its_age_only() -> None:
 
 def test_value_that_the_bridge_checked_by_other_limits_is_checked_again() -> None:
     wide, narrow = signal(upper=2.0), signal(upper=1.0)
-    sample = Reception(value=np.full(2, 1.5), arrived=0.0, count=1, range=Range(wide))
+    sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, range=Range(wide))
     assert kind(Watchdog(narrow), 0.0, sample) == "implausible"
     assert kind(Watchdog(wide), 0.0, sample) is None
 
@@ -156,7 +156,7 @@ def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str |
     """The watchdog's findings for samples of (sent, arrived)."""
     watchdog = Watchdog(signal(), max_delay=max_delay)
     receptions = [
-        Reception(value=np.zeros(2), sent=sent, arrived=arrived, count=k + 1)
+        ReceivedSignal(value=np.zeros(2), sent=sent, arrived=arrived, count=k + 1)
         for k, (sent, arrived) in enumerate(samples)
     ]
     return [kind(watchdog, reception.arrived, reception) for reception in receptions]

@@ -19,10 +19,10 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.routes import Inlet
+from vtbdrake.lcm.routes import ChannelReader
 
 ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = 100_000
@@ -112,9 +112,9 @@ def resident() -> int:
 
 
 @pytest.fixture(scope="module")
-def fuzzed() -> tuple[dict[str, Reception], Oracle, list[int]]:
-    receptions = {"position": Reception(), "torque": Reception()}
-    inlet = Inlet(iiwa_status(SENSE), interface().sense, receptions, 0.0)
+def fuzzed() -> tuple[dict[str, ReceivedSignal], Oracle, list[int]]:
+    receptions = {"position": ReceivedSignal(), "torque": ReceivedSignal()}
+    inlet = ChannelReader(iiwa_status(SENSE), interface().sense, receptions, 0.0)
     oracle, memory = Oracle(), []
     for number, data in enumerate(stream(1, MESSAGES)):
         inlet.take("IIWA_STATUS", data)
@@ -126,30 +126,30 @@ def fuzzed() -> tuple[dict[str, Reception], Oracle, list[int]]:
     return receptions, oracle, memory
 
 
-def test_every_message_is_counted_once(fuzzed: tuple[dict[str, Reception], Oracle, list[int]]) -> None:
+def test_every_message_is_counted_once(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
     for reception in fuzzed[0].values():
         assert reception.count + sum(reception.rejected.values()) == MESSAGES
 
 
-def test_exactly_the_right_messages_are_believed(fuzzed: tuple[dict[str, Reception], Oracle, list[int]]) -> None:
+def test_exactly_the_right_messages_are_believed(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
     receptions, oracle, _ = fuzzed
     counts = {name: reception.count for name, reception in receptions.items()}
     assert counts == oracle.accepted
     assert min(counts.values()) > MESSAGES // 20
 
 
-def test_every_kind_of_rejection_occurred(fuzzed: tuple[dict[str, Reception], Oracle, list[int]]) -> None:
+def test_every_kind_of_rejection_occurred(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
     expected = {"fingerprint", "truncated", "trailing", "size", "not finite", "limits", "out of order", "duplicate"}
     expected |= {"ahead of time"}
     assert set(fuzzed[0]["position"].rejected) == expected
 
 
-def test_memory_stays_flat(fuzzed: tuple[dict[str, Reception], Oracle, list[int]]) -> None:
+def test_memory_stays_flat(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
     early, late = fuzzed[2]
     assert late - early < 5_000_000
 
 
-def judged(reception: Reception) -> int:
+def judged(reception: ReceivedSignal) -> int:
     """How many messages came, good or bad."""
     return reception.count + sum(reception.rejected.values())
 

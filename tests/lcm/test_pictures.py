@@ -20,11 +20,11 @@ from pydrake.systems.lcm import LcmPublisherSystem
 from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U, ImageToLcmImageArrayT
 
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.images import image_array_map, image_map
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.point_clouds import point_cloud_map
-from vtbdrake.lcm.routes import Inlet
+from vtbdrake.lcm.routes import ChannelReader
 from vtbdrake.testbed import Signal
 
 WIDTH, HEIGHT = 6, 4
@@ -50,9 +50,9 @@ def sent_by_drake(system: System, values: list[Any], message_type: Any) -> bytes
     return heard[-1]
 
 
-def take(map: LcmMap, signals: list[Signal], *messages: bytes) -> dict[str, Reception]:
-    receptions = {signal.name: Reception() for signal in signals}
-    inlet = Inlet(map, signals, receptions, 0.1)
+def take(map: LcmMap, signals: list[Signal], *messages: bytes) -> dict[str, ReceivedSignal]:
+    receptions = {signal.name: ReceivedSignal() for signal in signals}
+    inlet = ChannelReader(map, signals, receptions, 0.1)
     for message in messages:
         inlet.take(CHANNEL, message)
     return receptions
@@ -227,8 +227,8 @@ def test_broken_pictures_are_counted_and_do_no_harm(kind: str) -> None:
     else:
         good = sent_by_drake(PointCloudToLcm("lidar"), [cloud(3)], lcmt_point_cloud)
         map, signal = point_cloud_map(CHANNEL, "camera"), Signal("camera", model_value=cloud(0))
-    reception = Reception()
-    inlet = Inlet(map, [signal], {"camera": reception}, 0.0)
+    reception = ReceivedSignal()
+    inlet = ChannelReader(map, [signal], {"camera": reception}, 0.0)
     for _ in range(5_000):
         data = bytearray(good)
         for _ in range(chance.randrange(1, 6)):

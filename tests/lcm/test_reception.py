@@ -13,10 +13,10 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, interface, status
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.routes import Inlet
+from vtbdrake.lcm.routes import ChannelReader
 from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.testbed import Signal
 
@@ -25,9 +25,9 @@ class Arm:
     """The inlet of the arm's status, and the reception of its two signals."""
 
     def __init__(self, *, reorder_window: float = math.inf) -> None:
-        self.position, self.torque = Reception(), Reception()
+        self.position, self.torque = ReceivedSignal(), ReceivedSignal()
         receptions = {"position": self.position, "torque": self.torque}
-        self.inlet = Inlet(iiwa_status(SENSE), interface().sense, receptions, reorder_window)
+        self.inlet = ChannelReader(iiwa_status(SENSE), interface().sense, receptions, reorder_window)
 
     def take(self, *messages: lcmt_iiwa_status | bytes) -> Arm:
         for message in messages:
@@ -133,9 +133,9 @@ def test_time_of_a_rejected_message_counts_for_nothing() -> None:
 
 
 def test_message_without_a_time_is_new_whenever_it_comes(user_types: ModuleType) -> None:
-    reception = Reception()
+    reception = ReceivedSignal()
     map = vector_map("POINT", user_types.point_t, {"x": "x"}, stamp="")
-    inlet = Inlet(map, [Signal("x", size=1)], {"x": reception}, 0.1)
+    inlet = ChannelReader(map, [Signal("x", size=1)], {"x": reception}, 0.1)
     for _ in range(3):
         inlet.take("POINT", user_types.point_t().encode())
     assert reception.count == 3
@@ -164,7 +164,7 @@ def exit_process(_: Any) -> dict[str, Any]:
 def test_decoder_of_a_user_that_fails_is_counted_and_nothing_is_raised(
     user_types: ModuleType, decode: Callable[[Any], dict[str, Any]], reason: str
 ) -> None:
-    reception = Reception()
+    reception = ReceivedSignal()
     map = LcmMap(channel="POINT", type=user_types.point_t, signals=["x"], decode=decode)
-    Inlet(map, [Signal("x", size=1)], {"x": reception}, 0.1).take("POINT", user_types.point_t().encode())
+    ChannelReader(map, [Signal("x", size=1)], {"x": reception}, 0.1).take("POINT", user_types.point_t().encode())
     assert (reception.count, reception.rejected) == (0, {reason: 1})

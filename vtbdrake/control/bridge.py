@@ -7,13 +7,13 @@ from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.control.kernels import Reception
+from vtbdrake.control.kernels import ReceivedSignal
 
 if TYPE_CHECKING:
     # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
     from vtbdrake.testbed import Interface
 
-__all__ = ["Bridge", "BridgeError", "Reception"]
+__all__ = ["Bridge", "BridgeError", "ReceivedSignal"]
 
 
 class BridgeError(RuntimeError):
@@ -38,9 +38,9 @@ class Bridge(ABC):
     """
 
     interface: Interface
-    sensed: dict[str, Reception]
-    commanded: dict[str, Reception]
-    reported: Mapping[str, Reception] = MappingProxyType({})
+    sensed: dict[str, ReceivedSignal]
+    commanded: dict[str, ReceivedSignal]
+    reported: Mapping[str, ReceivedSignal] = MappingProxyType({})
     channels: Mapping[str, str] = MappingProxyType({})
     tap: Callable[[str, bytes], None] | None = None
 

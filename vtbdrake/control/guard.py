@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
 from vtbdrake.control.kernels import found
 from vtbdrake.control.limits import NOT_STARTED, AbstractGuard, CommandFault, CommandGuard
@@ -152,7 +152,7 @@ class Guards:
         self.commands[name].start_from(value)
         self._departing |= {name}
 
-    def doubts(self, name: str, now: float, reception: Reception) -> list[str]:
+    def doubts(self, name: str, now: float, reception: ReceivedSignal) -> list[str]:
         """What is wrong with a sensor signal now."""
         fault = self.watchdogs[name].check(now, reception)
         return [fault.reason] if fault else []
@@ -160,19 +160,19 @@ class Guards:
     def check(
         self,
         now: float,
-        receptions: Mapping[str, Reception],
+        receptions: Mapping[str, ReceivedSignal],
         commands: Mapping[str, Any],
         active: Collection[str] | None = None,
         *,
         error: BaseException | None = None,
         missed: int = 0,
         not_ready: str | None = None,
-        others: Mapping[str, Reception] = MappingProxyType({}),
+        others: Mapping[str, ReceivedSignal] = MappingProxyType({}),
     ) -> Verdict:
         """Judge one cycle. Call `withheld` after it, with the commands that could not be sent.
 
         Args:
-            now: the time on the clock of `Reception.arrived`, in seconds.
+            now: the time on the clock of `ReceivedSignal.arrived`, in seconds.
             receptions: of the sensor signals that are on real; no others are watched.
             commands: of the DPS, by actuator signal.
             active: the actuator signals that are on real, each once; by default those of ``commands``, and those of the
@@ -225,7 +225,7 @@ class Guards:
         self._unsent = {name: self._unsent.get(name, 0) + 1 for name in self._active if name not in left}
         self._departing -= left
 
-    def fault(self, reason: str, now: float, receptions: Mapping[str, Reception]) -> Verdict:
+    def fault(self, reason: str, now: float, receptions: Mapping[str, ReceivedSignal]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
         self._depart_anew(now, receptions)
         told = Fault(now, None, "told", reason)
@@ -234,7 +234,9 @@ class Guards:
             self._latch((told,))
         return Verdict(self._fall_back(now, receptions), False, (*self._faults, told))
 
-    def reset(self, now: float, receptions: Mapping[str, Reception], against: Collection[str] = ()) -> tuple[str, ...]:
+    def reset(
+        self, now: float, receptions: Mapping[str, ReceivedSignal], against: Collection[str] = ()
+    ) -> tuple[str, ...]:
         """Releases the latch, unless a cause persists: the DPS's and the loop's as of the last `check`, the sensor
         signals' as of now. A sensor signal that has jumped is accepted where it is, if it has been steady there.
 
@@ -286,8 +288,8 @@ class Guards:
     def _depart_anew(
         self,
         now: float,
-        receptions: Mapping[str, Reception],
-        others: Mapping[str, Reception] = MappingProxyType({}),
+        receptions: Mapping[str, ReceivedSignal],
+        others: Mapping[str, ReceivedSignal] = MappingProxyType({}),
     ) -> list[Fault]:
         """Have commands that have not left for long depart from what is measured now, and return what is wrong."""
         if self._last is not None and now - self._last > self._longest_pause:
@@ -332,7 +334,7 @@ class Guards:
         self._failed.clear()
         _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
 
-    def _fall_back(self, now: float, receptions: Mapping[str, Reception]) -> dict[str, Any]:
+    def _fall_back(self, now: float, receptions: Mapping[str, ReceivedSignal]) -> dict[str, Any]:
         """The fallbacks' commands, within the limits."""
         dt = self.period if self._last is None else now - self._last
         self._last = now

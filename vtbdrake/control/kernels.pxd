@@ -1,3 +1,5 @@
+from libc.stdint cimport int64_t
+
 cimport numpy as cnp
 
 
@@ -14,3 +16,25 @@ cdef inline double* entries_of(object value, Py_ssize_t size) noexcept:
     ):
         return NULL
     return <double*>cnp.PyArray_DATA(array)
+
+
+cdef void* zeros(Py_ssize_t count, size_t size) except NULL
+
+
+cdef class Box:
+    cdef Py_ssize_t size
+    cdef double* lower
+    cdef double* upper
+
+    cdef bint holds(self, const double* entries) noexcept
+
+
+cdef class ReceivedSignal:
+    cdef public object value
+    cdef public double arrived
+    cdef public double sent
+    cdef public int64_t count
+    cdef public dict rejected
+    cdef public object range
+
+    cpdef accept(self, value, double arrived, double sent)

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.boundary import RealPorts
-from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.cycle import WRITE, Change, time_after
 from vtbdrake.control.parameters import parameters_at_hand
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
@@ -58,7 +58,7 @@ class Stepped:
         self._ports = RealPorts(target, self._context)
         self.idle = isinstance(target, DpsAlone)
         self.active: tuple[str, ...] = ()
-        self.watched: Mapping[str, Reception] = {}
+        self.watched: Mapping[str, ReceivedSignal] = {}
         self._changes: list[Change] = []
         self._fed: dict[str, Any] = {}
         # How many of each signal's values are known: what is counted beyond that is new.

@@ -8,7 +8,7 @@ from math import inf, isfinite, isnan, nan
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.kernels import Freshness, Reach
 from vtbdrake.control.ranges import Range
 from vtbdrake.testbed import Signal
@@ -54,7 +54,7 @@ class Delay:
         self._least = inf  # of the times from sending to arrival: the clocks' difference is in it
         self._sent = self._arrived = -inf
 
-    def of(self, reception: Reception) -> float:
+    def of(self, reception: ReceivedSignal) -> float:
         """Of the newest message, in seconds; NaN if it does not tell when it was sent."""
         took = reception.arrived - reception.sent
         if isnan(took):
@@ -114,14 +114,14 @@ class Watchdog(Freshness):
                 raise ValueError(f"the jump_tolerance of {signal.name} is not negative, unlike {tolerance.tolist()}")
             self._reach = Reach(rate.tolist(), tolerance.tolist())
 
-    def stale(self, now: float, reception: Reception) -> Fault:
+    def stale(self, now: float, reception: ReceivedSignal) -> Fault:
         name = self.signal.name
         if not reception.count:
             return Fault(now, name, "stale", f"sensor signal {name} has never arrived")
         age = f"{1e3 * reception.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
         return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
 
-    def examine(self, now: float, reception: Reception) -> Fault | None:
+    def examine(self, now: float, reception: ReceivedSignal) -> Fault | None:
         fault = None
         # Mostly they are not only equal but the same, from the second time on.
         if self._range is not reception.range:
@@ -151,7 +151,7 @@ class Watchdog(Freshness):
             self.accept(self._refused, self._refused_at)
             self._refused = None
 
-    def _implausible(self, now: float, reception: Reception) -> Fault | None:
+    def _implausible(self, now: float, reception: ReceivedSignal) -> Fault | None:
         if self._range is None:
             return None
         name, value = self.signal.name, reception.value
@@ -164,7 +164,7 @@ class Watchdog(Freshness):
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
         return Fault(now, name, "implausible", reason)
 
-    def _jump(self, now: float, reception: Reception, reach: Reach) -> Fault | None:
+    def _jump(self, now: float, reception: ReceivedSignal, reach: Reach) -> Fault | None:
         value = np.asarray(reception.value, dtype=float)
         if self.value is None:
             return None
@@ -185,7 +185,7 @@ class Watchdog(Freshness):
         )
         return Fault(now, self.signal.name, "jump", reason)
 
-    def _delayed(self, now: float, reception: Reception, delay: Delay) -> Fault | None:
+    def _delayed(self, now: float, reception: ReceivedSignal, delay: Delay) -> Fault | None:
         more = delay.of(reception)
         if not more > delay.most:
             return None

@@ -6,14 +6,14 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.lcm.connections import Handler
 from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.ownership import Ownership
-from vtbdrake.lcm.routes import CommandWatch, Inlet, Outlet, Transmission
+from vtbdrake.lcm.routes import ChannelReader, ChannelWriter, CommandWatch, SentSignal
 from vtbdrake.testbed import Interface, Signal
 
 _HUB = "tcpq://"
@@ -27,7 +27,7 @@ class LcmBridge(Bridge):
     """Carries the signals of a testbed over LCM.
 
     Received messages are checked before anything of them is believed: type, length, sizes, finite entries, the limits
-    of the signals, and the order of the sender's times. What fails is counted in the signal's `Reception`, and never
+    of the signals, and the order of the sender's times. What fails is counted in its `ReceivedSignal`, and never
     raised. Each signal of a message stands for itself: one that is out of its limits does not take the others along.
 
     A late message (its time is below the last accepted one's) is ``out of order``, one with the same time a
@@ -93,22 +93,22 @@ class LcmBridge(Bridge):
 
         _check_channels([*sense, *commands, *act])
         self.channels = {name: map.channel for map in sense for name in map.signals}
-        self.sensed = {signal.name: Reception() for signal in interface.sense}
-        self.commanded: dict[str, Reception] = {}
-        self.sent = {signal.name: Transmission() for signal in interface.act}
+        self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
+        self.commanded: dict[str, ReceivedSignal] = {}
+        self.sent = {signal.name: SentSignal() for signal in interface.act}
         _check_complete(interface.act, act, "actuator")
         carriers = reported_signals(interface, reported or {})
-        self.reported = {name: Reception() for name in carriers}
+        self.reported = {name: ReceivedSignal() for name in carriers}
         heard = [*interface.sense, *carriers.values()]
         _check_complete(heard, sense, "sensor")
         receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
-        self._inlets = [Inlet(map, _signals(heard, map, "sensor"), receptions, reorder_window) for map in sense]
+        self._inlets = [ChannelReader(map, _signals(heard, map, "sensor"), receptions, reorder_window) for map in sense]
         _check_unique(commands)
         for map in commands:
             signals = _signals(interface.commands, map, "command")
-            self.commanded |= {signal.name: Reception() for signal in signals}
-            self._inlets.append(Inlet(map, signals, self.commanded, reorder_window))
-        self._outlets = [Outlet(map, _signals(interface.act, map, "actuator"), self.sent) for map in act]
+            self.commanded |= {signal.name: ReceivedSignal() for signal in signals}
+            self._inlets.append(ChannelReader(map, signals, self.commanded, reorder_window))
+        self._outlets = [ChannelWriter(map, _signals(interface.act, map, "actuator"), self.sent) for map in act]
         if watch is None:
             watch = not url.startswith(_PRIVATE)
         self._watches = {map.channel: CommandWatch(on_alarm) for map in act} if watch else {}
@@ -196,7 +196,7 @@ class LcmBridge(Bridge):
                 self.tap(outlet.channel, data)
         return () if len(gone) == len(commands) else tuple(name for name in commands if name not in gone)
 
-    def _tapped(self, inlet: Inlet) -> Handler:
+    def _tapped(self, inlet: ChannelReader) -> Handler:
         def take(channel: str, data: bytes) -> None:
             if self.tap is not None:
                 self.tap(channel, data)

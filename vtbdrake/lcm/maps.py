@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from math import nan
 from typing import Any, NamedTuple
 
-from vtbdrake.control.kernels import Form, Intake, Reception
+from vtbdrake.control.kernels import ReceivedSignal
 from vtbdrake.control.ranges import Range
+from vtbdrake.lcm.messages import MessageDecoder, MessageEncoder
 from vtbdrake.lcm.wire import decode
 from vtbdrake.testbed import Signal
 
@@ -91,7 +92,9 @@ class LcmMap:
 
         return read
 
-    def intake(self, signals: Sequence[Signal], receptions: Sequence[Reception], example: bytes) -> Intake | None:
+    def intake(
+        self, signals: Sequence[Signal], receptions: Sequence[ReceivedSignal], example: bytes
+    ) -> MessageDecoder | None:
         """What takes in messages that are laid out like an accepted one, quickly; None if there is no such way.
 
         Args:
@@ -101,7 +104,7 @@ class LcmMap:
         """
         return None
 
-    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> Form | None:
+    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> MessageEncoder | None:
         """What writes messages with all of ``signals``, quickly; None if there is no such way.
 
         Args:

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any
 
-from vtbdrake.control.bridge import Reception
-from vtbdrake.control.kernels import Intake
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.ranges import Range
 from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.lcm.messages import MessageDecoder
 from vtbdrake.lcm.wire import MalformedError
 from vtbdrake.testbed import Signal
 
@@ -26,7 +26,7 @@ AHEAD = 1.5
 have come, or how much faster than real time a sender runs that simulates."""
 
 
-class Inlet:
+class ChannelReader:
     """Takes in the messages of one channel.
 
     By the sender's time, a message can be late (``out of order``), a ``duplicate``, or ``ahead of time``: further on
@@ -39,7 +39,7 @@ class Inlet:
     """
 
     def __init__(
-        self, map: LcmMap, signals: Sequence[Signal], receptions: Mapping[str, Reception], reorder_window: float
+        self, map: LcmMap, signals: Sequence[Signal], receptions: Mapping[str, ReceivedSignal], reorder_window: float
     ) -> None:
         """
         Raises:
@@ -54,7 +54,7 @@ class Inlet:
             reception.range = self._ranges[name]
         self._map, self._signals = map, signals
         # By their size, the messages that can be taken in quickly; None for those that cannot.
-        self._intakes: dict[int, Intake | None] = {}
+        self._intakes: dict[int, MessageDecoder | None] = {}
         self._reorder_window = reorder_window
         self._last = -inf
         self._last_arrived = -inf
@@ -103,7 +103,7 @@ class Inlet:
             receptions = list(self._receptions.values())
             self._intakes[len(data)] = self._map.intake(self._signals, receptions, data)
 
-    def _sorted_out(self, values: Mapping[str, Any]) -> dict[str, Reception]:
+    def _sorted_out(self, values: Mapping[str, Any]) -> dict[str, ReceivedSignal]:
         """The receptions of those values that can be accepted; the others count theirs as rejected."""
         accepted = {}
         for name, reception in self._receptions.items():
@@ -127,7 +127,7 @@ class Inlet:
 
 
 @dataclass
-class Transmission:
+class SentSignal:
     """What is known of one actuator signal.
 
     Attributes:
@@ -146,7 +146,7 @@ class Transmission:
         self.withheld[reason] = self.withheld.get(reason, 0) + 1
 
 
-class Outlet:
+class ChannelWriter:
     """Makes the messages of one channel.
 
     Attributes:
@@ -154,9 +154,7 @@ class Outlet:
         named: the signals of the last message.
     """
 
-    def __init__(
-        self, map: LcmMap, signals: Sequence[Signal], transmissions: MutableMapping[str, Transmission]
-    ) -> None:
+    def __init__(self, map: LcmMap, signals: Sequence[Signal], transmissions: MutableMapping[str, SentSignal]) -> None:
         """
         Raises:
             ValueError: the map cannot carry the signals.

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.control.kernels import Form, Intake, Reception
+from vtbdrake.control.kernels import ReceivedSignal
 from vtbdrake.control.ranges import Range
 from vtbdrake.lcm.fields import Field, compose, find_field
 from vtbdrake.lcm.maps import LcmMap, Reader, Writer, never_sent
+from vtbdrake.lcm.messages import MessageDecoder, MessageEncoder
 from vtbdrake.lcm.wire import Layout, Place
 from vtbdrake.testbed import Signal
 
@@ -61,12 +62,14 @@ class VectorMap(LcmMap):
         self.check(signals)
         return super().reader(signals)
 
-    def intake(self, signals: Sequence[Signal], receptions: Sequence[Reception], example: bytes) -> Intake | None:
+    def intake(
+        self, signals: Sequence[Signal], receptions: Sequence[ReceivedSignal], example: bytes
+    ) -> MessageDecoder | None:
         layout = self._layout(self.type.decode(example))
         if layout is None:
             return None
         ranges = [Range(signal) for signal in signals]
-        return Intake(
+        return MessageDecoder(
             example,
             fixed=layout.fixed,
             places=self._places(layout, signals),
@@ -81,12 +84,12 @@ class VectorMap(LcmMap):
         self.check(signals)
         return _VectorWriter(self, signals)
 
-    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> Form | None:
+    def form(self, signals: Sequence[Signal], ranges: Mapping[str, Range] | None = None) -> MessageEncoder | None:
         assert self.encode is not None
         layout = self._layout(self.encode({signal.name: np.zeros(signal.size or 0) for signal in signals}, 0))
         if layout is None:
             return None
-        return Form(
+        return MessageEncoder(
             layout.example,
             places=self._places(layout, signals),
             stamp=self._stamp(layout),
@@ -172,10 +175,10 @@ class _VectorWriter:
         self._map = map
         self._signals = signals
         self._write = LcmMap.writer(map, signals)
-        self._forms: dict[tuple[str, ...], Form | None] = {}
+        self._forms: dict[tuple[str, ...], MessageEncoder | None] = {}
         self._learn(tuple(signal.name for signal in signals))
 
-    def _learn(self, names: tuple[str, ...]) -> Form | None:
+    def _learn(self, names: tuple[str, ...]) -> MessageEncoder | None:
         form = self._map.form([signal for signal in self._signals if signal.name in names])
         self._forms[names] = form
         return form

@@ -21,7 +21,7 @@ _FINGERPRINT = 8  # bytes, with which every message begins
 
 
 class MalformedError(ValueError):
-    """A message that is not what its channel carries; ``reason`` is one of those that `Reception` counts."""
+    """A message that is not what its channel carries; ``reason`` is one of those that `ReceivedSignal` counts."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)

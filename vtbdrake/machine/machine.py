@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.control import watchdog
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.lcm.routes import Inlet
+from vtbdrake.lcm.routes import ChannelReader
 from vtbdrake.machine.brake import HoldingBrake
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import ACT, SENSE, InjectedFault, InjectedFaultError, NoBrake, Packet, whole_cycles
@@ -35,8 +35,8 @@ class MachineStatus:
         braking: whether it braked in its last cycle.
         silent: command channels on which, by then, none had been accepted for longer than its timeout.
         accepted: by actuator signal, how many commands it took.
-        rejected: by actuator signal, how many it did not, by the reason; see `Reception`, and `Machine.refuse_late` for
-            those that are ``late``.
+        rejected: by actuator signal, how many it did not, by the reason; see `ReceivedSignal`, and
+            `Machine.refuse_late` for those that are ``late``.
         faults: those that have begun, as `InjectedFault.to_dict` gives them.
     """
 
@@ -100,9 +100,9 @@ class Machine:
         self._feed = world.feed(self._context)
         self._sensors = Sensors(world, self.protocol, config, noise, given=self._given)
         signals = {signal.name: signal for signal in world.interface.act}
-        self._receptions = {name: Reception() for name in signals}
+        self._receptions = {name: ReceivedSignal() for name in signals}
         self._inlets = {
-            map.channel: Inlet(map, [signals[name] for name in map.signals], self._receptions, _REORDER_WINDOW)
+            map.channel: ChannelReader(map, [signals[name] for name in map.signals], self._receptions, _REORDER_WINDOW)
             for map in self.protocol.act
         }
         self._types = {map.channel: map.type for map in self.protocol.act}
@@ -176,7 +176,7 @@ class Machine:
         self._simulator.AdvanceTo((self.cycle + 1) * self.config.period)
         self.cycle += 1
 
-    def _accept(self, name: str, reception: Reception) -> None:
+    def _accept(self, name: str, reception: ReceivedSignal) -> None:
         delay = self._delays.get(name)
         if delay is not None and delay.of(reception) > delay.most:
             reception.reject("late")

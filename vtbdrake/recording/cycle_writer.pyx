@@ -8,7 +8,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.control.byte_order cimport put_double, put_uint32, put_uint64
+from vtbdrake.lcm.byte_order cimport put_double, put_uint32, put_uint64
 from vtbdrake.control.kernels cimport entries_of
 from vtbdrake.recording.log_format import COMMANDED, CYCLE, EVENT, SENT, SYNC, VECTOR
 

@@ -11,7 +11,7 @@ from cpython.memoryview cimport PyMemoryView_FromMemory
 from libc.stdint cimport int32_t, int64_t, uint32_t, uint64_t
 from libc.string cimport memcpy
 
-from vtbdrake.control.byte_order cimport get_uint32, get_uint64
+from vtbdrake.lcm.byte_order cimport get_uint32, get_uint64
 from vtbdrake.lcm.maps import LONGEST_CHANNEL_NAME
 from vtbdrake.recording.log_format import EVENT, MAX_CHANNELS, MAX_DAMAGES, SYNC, LogError
 

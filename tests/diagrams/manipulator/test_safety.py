@@ -12,7 +12,7 @@ import pytest
 from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.safety import CARRY, DISAGREEMENT, SLIP, FloatInPlace
 from diagrams.manipulator.scenario import ManipulatorScenario
-from vtbdrake.control.bridge import Reception
+from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, NoCommand, Sample
 from vtbdrake.control.guard import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal, WorldAlone
@@ -127,7 +127,7 @@ class GuardedArm:
         self.context = WORLD.default_context()
         self.simulator = WORLD.simulator(self.context)
         self.simulator.Initialize()
-        self.receptions = {signal.name: Reception() for signal in interface.sense}
+        self.receptions = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.heard: Callable[[dict[str, Any]], dict[str, Any]] = lambda measured: measured
         self.cycles = 0
         self.guards.start("joint_torque", gravity(self.pose))

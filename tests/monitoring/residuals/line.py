@@ -7,13 +7,13 @@ from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, Reception
+from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.lcm.routes import Inlet, Outlet, Transmission
+from vtbdrake.lcm.routes import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.machine.machine import Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
@@ -26,14 +26,15 @@ class Ear(Bridge):
     def __init__(self, scenario: Scenario) -> None:
         protocol, self.interface = protocol_of(scenario), scenario.interface()
         carriers = reported_signals(self.interface, protocol.reported)
-        self.sensed = {signal.name: Reception() for signal in self.interface.sense}
-        self.reported = {name: Reception() for name in carriers}
+        self.sensed = {signal.name: ReceivedSignal() for signal in self.interface.sense}
+        self.reported = {name: ReceivedSignal() for name in carriers}
         self.commanded = {}
         self.heard: deque[tuple[str, bytes]] = deque()
         signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
         receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
         self._inlets = {
-            map.channel: Inlet(map, [signals[name] for name in map.signals], receptions, 0.1) for map in protocol.sense
+            map.channel: ChannelReader(map, [signals[name] for name in map.signals], receptions, 0.1)
+            for map in protocol.sense
         }
 
     def open(self) -> None:
@@ -71,8 +72,10 @@ class Line(Ear):
         self.falsify: Falsify = lambda channel, data: data
         self.ears: list[Ear] = []
         signals = {signal.name: signal for signal in self.interface.act}
-        sent = {name: Transmission() for name in signals}
-        self._outlets = [Outlet(map, [signals[n] for n in map.signals], sent) for map in protocol_of(scenario).act]
+        sent = {name: SentSignal() for name in signals}
+        self._outlets = [
+            ChannelWriter(map, [signals[n] for n in map.signals], sent) for map in protocol_of(scenario).act
+        ]
         self._begun = False
         self._utime = 0
 

@@ -5,7 +5,7 @@ from cpython.bytes cimport PyBytes_FromStringAndSize
 from libc.stdint cimport UINT32_MAX, uint32_t
 from libc.string cimport memcpy
 
-from vtbdrake.control.byte_order cimport get_uint32, put_uint32
+from vtbdrake.lcm.byte_order cimport get_uint32, put_uint32
 from vtbdrake.lcm.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, ProtocolError
 from vtbdrake.control.streams cimport Stream
 
