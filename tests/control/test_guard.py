@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vtbdrake.control.bridge import ReceivedSignal
@@ -602,6 +602,7 @@ def test_whatever_happens_what_goes_out_is_finite_and_within_all_limits(script: 
 happenings = st.sampled_from(["go", "go", "wild", "nan", "raise", "lost", "back", "mute", "talk", "reset", "off", "on"])
 
 
+@example([("lost", 1, 0.0), ("off", 20, 0.0), ("on", 4, 0.0), ("back", 1, 0.0)])
 @given(st.lists(st.tuples(happenings, st.integers(1, 30), st.sampled_from([0.0, 0.0, 0.0, 0.2])), max_size=30))
 def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_acts(
     script: list[tuple[str, int, float]],

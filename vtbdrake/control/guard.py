@@ -125,6 +125,8 @@ class Guards:
         self._held_back: frozenset[str] = frozenset()
         # Those of which no command has left since their start, or since the loop itself has paused.
         self._departing: frozenset[str] = frozenset()
+        # Whether nobody has said yet which commands of the last verdict did not leave.
+        self._unconfirmed = False
         self._silent: frozenset[str] = frozenset()
 
     @property
@@ -169,7 +171,7 @@ class Guards:
         not_ready: str | None = None,
         others: Mapping[str, ReceivedSignal] = MappingProxyType({}),
     ) -> Verdict:
-        """Judge one cycle. Call `withheld` after it, with the commands that could not be sent.
+        """Judge one cycle. What it returns counts as sent, unless `withheld` says otherwise before the next one.
 
         Args:
             now: the time on the clock of `ReceivedSignal.arrived`, in seconds.
@@ -182,6 +184,9 @@ class Guards:
             not_ready: why the machine is not ready, if it is not.
             others: receptions of sensor signals that are not on real: fallbacks may use them.
         """
+        if self._unconfirmed:
+            self.withheld(())
+        self._unconfirmed = True
         driven = self._activate(active if active is not None else self._active if error else commands)
         causes = self._whole(now, error, missed, not_ready)
         causes += self._depart_anew(now, receptions, others)
@@ -216,6 +221,7 @@ class Guards:
         Args:
             names: their actuator signals; empty if all have left.
         """
+        self._unconfirmed = False
         if not names and not self._unsent and not self._silent and not self._departing:
             return
         for name in names:
