@@ -129,7 +129,8 @@ class GuardedArm:
         self.simulator.Initialize()
         self.receptions = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.heard: Callable[[dict[str, Any]], dict[str, Any]] = lambda measured: measured
-        self.cycles = 0
+        self.cycles = 1
+        self.simulator.AdvanceTo(T)  # The sensors measure what the arm's brakes hold.
         self.guards.start("joint_torque", gravity(self.pose))
         self.run(5)
 
