@@ -11,7 +11,7 @@ import lcm
 import pytest
 
 from tests.cli.program import ROOT, run
-from vtbdrake.lcm.hub import Statistics
+from vtbdrake.lcm.hub import HubStatistics
 
 
 @contextlib.contextmanager
@@ -68,7 +68,7 @@ def test_it_runs_on_the_processors_that_it_is_told() -> None:
 def protected(url: str) -> set[str]:
     """The channels that the hub says it protects."""
     bus, found = lcm.LCM(url), []
-    bus.subscribe("VTB_HUB", lambda _, data: found.append(set(Statistics.from_json(data).protected)))
+    bus.subscribe("VTB_HUB", lambda _, data: found.append(set(HubStatistics.from_json(data).protected)))
     while not found:
         assert bus.handle_timeout(30_000)
     return found[0]

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.control.streams import Frames
-from vtbdrake.lcm.hub.reader import Reader, publication
-from vtbdrake.lcm.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, ProtocolError, Record
+from vtbdrake.lcm.hub.reader import TcpqReader, publish_record
+from vtbdrake.lcm.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, Record, TcpqError
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)
 LARGEST = 1000
@@ -35,8 +35,8 @@ def published(channel: bytes, data: bytes) -> bytes:
     return struct.pack(">II", PUBLISH, len(channel)) + channel + struct.pack(">I", len(data)) + data
 
 
-def cut(reader: Reader) -> Iterator[Record]:
-    while (record := reader.record()) is not None:
+def cut(reader: TcpqReader) -> Iterator[Record]:
+    while (record := reader.next_record()) is not None:
         yield record
 
 
@@ -49,7 +49,7 @@ def in_pieces(stream: bytes, ends: list[int]) -> Iterator[bytes]:
 
 @given(RECORDS, st.lists(st.integers(0, 10_000), max_size=20))
 def test_records_are_the_same_in_whatever_pieces_they_come(records: list[Record], ends: list[int]) -> None:
-    reader, found = Reader(max_message=LARGEST), []
+    reader, found = TcpqReader(max_message=LARGEST), []
     for piece in in_pieces(GREETING + b"".join(record for *_, record in records), ends):
         reader.append(piece)
         found += cut(reader)
@@ -59,10 +59,10 @@ def test_records_are_the_same_in_whatever_pieces_they_come(records: list[Record]
 
 @given(RECORDS, st.lists(st.integers(0, 10_000), max_size=20))
 def test_publications_are_channel_and_data_of_those_records(records: list[Record], ends: list[int]) -> None:
-    reader, found = Reader(max_message=LARGEST, greeted=True), []
+    reader, found = TcpqReader(max_message=LARGEST, greeted=True), []
     for piece in in_pieces(b"".join(record for *_, record in records), ends):
         reader.append(piece)
-        while (come := reader.publication()) is not None:
+        while (come := reader.next_publication()) is not None:
             found.append(come)
     assert [published(*come) for come in found] == [record for kind, _, record in records if kind == PUBLISH]
 
@@ -85,16 +85,16 @@ def test_large_records_are_the_same_in_whatever_pieces_they_come(greeted: bool) 
         sent = [(b"CHANNEL", chosen.randbytes(size)) for size in sizes]
         stream = GREETING * (not greeted) + b"".join(published(*message) for message in sent)
         ends = [chosen.randrange(len(stream)) for _ in range(chosen.randrange(40))]
-        records, publications = (Reader(max_message=2**20, greeted=greeted) for _ in range(2))
+        records, publications = (TcpqReader(max_message=2**20, greeted=greeted) for _ in range(2))
         found, taken = [], []
         for piece in in_pieces(stream, ends):
             records.append(piece)
             publications.append(piece)
             found += cut(records)
             # Sometimes several pieces come before anything is taken off.
-            while chosen.random() < 0.9 and (come := publications.publication()) is not None:
+            while chosen.random() < 0.9 and (come := publications.next_publication()) is not None:
                 taken.append(come)
-        while (come := publications.publication()) is not None:
+        while (come := publications.next_publication()) is not None:
             taken.append(come)
         expected = [(PUBLISH, message[0], published(*message)) for message in sent]
         assert found == [(GREET, b"", GREETING)] * (not greeted) + expected
@@ -103,13 +103,13 @@ def test_large_records_are_the_same_in_whatever_pieces_they_come(greeted: bool) 
 
 def test_a_large_record_is_not_copied_and_its_memory_is_not_kept() -> None:
     size, piece = 1 << 24, bytes(1 << 18)
-    reader = Reader(max_message=size, greeted=True)
+    reader = TcpqReader(max_message=size, greeted=True)
     tracemalloc.start()
     reader.append(published(b"A", b"")[:-4] + struct.pack(">I", size))
     for _ in range(size // len(piece)):
-        assert reader.record() is None and reader.partial
+        assert reader.next_record() is None and reader.partial
         reader.append(piece)
-    record = reader.record()
+    record = reader.next_record()
     now, most = tracemalloc.get_traced_memory()
     assert most < 1.2 * size
     del record
@@ -120,12 +120,12 @@ def test_a_large_record_is_not_copied_and_its_memory_is_not_kept() -> None:
 
 def test_a_publication_whose_length_cannot_be_told_is_refused() -> None:
     with pytest.raises(ValueError, match="less than 4 GiB, not 1 and 4294967296 bytes"):
-        publication(b"A", bytes(2**32))
+        publish_record(b"A", bytes(2**32))
 
 
 @given(CHANNELS, st.binary())
 def test_a_publication_is_written_as_liblcm_does(channel: bytes, data: bytes) -> None:
-    assert publication(channel, data) == published(channel, data)
+    assert publish_record(channel, data) == published(channel, data)
 
 
 @pytest.mark.parametrize(
@@ -141,38 +141,38 @@ def test_a_publication_is_written_as_liblcm_does(channel: bytes, data: bytes) ->
     ],
 )
 def test_what_is_no_record_is_told_after_the_records_before_it(bytes_: bytes, reason: str) -> None:
-    reader = Reader(max_message=LARGEST, greeted=True)
+    reader = TcpqReader(max_message=LARGEST, greeted=True)
     reader.append(published(b"A", b"1") + bytes_)
-    assert reader.record() == (PUBLISH, b"A", published(b"A", b"1"))
+    assert reader.next_record() == (PUBLISH, b"A", published(b"A", b"1"))
     for _ in range(2):
-        with pytest.raises(ProtocolError) as caught:
-            reader.record()
+        with pytest.raises(TcpqError) as caught:
+            reader.next_record()
         assert caught.value.reason == reason
 
 
 @pytest.mark.parametrize("greeting", [struct.pack(">II", 0x287617FA, 0x0100), struct.pack(">II", 0x287617FB, 0x0200)])
 def test_who_greets_in_another_way_is_no_client(greeting: bytes) -> None:
-    reader = Reader(max_message=LARGEST)
+    reader = TcpqReader(max_message=LARGEST)
     reader.append(greeting)
-    with pytest.raises(ProtocolError, match="greeting|begins with|speaks version"):
-        reader.record()
+    with pytest.raises(TcpqError, match="greeting|begins with|speaks version"):
+        reader.next_record()
 
 
 def test_memory_is_that_of_what_has_come_and_given_back() -> None:
     announced, come = 1 << 30, 1 << 20
     tracemalloc.start()
-    reader, frames = Reader(max_message=1 << 31, greeted=True), Frames()
+    reader, frames = TcpqReader(max_message=1 << 31, greeted=True), Frames()
     reader.append(published(b"A", b"")[:-4] + struct.pack(">I", announced))
     frames.append(struct.pack("<Q", 2**64 - 1))
     for _ in range(16):
         reader.append(bytes(come // 16))
         frames.append(bytes(come // 16))
-        assert reader.record() is frames.frame() is None
+        assert reader.next_record() is frames.frame() is None
     assert tracemalloc.get_traced_memory()[0] < 8 * come
     del frames
-    reader = Reader(max_message=1 << 31, greeted=True)
+    reader = TcpqReader(max_message=1 << 31, greeted=True)
     reader.append(published(b"A", bytes(come)))
-    assert reader.record() is not None
+    assert reader.next_record() is not None
     reader.append(published(b"A", b"1"))
     assert tracemalloc.get_traced_memory()[0] < come // 4
     tracemalloc.stop()
@@ -180,7 +180,7 @@ def test_memory_is_that_of_what_has_come_and_given_back() -> None:
 
 def test_a_socket_is_read_without_waiting_until_it_is_closed() -> None:
     near, far = socket.socketpair()
-    reader = Reader(max_message=LARGEST, greeted=True)
+    reader = TcpqReader(max_message=LARGEST, greeted=True)
     with near, far:
         assert reader.receive(near.fileno(), 100) == -1
         for limit in (0, -1, -(2**31)):
@@ -188,7 +188,7 @@ def test_a_socket_is_read_without_waiting_until_it_is_closed() -> None:
                 reader.receive(near.fileno(), limit)
         far.sendall(published(b"A", bytes(200)))
         assert [reader.receive(near.fileno(), 100) for _ in range(4)] == [100, 100, 13, -1]
-        assert reader.publication() == (b"A", bytes(200))
+        assert reader.next_publication() == (b"A", bytes(200))
         far.close()
         assert reader.receive(near.fileno(), 100) == 0
     with pytest.raises(OSError, match="Bad file descriptor"):

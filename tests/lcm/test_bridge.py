@@ -25,7 +25,7 @@ from tests.control.arm import LIMIT, bridge, command, status
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.connections import TcpqConnection
-from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, Statistics
+from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.ownership import Ownership
 from vtbdrake.lcm.routes import CommandWatch
@@ -384,7 +384,7 @@ def test_refusals_of_ones_own_commands_and_those_before_are_no_attempts_of_other
 
     def told(owner: str, refused: int, last: str) -> int:
         state = ChannelStatistics(owner=owner, refused=refused, last_refused=last)
-        ownership.take(STATUS_CHANNEL, Statistics(protected={"C": state}).to_json())
+        ownership.take(STATUS_CHANNEL, HubStatistics(protected={"C": state}).to_json())
         return ownership.attempts
 
     assert told("me", 7, "other") == 0  # before the first status

@@ -9,7 +9,7 @@ from typing import Any
 from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.lcm.connections import Handler
-from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
+from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.ownership import Ownership

@@ -12,17 +12,17 @@ from urllib.parse import urlsplit
 
 import lcm
 
-from vtbdrake.lcm.hub.reader import Reader, publication
-from vtbdrake.lcm.hub.shortcut import take_shortcut
+from vtbdrake.lcm.hub.reader import TcpqReader, publish_record
 from vtbdrake.lcm.hub.tcpq import (
     MAGIC_CLIENT,
-    MAGIC_REFUSAL,
+    MAGIC_REJECTION,
     MAGIC_SERVER,
-    MAX_REFUSAL,
+    MAX_REJECTION,
     SUBSCRIBE,
     VERSION,
-    ProtocolError,
+    TcpqError,
     address_name,
+    connect_shortcut,
 )
 
 Handler = Callable[[str, bytes], None]
@@ -133,7 +133,7 @@ class TcpqConnection(Connection):
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
         self._handlers = {channel.encode(): (channel, handler) for channel, handler in handlers.items()}
         # The hub's greeting is read below; what follows has the form of a client's records.
-        self._reader = Reader(max_message=_LONGEST_MESSAGE, greeted=True)
+        self._reader = TcpqReader(max_message=_LONGEST_MESSAGE, greeted=True)
         self._unsent = b""
         self._socket = _open(tcpq_address(url), timeout, stamped=stamped)
         try:
@@ -154,8 +154,8 @@ class TcpqConnection(Connection):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # Who is not let in may be told before that.
             self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
         magic, size = _WORDS.unpack(self._receive_exactly(_WORDS.size))
-        if magic == MAGIC_REFUSAL:
-            raise RefusedError(self._receive_exactly(min(size, MAX_REFUSAL)).decode(errors="replace"))
+        if magic == MAGIC_REJECTION:
+            raise RefusedError(self._receive_exactly(min(size, MAX_REJECTION)).decode(errors="replace"))
         if magic != MAGIC_SERVER:
             raise ConnectionError("what listens there is no tcpq hub")
 
@@ -187,7 +187,7 @@ class TcpqConnection(Connection):
         return count
 
     def _receive_stamped(self) -> int:
-        """As `Reader.receive`; `arrived` is then the time of the last byte that came."""
+        """As `TcpqReader.receive`; `arrived` is then the time of the last byte that came."""
         try:
             chunk, ancillary, _, _ = self._socket.recvmsg(_RECEIVE, socket.CMSG_SPACE(_TIMESPEC.size))
         except BlockingIOError:
@@ -201,14 +201,14 @@ class TcpqConnection(Connection):
         return len(chunk)
 
     def _dispatch(self, limit: int) -> int:
-        publication, handlers, count = self._reader.publication, self._handlers, 0
+        publication, handlers, count = self._reader.next_publication, self._handlers, 0
         try:
             while count < limit and (come := publication()) is not None:
                 count += 1
                 if come[0] in handlers:
                     channel, handler = handlers[come[0]]
                     handler(channel, come[1])
-        except ProtocolError as error:
+        except TcpqError as error:
             raise ConnectionError(f"the hub {error}") from None
         return count
 
@@ -217,7 +217,7 @@ class TcpqConnection(Connection):
             self._send(self._unsent)
             if self.pending:
                 raise BlockingIOError("an earlier message is still on its way")
-        records = [publication(channel.encode(), data) for channel, data in messages]
+        records = [publish_record(channel.encode(), data) for channel, data in messages]
         self._send(records[0] if len(records) == 1 else b"".join(records))
 
     def _send(self, records: bytes) -> None:
@@ -232,7 +232,7 @@ class TcpqConnection(Connection):
 def _open(address: tuple[str, int], timeout: float, *, stamped: bool) -> socket.socket:
     """A connection to the hub, with a time-out, until it is told otherwise."""
     # The kernel does not stamp what comes by a Unix socket.
-    sock = None if stamped else take_shortcut(*address)
+    sock = None if stamped else connect_shortcut(*address)
     if sock is None:
         sock = socket.create_connection(address, timeout)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 
-from vtbdrake.lcm.hub.statistics import ChannelStatistics, Statistics
+from vtbdrake.lcm.hub import ChannelStatistics, HubStatistics
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Ownership:
     def take(self, _: str, data: bytes) -> None:
         """Handles one message of the status channel."""
         try:
-            protected = Statistics.from_json(data).protected
+            protected = HubStatistics.from_json(data).protected
         except (ValueError, TypeError, KeyError, AttributeError):
             _log.warning("what came on the hub's status channel is no status: %r", data[:100])
             return

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import lcm
 
-from vtbdrake.lcm.hub import Statistics
+from vtbdrake.lcm.hub import HubStatistics
 
 TIMEOUT = 30.0
 
@@ -64,12 +64,12 @@ class Client:
             assert time.monotonic() < deadline, "waited in vain"
             self.bus.handle_timeout(100)
 
-    def wait_for_status(self, condition: Callable[[Statistics], bool]) -> Statistics:
+    def wait_for_status(self, condition: Callable[[HubStatistics], bool]) -> HubStatistics:
         """What the hub publishes, as soon as the condition holds."""
-        found: list[Statistics] = []
+        found: list[HubStatistics] = []
 
         def look(_: str, data: bytes) -> None:
-            status = Statistics.from_json(data)
+            status = HubStatistics.from_json(data)
             if condition(status):
                 found.append(status)
 

@@ -26,8 +26,7 @@ from tests.lcm.hub.clients import (
 )
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.hub import Hub, HubConfig
-from vtbdrake.lcm.hub.peers import peer_user
-from vtbdrake.lcm.hub.shortcut import take_shortcut
+from vtbdrake.lcm.hub.tcpq import connect_shortcut, peer_user
 from vtbdrake.lcm.link import LcmLink
 
 STRANGER = 65534
@@ -206,7 +205,7 @@ def test_a_hub_that_refuses_without_a_text_is_no_hub() -> None:
             thread = threading.Thread(target=serve)
             thread.start()
             port = server.getsockname()[1]
-            assert take_shortcut("127.0.0.1", port) is None
+            assert connect_shortcut("127.0.0.1", port) is None
             with pytest.raises(BridgeError, match="no LCM bus"):
                 LcmLink(f"tcpq://127.0.0.1:{port}", {}, connect_timeout=30.0).open()
             thread.join()

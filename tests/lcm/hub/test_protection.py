@@ -9,7 +9,7 @@ import pytest
 
 from tests.lcm.hub.clients import Client, ClientProcess, wait_until
 from vtbdrake.lcm.hub import Hub, HubConfig, client_name
-from vtbdrake.lcm.hub.connection import Connection
+from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.protection import ProtectedChannel
 
 
@@ -178,7 +178,9 @@ class TestLease:
     def connections(self):
         with socket.create_server(("127.0.0.1", 0)) as server:
             ends = [socket.create_connection(server.getsockname()) for _ in range(2)]
-            accepted = [Connection(server.accept()[0], max_message=1, max_queue=1, now=0.0, user=None) for _ in ends]
+            accepted = [
+                ClientConnection(server.accept()[0], max_message=1, max_queue=1, now=0.0, user=None) for _ in ends
+            ]
             yield accepted
             for end in (*ends, *accepted):
                 end.close()

@@ -30,8 +30,7 @@ from tests.lcm.hub.clients import (
 )
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
-from vtbdrake.lcm.hub.shortcut import shortcut_name, take_shortcut
-from vtbdrake.lcm.hub.tcpq import address_name
+from vtbdrake.lcm.hub.tcpq import address_name, connect_shortcut, shortcut_name
 from vtbdrake.lcm.link import LcmLink
 
 MEBIBYTE = 1024 * 1024
@@ -77,7 +76,7 @@ class Own:
 @contextlib.contextmanager
 def raw_shortcut(url: str, greeting: bytes = GREETING) -> Iterator[socket.socket]:
     """The shortcut's end of a client, on which the test speaks itself."""
-    sock = take_shortcut(*address(url))
+    sock = connect_shortcut(*address(url))
     assert sock is not None
     with sock:
         sock.settimeout(TIMEOUT)
@@ -286,8 +285,8 @@ def test_one_that_is_killed_in_the_middle_of_a_message_is_forgotten(hub) -> None
     port = address(hub.url)[1]
     code = f"""
 import sys
-from vtbdrake.lcm.hub.shortcut import take_shortcut
-sock = take_shortcut("127.0.0.1", {port})
+from vtbdrake.lcm.hub.tcpq import connect_shortcut
+sock = connect_shortcut("127.0.0.1", {port})
 sock.sendall({GREETING + record(1, b"A", b"whole") + record(1, b"A", bytes(1000))[:-1]!r})
 print("ready", flush=True)
 sys.stdin.read()
@@ -354,7 +353,7 @@ def test_a_hub_whose_name_is_taken_warns_once_and_is_there_for_tcp(caplog: pytes
         client.sync()
         assert client.received == [("A", b"")]
     (warning,) = caplog.records
-    assert "there is TCP alone" in warning.getMessage() and "in use" in warning.getMessage()
+    assert "by TCP only" in warning.getMessage() and "in use" in warning.getMessage()
 
 
 def test_who_holds_the_name_as_our_own_user_is_taken_for_the_hub() -> None:
@@ -374,7 +373,7 @@ def test_who_holds_the_name_as_another_user_is_not_spoken_to(caplog: pytest.LogC
             own.sync()
     (warning,) = caplog.records
     assert warning.levelno == logging.WARNING
-    assert f"belongs to the user {stranger}" in warning.getMessage()
+    assert f"belongs to user {stranger}" in warning.getMessage()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")

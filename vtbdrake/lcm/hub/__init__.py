@@ -30,7 +30,7 @@ to all clients that subscribed to its channel, the publisher included.
      then it is free: rule 1. So nobody slips in while a controller is started again or its successor takes over.
 
   A time in which the hub itself was held up does not count against a lease.
-* **Status.** The hub publishes its `Statistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within
+* **Status.** The hub publishes its `HubStatistics` as JSON on ``VTB_HUB``, every ``status_period`` seconds, and within
   10 ms when the owner of a channel changes or something is refused. Clients have the names of their sockets,
   ``127.0.0.1:41234`` or ``local:00a3f``; `client_name` tells a client its own. No client can publish on ``VTB_HUB``.
 * **Shortcut.** Beside a loopback address the hub listens on a Unix socket, by which a message costs less; this
@@ -45,7 +45,7 @@ It listens on loopback unless another address is asked for by name.
 from vtbdrake.lcm.hub.config import HubConfig
 from vtbdrake.lcm.hub.process import Hub, HubError, serve
 from vtbdrake.lcm.hub.server import HubAddressError, HubServer
-from vtbdrake.lcm.hub.statistics import ChannelStatistics, Statistics
+from vtbdrake.lcm.hub.statistics import ChannelStatistics, HubStatistics
 from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX, client_name
 
 __all__ = [
@@ -57,7 +57,7 @@ __all__ = [
     "HubConfig",
     "HubError",
     "HubServer",
-    "Statistics",
+    "HubStatistics",
     "client_name",
     "serve",
 ]

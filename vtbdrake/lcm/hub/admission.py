@@ -7,9 +7,9 @@ import socket
 from collections.abc import Collection
 from typing import NamedTuple
 
+from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.config import HubConfig
-from vtbdrake.lcm.hub.connection import Connection
-from vtbdrake.lcm.hub.peers import peer_user
+from vtbdrake.lcm.hub.tcpq import peer_user
 
 STRANGER, QUOTA, FULL = "user", "quota", "too many"
 """Reasons why a client is not let in, as they are counted."""
@@ -48,7 +48,7 @@ class Admission:
         self._most_of_a_user = max(1, config.max_clients // 4)
         self._most_of_others = max(1, 3 * config.max_clients // 4)
 
-    def decide(self, sock: socket.socket, clients: Collection[Connection]) -> Decision:
+    def decide(self, sock: socket.socket, clients: Collection[ClientConnection]) -> Decision:
         """Whether a client may be one more.
 
         Args:

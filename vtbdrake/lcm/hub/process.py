@@ -20,7 +20,7 @@ from typing import Any
 from vtbdrake.interpreter import command
 from vtbdrake.lcm.hub.config import HubConfig
 from vtbdrake.lcm.hub.server import HubServer, listen
-from vtbdrake.lcm.hub.statistics import Statistics
+from vtbdrake.lcm.hub.statistics import HubStatistics
 from vtbdrake.lcm.hub.tcpq import address_name
 
 _log = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ class Hub:
             raise HubError("the hub does not run: start it, or use it in a with statement")
         return self._process.pid
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> HubStatistics:
         """Of this moment.
 
         Raises:
@@ -109,7 +109,7 @@ class Hub:
         """
         return self._ask(_ANSWER_TIMEOUT)
 
-    def _ask(self, timeout: float) -> Statistics:
+    def _ask(self, timeout: float) -> HubStatistics:
         if self._control is None:
             raise HubError("the hub does not run: start it, or use it in a with statement")
         self._control.settimeout(timeout)
@@ -123,7 +123,7 @@ class Hub:
                 answer += part
         except OSError as error:
             raise HubError(f"the hub at {self._url} does not answer: {error}") from error
-        return Statistics.from_json(answer)
+        return HubStatistics.from_json(answer)
 
     def close(self) -> None:
         """Ends it; it may be started again."""

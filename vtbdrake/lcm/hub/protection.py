@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
-from vtbdrake.lcm.hub.connection import Connection
+from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.log_rate import limited_logger
 from vtbdrake.lcm.hub.statistics import ChannelStatistics
 
@@ -25,14 +25,14 @@ class ProtectedChannel:
     def __init__(self, name: str, *, lease: float) -> None:
         self.name = name
         self._lease = lease
-        self.owner: Connection | None = None
+        self.owner: ClientConnection | None = None
         self._holder: str | None = None  # the owner's name, also when it is gone
         self._renewed = -inf
         self._refused = 0
         self._last_refused: str | None = None
         self._taken = 0
 
-    def admit(self, client: Connection, now: float) -> bool:
+    def admit(self, client: ClientConnection, now: float) -> bool:
         """Whether what the client publishes at the time ``now`` may pass."""
         if client is self.owner:
             self._renewed = now
@@ -43,7 +43,7 @@ class ProtectedChannel:
         self._refuse(client, now, "publishes on it")
         return False
 
-    def take(self, client: Connection, now: float) -> bool:
+    def take(self, client: ClientConnection, now: float) -> bool:
         """Whether the client, which asks for the channel, has it now."""
         if self.owner is not None and client is not self.owner:
             if not self._is_over(now):
@@ -53,7 +53,7 @@ class ProtectedChannel:
         self._give(client, now)
         return True
 
-    def release(self, client: Connection) -> bool:
+    def release(self, client: ClientConnection) -> bool:
         """The client is gone; says whether it was the owner."""
         if client is not self.owner:
             return False
@@ -78,13 +78,13 @@ class ProtectedChannel:
     def _is_over(self, now: float) -> bool:
         return now - self._renewed > self._lease
 
-    def _give(self, client: Connection, now: float) -> None:
+    def _give(self, client: ClientConnection, now: float) -> None:
         if client is not self.owner:
             before = "" if self.owner is None else f", until now {self._holder}"
             _log.warning("%s: its owner is %s%s", self.name, client.name, before)
         self.owner, self._holder, self._renewed = client, client.name, now
 
-    def _refuse(self, client: Connection, now: float, what: str) -> None:
+    def _refuse(self, client: ClientConnection, now: float, what: str) -> None:
         self._refused += 1
         self._last_refused = client.name
         _log.warning(

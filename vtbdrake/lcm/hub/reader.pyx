@@ -6,7 +6,7 @@ from libc.stdint cimport UINT32_MAX, uint32_t
 from libc.string cimport memcpy
 
 from vtbdrake.lcm.byte_order cimport get_uint32, put_uint32
-from vtbdrake.lcm.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, ProtocolError
+from vtbdrake.lcm.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, TcpqError
 from vtbdrake.control.streams cimport Stream
 
 cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
@@ -17,7 +17,7 @@ cdef uint32_t _UNSUBSCRIBE = UNSUBSCRIBE
 cdef Py_ssize_t _LARGE = 1 << 18
 
 
-def publication(bytes channel, bytes data):
+def publish_record(bytes channel, bytes data):
     """The record that publishes ``data``.
 
     Raises:
@@ -36,7 +36,7 @@ def publication(bytes channel, bytes data):
     return record
 
 
-cdef class Reader(Stream):
+cdef class TcpqReader(Stream):
     """Cuts what comes from one client into tcpq's records.
 
     Args:
@@ -70,13 +70,13 @@ cdef class Reader(Stream):
         """How many bytes have come that are not taken off."""
         return self.end - self.begin + (self.filled if self.large is not None else 0)
 
-    def record(self):
+    def next_record(self):
         """The next record: its type, its channel or pattern, and the record as it came; None if it is not there yet.
 
         A large one is a bytearray, which is nobody else's.
 
         Raises:
-            ProtocolError: the client is of no use any more.
+            TcpqError: the client is of no use any more.
         """
         if not self._whole():
             return None
@@ -92,11 +92,11 @@ cdef class Reader(Stream):
             return GREET, b"", whole
         return self.kind, PyBytes_FromStringAndSize(at + 8, self.length), whole
 
-    def publication(self):
+    def next_publication(self):
         """The next publication: channel and data; other records are left out. None if it is not there yet.
 
         Raises:
-            ProtocolError: as `record`.
+            TcpqError: as `record`.
         """
         cdef const char* at
         while self._whole():
@@ -125,25 +125,25 @@ cdef class Reader(Stream):
         self.kind, self.length = get_uint32(at), get_uint32(at + 4)
         if not self.greeted:
             if self.kind != MAGIC_CLIENT:
-                raise ProtocolError("greeting", f"begins with {self.kind:#010x}, a tcpq client with {MAGIC_CLIENT:#010x}")
+                raise TcpqError("greeting", f"begins with {self.kind:#010x}, a tcpq client with {MAGIC_CLIENT:#010x}")
             if self.length != VERSION:
-                raise ProtocolError(
+                raise TcpqError(
                     "greeting", f"speaks version {self.length:#06x} of tcpq, the hub {VERSION:#06x}"
                 )
             self.greeted = True
             self.kind, self.length, self.size = 0, 0, 8
             return True
         if not _PUBLISH <= self.kind <= _UNSUBSCRIBE:
-            raise ProtocolError("malformed", f"sends a record of type {self.kind}, there are 1, 2 and 3")
+            raise TcpqError("malformed", f"sends a record of type {self.kind}, there are 1, 2 and 3")
         if not 0 < self.length <= _MAX_CHANNEL:
-            raise ProtocolError("malformed", f"sends a channel of {self.length} bytes, it has 1 to {MAX_CHANNEL}")
+            raise TcpqError("malformed", f"sends a channel of {self.length} bytes, it has 1 to {MAX_CHANNEL}")
         self.size = 8 + self.length
         if self.kind == _PUBLISH:
             if have < 12 + self.length:
                 return False
             size = get_uint32(at + 8 + self.length)
             if size > self.max_message:
-                raise ProtocolError(
+                raise TcpqError(
                     "too large", f"sends a message of {size} bytes, the largest allowed has {self.max_message}"
                 )
             self.size = 12 + self.length + <Py_ssize_t>size

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vtbdrake.lcm.hub import tcpq
+from vtbdrake.lcm.hub.clients import ClientConnection, text
 from vtbdrake.lcm.hub.config import HubConfig
-from vtbdrake.lcm.hub.connection import Connection, text
 from vtbdrake.lcm.hub.log_rate import limited_logger
 from vtbdrake.lcm.hub.protection import ProtectedChannel
-from vtbdrake.lcm.hub.reader import publication
-from vtbdrake.lcm.hub.statistics import Statistics
+from vtbdrake.lcm.hub.reader import publish_record
+from vtbdrake.lcm.hub.statistics import HubStatistics
 
 _log = limited_logger(__name__)
 
@@ -32,7 +32,7 @@ class _Route(NamedTuple):
     """
 
     channel: str
-    subscribers: tuple[Connection, ...]
+    subscribers: tuple[ClientConnection, ...]
     protection: ProtectedChannel | None
     reserved: bool
 
@@ -50,19 +50,19 @@ class Relay:
     """
 
     def __init__(self, config: HubConfig) -> None:
-        self.lost: list[tuple[Connection, OSError]] = []
-        self.behind: list[Connection] = []
+        self.lost: list[tuple[ClientConnection, OSError]] = []
+        self.behind: list[ClientConnection] = []
         self.news = False
-        self._leaving: dict[Connection, list[bytes | bytearray]] = {}
-        self._clients: list[Connection] = []
+        self._leaving: dict[ClientConnection, list[bytes | bytearray]] = {}
+        self._clients: list[ClientConnection] = []
         self._routes: dict[bytes, _Route] = {}
         self._protected = {name: ProtectedChannel(name, lease=config.lease) for name in config.protect}
-        self._statistics = Statistics()
+        self._statistics = HubStatistics()
 
-    def join(self, client: Connection) -> None:
+    def join(self, client: ClientConnection) -> None:
         self._clients.append(client)
 
-    def leave(self, client: Connection, reason: str) -> None:
+    def leave(self, client: ClientConnection, reason: str) -> None:
         """The client is gone."""
         self._clients.remove(client)
         self._routes.clear()
@@ -75,11 +75,11 @@ class Relay:
         disconnected = self._statistics.disconnected
         disconnected[reason] = disconnected.get(reason, 0) + 1
 
-    def handle(self, client: Connection, record: tcpq.Record, now: float) -> int:
+    def handle(self, client: ClientConnection, record: tcpq.Record, now: float) -> int:
         """Does what a client asks for; returns what that cost: 1, or 16 where the subscribers had to be found.
 
         Raises:
-            ProtocolError: the client is of no use any more.
+            TcpqError: the client is of no use any more.
         """
         kind, channel, content = record
         if kind == tcpq.PUBLISH:
@@ -99,7 +99,7 @@ class Relay:
         else:
             self._routes.pop(channel.encode(), None)
 
-    def _publish(self, client: Connection, channel: bytes, content: bytes | bytearray, now: float) -> int:
+    def _publish(self, client: ClientConnection, channel: bytes, content: bytes | bytearray, now: float) -> int:
         statistics = self._statistics
         client.published = True
         cost, route = _RECORD, self._routes.get(channel)
@@ -134,7 +134,7 @@ class Relay:
                 self._send(subscriber, content)
                 self._statistics.delivered += 1
 
-    def _send(self, client: Connection, content: bytes | bytearray) -> None:
+    def _send(self, client: ClientConnection, content: bytes | bytearray) -> None:
         self._leaving.setdefault(client, []).append(content)
 
     def deliver(self, now: float) -> None:
@@ -153,13 +153,13 @@ class Relay:
                 self.behind.append(client)
         self._leaving.clear()
 
-    def _admit(self, client: Connection, protection: ProtectedChannel, now: float) -> bool:
+    def _admit(self, client: ClientConnection, protection: ProtectedChannel, now: float) -> bool:
         owner = protection.owner
         admitted = protection.admit(client, now)
         self.news |= not admitted or protection.owner is not owner
         return admitted
 
-    def _answer(self, client: Connection, channel: str, now: float) -> None:
+    def _answer(self, client: ClientConnection, channel: str, now: float) -> None:
         """Grants or refuses a request for a channel."""
         self.news = True
         protected = self._protected.get(channel.removeprefix(tcpq.TAKE_PREFIX))
@@ -181,10 +181,10 @@ class Relay:
         channel = tcpq.STATUS_CHANNEL.encode()
         route = self._routes.get(channel) or self._find_route(channel)
         if route.subscribers:
-            self._distribute(route, publication(channel, self.statistics(now).to_json()))
+            self._distribute(route, publish_record(channel, self.statistics(now).to_json()))
             self.deliver(now)
 
-    def statistics(self, now: float) -> Statistics:
+    def statistics(self, now: float) -> HubStatistics:
         statistics = self._statistics
         statistics.clients = len(self._clients)
         statistics.queued = sum(client.queued for client in self._clients)

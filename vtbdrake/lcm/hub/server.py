@@ -13,12 +13,12 @@ from functools import partial
 
 from vtbdrake.lcm.hub import tcpq
 from vtbdrake.lcm.hub.admission import FULL, Admission
+from vtbdrake.lcm.hub.clients import SLICE, ClientConnection
 from vtbdrake.lcm.hub.config import MEBIBYTE, HubConfig
-from vtbdrake.lcm.hub.connection import SLICE, Connection
 from vtbdrake.lcm.hub.log_rate import limited_logger
 from vtbdrake.lcm.hub.relay import Relay
-from vtbdrake.lcm.hub.shortcut import LOOPBACK, open_shortcut
-from vtbdrake.lcm.hub.statistics import Statistics
+from vtbdrake.lcm.hub.statistics import HubStatistics
+from vtbdrake.lcm.hub.tcpq import LOOPBACK, listen_shortcut
 
 _log = limited_logger(__name__)
 
@@ -46,7 +46,7 @@ def listen(config: HubConfig) -> list[socket.socket]:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((config.host, config.port))
         # The shortcut opens first: who seeks the hub and finds no shortcut yet must not stay with TCP.
-        shortcut = open_shortcut(*sock.getsockname())
+        shortcut = listen_shortcut(*sock.getsockname())
         if shortcut is not None:
             listeners.append(shortcut)
         sock.listen()
@@ -106,8 +106,8 @@ class HubServer:
         for fileno in self._others:
             self._epoll.register(fileno, select.EPOLLIN)
 
-        self._clients: dict[int, Connection] = {}
-        self._waiting: dict[int, Connection] = {}  # those of them that have sent more than a turn's records
+        self._clients: dict[int, ClientConnection] = {}
+        self._waiting: dict[int, ClientConnection] = {}  # those of them that have sent more than a turn's records
         self._unchecked = 0  # bytes that have come since the last look at the memory
         self._admission = Admission(config, on_loopback=self._listeners[0].getsockname()[0].startswith(LOOPBACK))
         self._relay = Relay(config)
@@ -166,7 +166,7 @@ class HubServer:
             if self._control is not None:
                 self._control.close()
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> HubStatistics:
         """Of this moment. To be asked in the thread of `serve_forever`, or when it has ended."""
         return self._relay.statistics(self._now)
 
@@ -207,11 +207,11 @@ class HubServer:
             _log.warning("a client is not let in: %s", message)
             self._relay.turn_away(reason)
             with contextlib.suppress(OSError):
-                sock.send(tcpq.refusal(message), socket.MSG_DONTWAIT)
+                sock.send(tcpq.rejection(message), socket.MSG_DONTWAIT)
             sock.close()
             return
         try:
-            client = Connection(
+            client = ClientConnection(
                 sock, max_message=self.config.max_message, max_queue=self.config.max_queue, now=self._now, user=user
             )
         except OSError:  # It is gone already.
@@ -231,7 +231,7 @@ class HubServer:
         self._disconnect(first, "idle", "has neither subscribed nor published, and makes room for another client")
         return True
 
-    def _attend(self, client: Connection, event: int) -> None:
+    def _attend(self, client: ClientConnection, event: int) -> None:
         try:
             if event & select.EPOLLOUT:
                 self._flush(client)
@@ -244,16 +244,16 @@ class HubServer:
             pass
         except OSError as error:
             self._disconnect(client, "lost", f"is lost: {error}")
-        except tcpq.ProtocolError as error:
+        except tcpq.TcpqError as error:
             self._disconnect(client, error.reason, str(error))
 
-    def _flush(self, client: Connection) -> None:
+    def _flush(self, client: ClientConnection) -> None:
         client.flush(self._now)
         if not client.queued:
             client.watched = False
             self._epoll.modify(client.fileno, select.EPOLLIN)
 
-    def _read(self, client: Connection) -> None:
+    def _read(self, client: ClientConnection) -> None:
         for _ in range(_READS):
             size = client.reader.receive(client.fileno, SLICE)
             if size < 0:
@@ -268,11 +268,11 @@ class HubServer:
             if not handled_all or not client.reader.partial or size == SLICE:
                 return
 
-    def _handle(self, client: Connection) -> bool:
+    def _handle(self, client: ClientConnection) -> bool:
         """Handles what a client has sent, but no more than is its turn; returns whether that was all."""
         reader, left, first = client.reader, _TURN, True
         while left > 0:
-            record = reader.record()
+            record = reader.next_record()
             if record is None:
                 self._waiting.pop(client.fileno, None)
                 if not reader.partial:
@@ -286,7 +286,7 @@ class HubServer:
         self._waiting[client.fileno] = client
         return False
 
-    def _disconnect(self, client: Connection, reason: str, message: str) -> None:
+    def _disconnect(self, client: ClientConnection, reason: str, message: str) -> None:
         client.close()
         self._waiting.pop(client.fileno, None)
         if self._clients.pop(client.fileno, None) is not None:

@@ -27,7 +27,7 @@ class ChannelStatistics:
 
 
 @dataclass
-class Statistics:
+class HubStatistics:
     """Of a hub, since it began.
 
     Attributes:
@@ -57,7 +57,7 @@ class Statistics:
         return json.dumps(asdict(self)).encode()
 
     @classmethod
-    def from_json(cls, text: bytes) -> Statistics:
+    def from_json(cls, text: bytes) -> HubStatistics:
         """What `to_json` made, the content of a message on the status channel."""
         fields: dict[str, Any] = json.loads(text)
         protected = {name: ChannelStatistics(**channel) for name, channel in fields.pop("protected").items()}

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.control.json_object import json_object
-from vtbdrake.lcm.hub.statistics import Statistics
-from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX
+from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.link import LcmLink
 from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
 
@@ -126,7 +125,7 @@ class LiveClient:
 
     def _hear_status(self, channel: str, data: bytes) -> None:
         try:
-            protected = Statistics.from_json(data).protected
+            protected = HubStatistics.from_json(data).protected
         except (ValueError, TypeError, KeyError, AttributeError):
             return  # Not of a hub; on other buses anybody may say it.
         self._owners = {

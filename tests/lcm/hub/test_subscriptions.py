@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from vtbdrake.lcm.hub.patterns import MAX_COST, MAX_SUBSCRIPTIONS, Subscriptions, compiled, literal
-from vtbdrake.lcm.hub.tcpq import ProtocolError
+from vtbdrake.lcm.hub.subscriptions import MAX_COST, MAX_SUBSCRIPTIONS, Subscriptions, compiled, literal
+from vtbdrake.lcm.hub.tcpq import TcpqError
 
 CHANNELS = ["A", "B", "AB", "AAB", "A.B", "A/B-C", "A\\B", "a1_x", "ARM_STATUS", "LEG_STATUS", "STATUS", "é", "", "A]B"]
 
@@ -111,7 +111,7 @@ def test_a_thousand_names_cost_one_look_up() -> None:
     subscriptions = subscribed(*(f"CHANNEL_{i}" for i in range(MAX_SUBSCRIPTIONS)))
     assert subscriptions.cost == 0
     assert subscriptions.wants("CHANNEL_7") and not subscriptions.wants("CHANNEL_")
-    with pytest.raises(ProtocolError, match="more than 1024"):
+    with pytest.raises(TcpqError, match="more than 1024"):
         subscriptions.add("CHANNEL_7")
 
 

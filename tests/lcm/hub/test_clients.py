@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from vtbdrake.lcm.hub.connection import Connection
+from vtbdrake.lcm.hub.clients import ClientConnection
 
 MAX_QUEUE = 100_000
 
@@ -25,7 +25,7 @@ def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted(
     choose = random.Random(1)
     client, sock = connected()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
-    hub = Connection(sock, max_message=MAX_QUEUE, max_queue=MAX_QUEUE, now=0.0, user=None)
+    hub = ClientConnection(sock, max_message=MAX_QUEUE, max_queue=MAX_QUEUE, now=0.0, user=None)
     sent, received, dropped = [], b"", 0
     with client, sock:
         client.setblocking(False)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from vtbdrake.lcm.hub.log_rate import limited_logger
-from vtbdrake.lcm.hub.tcpq import ProtocolError
+from vtbdrake.lcm.hub.tcpq import TcpqError
 
 _log = limited_logger(__name__)
 
@@ -112,10 +112,10 @@ class Subscriptions:
         """Adds a subscription; returns the channel if it means a single one, else None.
 
         Raises:
-            ProtocolError: it is one too many.
+            TcpqError: it is one too many.
         """
         if self._count >= MAX_SUBSCRIPTIONS:
-            raise ProtocolError("malformed", f"subscribes more than {MAX_SUBSCRIPTIONS} times")
+            raise TcpqError("malformed", f"subscribes more than {MAX_SUBSCRIPTIONS} times")
         self._count += 1
         self._times[pattern] += 1
         channel = literal(pattern)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 from collections import deque
 
-from vtbdrake.lcm.hub.patterns import Subscriptions
-from vtbdrake.lcm.hub.reader import Reader
-from vtbdrake.lcm.hub.tcpq import ProtocolError, address_name
+from vtbdrake.lcm.hub.reader import TcpqReader
+from vtbdrake.lcm.hub.subscriptions import Subscriptions
+from vtbdrake.lcm.hub.tcpq import TcpqError, address_name
 
 # A slice of a large message: while it is copied to the kernel, or from there, all others wait (some 50 us).
 SLICE = 256 * 1024
@@ -17,7 +17,7 @@ SLICE = 256 * 1024
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 3}
 
 
-class Connection:
+class ClientConnection:
     """A client: its socket, its subscriptions, and the queue of what it has not read yet.
 
     Args:
@@ -45,7 +45,7 @@ class Connection:
         self.fileno = sock.fileno()
         self.name = address_name(sock.getpeername())
         self.user = user
-        self.reader = Reader(max_message=max_message)
+        self.reader = TcpqReader(max_message=max_message)
         self.subscriptions = Subscriptions()
         self.published = False
         self.connected = self.progressed = now
@@ -150,12 +150,12 @@ def text(channel: bytes) -> str:
     """A channel or pattern as text, as liblcm's clients in Python and Java need it.
 
     Raises:
-        ProtocolError: it is none.
+        TcpqError: it is none.
     """
     try:
         name = channel.decode()
     except UnicodeDecodeError:
-        raise ProtocolError("malformed", f"names a channel {channel!r}, which is not UTF-8") from None
+        raise TcpqError("malformed", f"names a channel {channel!r}, which is not UTF-8") from None
     if "\0" in name:
-        raise ProtocolError("malformed", f"names a channel {channel!r}, with a null character")
+        raise TcpqError("malformed", f"names a channel {channel!r}, with a null character")
     return name
