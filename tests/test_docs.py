@@ -1,0 +1,50 @@
+"""The programs in README.md and docs/ run, and their links lead somewhere."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def program(page: Path) -> str:
+    """Return the Python blocks of a page, one after the other, with their lines where the page has them."""
+    lines = page.read_text("utf-8").split("\n")
+    inside, kept = False, []
+    for line in lines:
+        if line.startswith("```"):
+            inside = not inside and line == "```python"
+            kept.append("")
+        else:
+            kept.append(line if inside else "")
+    return "\n".join(kept)
+
+
+WITH_PROGRAM = [page for page in PAGES if program(page).strip()]
+
+
+@pytest.mark.parametrize("page", WITH_PROGRAM, ids=lambda page: page.stem)
+def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
+    script = tmp_path / f"{page.stem}.py"
+    script.write_text(program(page), "utf-8")
+    search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": search, "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_paths_of_a_page_exist(page: Path) -> None:
+    text = page.read_text("utf-8")
+    links = [link for link in re.findall(r"\]\(([^)#]+)", text) if "://" not in link]
+    paths = re.findall(r"`((?:vtbdrake|diagrams|notebooks|docs|tests|benchmarks|tools)/[\w./]*)`", text)
+    missing = [link for link in links if not (page.parent / link).exists()]
+    missing += [path for path in paths if not (ROOT / path).exists()]
+    assert not missing, f"{page.name} names what is not there: {missing}"
