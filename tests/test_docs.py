@@ -34,8 +34,15 @@ def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
     script.write_text(program(page), "utf-8")
     search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"PYTHONPATH": search, "MPLBACKEND": "agg"}
+    run = [sys.executable, script]
     done = subprocess.run(
-        [sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, script],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-4000:]
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
-from vtbdrake.visualization import make_meshcat, save_html, show_motions
+from vtbdrake.visualization import make_meshcat, show_motions
 
 OUT = Path("out")
 
@@ -34,13 +35,12 @@ def main() -> None:
     OUT.mkdir(exist_ok=True)
     boundary.plot().savefig(OUT / "payload.png", dpi=150)
     sweep.save(OUT / "payload.vtb")
-    meshcat = make_meshcat()
     motions = {
         "unloaded": problem.motion({MASS: 0.0}),
         f"{boundary.lower:g} kg": problem.motion({MASS: boundary.lower}),
     }
-    legend = show_motions(meshcat, motions)
-    save_html(meshcat, OUT / "payload.html", title="SpaceClimber on the moon, attachment at its front", legend=legend)
+    scene = show_motions(make_meshcat(), motions)
+    replace(scene, title="SpaceClimber on the moon, component at its front").save(OUT / "payload.html")
     print(
         f"\nWrote {OUT}/payload.png (plot), payload.html (recording, open it in a browser), payload.vtb (all rollouts)."
     )

@@ -91,7 +91,6 @@ def error_of(arguments: list[str], code: int = 2) -> str:
         (["run", SERVO, *BUS, "--seconds", "-1"], "'--seconds': it is a positive time in seconds, unlike -1"),
         (["run", SERVO, *BUS, "--wait", "0"], "'--wait': it is a positive time in seconds, unlike 0"),
         (["diagram", PENDULUM, "--mode", "dream"], "'sim', 'shadow', 'real', 'twin'"),
-        (["diagram", PENDULUM, "--format", "png"], "'mermaid', 'svg'"),
     ],
 )
 def test_bad_input(arguments: list[str], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,8 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, PoseRelay
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbed, VirtualTestbedBuilder
-from vtbdrake.visualization import mermaid, svg
+from vtbdrake.visualization import svg
+from vtbdrake.visualization.diagram import structure_of
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -66,11 +67,9 @@ def thrown(testbed: VirtualTestbed, mode: str):
 )
 def test_switches_are_drawn_where_they_stand(pendulum: VirtualTestbed, mode: str, sense: str, act: str) -> None:
     context = thrown(pendulum, mode)
-    picture, chart = svg(pendulum, context), mermaid(pendulum, context)
+    picture = svg(pendulum, context)
     assert positions(picture) == {"T_sense.joint_state": sense, "T_act.torque": act, "u.angle": ""}
     assert {sense, act} <= texts(picture)
-    assert f'"T_sense.joint_state: {sense}"' in chart
-    assert f'"T_act.torque: {act}"' in chart
 
 
 def test_without_a_context_switches_stand_as_built() -> None:
@@ -90,27 +89,15 @@ def test_levers_lead_to_the_branches_in_use(pendulum: VirtualTestbed) -> None:
     assert used("twin", "T_act.torque") == [real, real, sim, sim, dps]
 
 
-def test_mermaid_arrows_follow_the_switches(pendulum: VirtualTestbed) -> None:
-    lines = [line.strip() for line in mermaid(pendulum, thrown(pendulum, "shadow")).splitlines()]
-    assert {"sim_sys_0 -.-> T_sense_0", "real_sense_0 ==> T_sense_0"} <= set(lines)
-    assert {"T_act_0 ==> sim_sys_0", "T_act_0 -.-> real_act_0"} <= set(lines)
-    assert 'T_sense_0 ==>|"2 [rad, rad/s]"| dps' in lines
-    assert 'u_0(["u.angle"]) ==>|"1 [rad]"| dps' in lines
-
-
 def test_parts_are_named(pendulum: VirtualTestbed) -> None:
     found = texts(svg(pendulum))
     assert {"plant: Pendulum", "spring", "damper", "joint_state", "torque", "u.angle", "PendulumScenario"} <= found
     assert {"real.sense.joint_state", "real.act.torque"} <= found
-    assert {'dps_2["spring"]:::dps', 'sim_sys_0["plant: Pendulum"]:::sim'} <= {
-        line.strip() for line in mermaid(pendulum).splitlines()
-    }
 
 
 def test_simulated_sensor_is_the_one_that_feeds_the_switch() -> None:
     testbed = AcrobotScenario().build()
     assert "sim.sense.joints" in texts(svg(testbed))
-    assert "sim_sense_0 ==> T_sense_0" in mermaid(testbed)
 
 
 def test_ground_belongs_to_the_environment() -> None:
@@ -118,7 +105,8 @@ def test_ground_belongs_to_the_environment() -> None:
     plant, _ = builder.add_plant()
     plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", CoulombFriction(1, 1))
     builder.set_dps(ConstantVectorSource([0.0]))
-    assert 'sim_env_0["plant: world"]:::sim' in mermaid(builder.build())
+    drawn = structure_of(builder.build())
+    assert drawn.world["env"] == ("plant: world",)
 
 
 def test_names_are_escaped_and_every_role_is_drawn() -> None:
@@ -126,7 +114,3 @@ def test_names_are_escaped_and_every_role_is_drawn() -> None:
     found = texts(svg(testbed))
     assert {"camera<1>", "arm", "RigidTransform", "PoseRelay"} <= found
     assert any("further systems: logger" in text for text in found)
-    chart = mermaid(testbed)
-    assert '["camera&lt;1&gt;"]' in chart
-    assert 'subgraph dps["DPS: PoseRelay"]' in chart
-    assert chart.count("subgraph") == chart.count("\n    end") + chart.count("\n        end")

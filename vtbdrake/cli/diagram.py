@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -10,10 +9,8 @@ import click
 from vtbdrake.cli.options import output as output_file
 from vtbdrake.cli.options import scenario_argument
 from vtbdrake.cli.text import write_whole
-from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.testbed import MODES
-
-FORMATS = ("mermaid", "svg")
 
 
 @click.command("diagram")
@@ -21,19 +18,17 @@ FORMATS = ("mermaid", "svg")
 @click.option(
     "--mode", type=click.Choice(list(MODES)), default="sim", show_default=True, help="Where the switches stand."
 )
-@click.option("--format", "format_", type=click.Choice(FORMATS), default=FORMATS[0], show_default=True)
 @click.option("-o", "--output", callback=output_file(), metavar="FILE", help="Write a file instead of to the terminal.")
-def draw_diagram(scenario: Scenario, mode: str, format_: str, output: Path | None) -> None:
-    """Draw a testbed: DPS, switches, both worlds (Figure 4).
+def draw_diagram(scenario: Scenario, mode: str, output: Path | None) -> None:
+    """Draw a testbed as SVG: DPS, switches, both worlds (Figure 4).
 
     \b
     Example:
-      vtbdrake diagram diagrams.space_climber:SpaceClimberScenario --format svg -o climber.svg
+      vtbdrake diagram diagrams.space_climber:SpaceClimberScenario -o climber.svg
     """
-    from vtbdrake.visualization import mermaid, svg
+    from vtbdrake.visualization import svg
 
-    draw: dict[str, Callable[[VirtualTestbed], str]] = {"mermaid": mermaid, "svg": svg}
-    text = draw[format_](scenario.build(mode=mode))
+    text = svg(scenario.build(mode=mode))
     if output is None:
         click.echo(text)
     else:

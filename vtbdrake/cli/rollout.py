@@ -100,8 +100,6 @@ def _outcome(result: RolloutResult) -> str:
 
 
 def _write_html(motion: Motion, path: Path) -> None:
-    from vtbdrake.visualization import make_meshcat, save_html, show_motion
+    from vtbdrake.visualization import make_meshcat, show_motion
 
-    meshcat = make_meshcat()
-    show_motion(meshcat, motion)
-    save_html(meshcat, path)
+    show_motion(make_meshcat(), motion).save(path)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from vtbdrake.optimization.problem import Problem
+    from vtbdrake.visualization import Scene
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,11 @@ class ProblemRollout(RolloutResult):
     problem: Problem = field(repr=False)
     condition: Mapping[str, Any] = field(default_factory=dict)
 
-    def show(self, meshcat: Meshcat, *, prefix: str = "rollout") -> None:
-        """Puts the motion into ``meshcat`` as a recording under ``prefix``."""
+    def show(self, meshcat: Meshcat, *, prefix: str = "rollout") -> Scene:
+        """Record the motion in ``meshcat`` under ``prefix``; the returned scene shows itself in a notebook."""
         from vtbdrake.visualization import show_motion
 
-        show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
+        return show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
 
     def plot(self) -> Figure:
         """The quality trajectory with t* marked (Figure 5)."""

@@ -1,17 +1,7 @@
-"""Pictures: plots of sweeps and rollouts, recordings in Meshcat, the drawing of a testbed."""
+"""Pictures: plots of sweeps, studies and rollouts, recordings in Meshcat, the drawing of a testbed."""
 
-from vtbdrake.visualization.diagram import mermaid, svg
-from vtbdrake.visualization.motion import make_meshcat, page, save_html, show_motion, show_motions
+from vtbdrake.visualization.diagram import svg
+from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions
 from vtbdrake.visualization.plots import plot_quality, plot_sweep
 
-__all__ = [
-    "make_meshcat",
-    "mermaid",
-    "page",
-    "plot_quality",
-    "plot_sweep",
-    "save_html",
-    "show_motion",
-    "show_motions",
-    "svg",
-]
+__all__ = ["Scene", "make_meshcat", "plot_quality", "plot_sweep", "show_motion", "show_motions", "svg"]

@@ -1,37 +1,309 @@
-"""Pictures of problem (18): the quality trajectories of Figure 5, h over the parameters as in Figure 6."""
+"""Plots of rollouts and sweeps: quality trajectories (Figure 5), and h over the parameters (Figure 6)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType
 
 from vtbdrake.optimization.boundary import why_no_boundary
-from vtbdrake.visualization.figure import Picture, finish, label
-from vtbdrake.visualization.landscape import draw_landscape
-from vtbdrake.visualization.trajectories import (
-    FAILED,
-    MARKERS,
-    STYLES,
-    describe,
-    draw_bars,
-    draw_threshold,
-    draw_trajectory,
-    is_two_valued,
-    keys,
-)
+from vtbdrake.rollout import RolloutResult
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Boundary, Sweep
     from vtbdrake.rollout import RolloutResult
+
+
+class Picture(Figure):
+    """A matplotlib Figure that pyplot does not know.
+
+    pyplot would keep it in memory, open a window on a desktop, and in a notebook show it beside the returned value.
+    """
+
+    def __init__(self, width: float, height: float) -> None:
+        super().__init__(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(self)
+
+    def _repr_png_(self) -> bytes:
+        buffer = BytesIO()
+        self.savefig(buffer, format="png", dpi=100)
+        return buffer.getvalue()
+
+
+def label(name: str, unit: str) -> str:
+    """Return an axis label such as ``sim.sys.payload.mass [kg]``; without brackets if there is no unit."""
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def finish(axes: Axes) -> None:
+    """Draw a pale grid, and remove the frame above and to the right."""
+    axes.grid(True, color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+MARKERS = "osD^vP*X<>hp"
+STYLES: tuple[tuple[float, Sequence[float]], ...] = (
+    (0, ()),
+    (0, (4, 1.5)),
+    (0, (1, 1.2)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (8, 2)),
+)
+FAILED = "#b2182b"
+THRESHOLD = "#555555"
+
+
+def is_two_valued(rollouts: Sequence[RolloutResult]) -> bool:
+    """Return whether f' takes only two values (an event such as tipping over): their trajectories would overlap."""
+    values = np.unique(np.concatenate([rollout.quality for rollout in rollouts] or [np.empty(0)]))
+    return len(rollouts) > 1 and values.size <= 2
+
+
+def draw_trajectory(
+    axes: Axes, rollout: RolloutResult, *, color: ColorType, style: int = 0, width: float = 1.4, name: str | None = None
+) -> None:
+    """Draw f' over time, with t* as a marker; a failed rollout ends with a cross."""
+    times = rollout.times[: rollout.quality.size]
+    steps = "steps-post" if np.unique(rollout.quality).size <= 2 else "default"
+    (line,) = axes.plot(times, rollout.quality, color=color, linewidth=width, label=name, drawstyle=steps)
+    line.set_linestyle(STYLES[style % len(STYLES)])
+    line.set_gid("trajectory")
+    if rollout.failed and times.size:
+        axes.plot(
+            times[-1],
+            rollout.quality[-1],
+            "x",
+            color=FAILED,
+            markersize=7,
+            markeredgewidth=2,
+            gid="failed",
+            clip_on=False,
+            zorder=3,
+        )
+    elif not rollout.failed:
+        draw_t_star(axes, rollout.t_star, rollout.h, color=color, style=style)
+
+
+def draw_t_star(axes: Axes, t_star: float, height: float, *, color: ColorType, style: int = 0) -> None:
+    """Mark t*."""
+    axes.plot(
+        t_star,
+        height,
+        MARKERS[style % len(MARKERS)],
+        color=color,
+        markeredgecolor="black",
+        markeredgewidth=0.6,
+        markersize=6,
+        zorder=3,
+        clip_on=False,
+        gid="t_star",
+    )
+
+
+def draw_bars(
+    axes: Axes,
+    rollouts: Sequence[RolloutResult],
+    heights: np.ndarray,
+    *,
+    colors: Sequence[ColorType],
+    styles: Sequence[int],
+) -> None:
+    """Draw two-valued trajectories as bars at ``heights``: thin at the lower value of f', thick at the upper one.
+
+    t* is marked where h is the upper value. A failed rollout ends with a cross.
+    """
+    lower, upper = levels(rollouts)
+    for rollout, height, color, style in zip(rollouts, heights, colors, styles, strict=True):
+        times, high = rollout.times[: rollout.quality.size], rollout.quality > lower
+        if not times.size:
+            axes.plot(0.0, height, "x", color=FAILED, markersize=6, markeredgewidth=2, gid="failed", clip_on=False)
+            continue
+        axes.plot([0.0, times[-1]], [height, height], color=color, linewidth=1.0, alpha=0.6, gid="bar")
+        # A sample holds until the next one.
+        begins, ends = times[:-1][high[:-1]], times[1:][high[:-1]]
+        axes.hlines(np.full(begins.size, height), begins, ends, colors=color, linewidth=4, alpha=0.6)
+        if rollout.failed:
+            axes.plot(
+                times[-1], height, "x", color=FAILED, markersize=6, markeredgewidth=2, gid="failed", clip_on=False
+            )
+        elif rollout.h > lower:
+            draw_t_star(axes, rollout.t_star, height, color=color, style=style)
+    handles = [_key(f"f' = {lower:g}", color="0.4", linewidth=1)]
+    if upper > lower:
+        handles.append(_key(f"f' = {upper:g}", color="0.4", linewidth=4))
+    handles += keys(failed=any(rollout.failed for rollout in rollouts))
+    axes.legend(handles=handles, fontsize="small", loc="best")
+    axes.set(xlabel="time t [s]", title="Quality trajectories f'(s⁰, t) of two values")
+
+
+def levels(rollouts: Sequence[RolloutResult]) -> tuple[float, float]:
+    """Return the least and the largest quality of all samples; (0, 0) if there are none."""
+    values = np.concatenate([np.empty(0), *(rollout.quality for rollout in rollouts)])
+    return (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+
+
+def draw_threshold(axes: Axes, threshold: float) -> None:
+    """Draw f_m as a line, if it is finite."""
+    if np.isfinite(threshold):
+        axes.axhline(threshold, color=THRESHOLD, linewidth=1, linestyle=(0, (4, 2)), gid="threshold", zorder=1)
+
+
+def keys(*, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
+    """Return the legend entries that all rollouts share."""
+    found = [_key("t*", marker="o", color="white", markeredgecolor="black", linestyle="")]
+    if exceedances:
+        found.append(_key("G₁: f' > f_m", color="0.6", linewidth=6, alpha=0.5))
+    if np.isfinite(threshold):
+        found.append(_key(f"f_m = {threshold:g}", color=THRESHOLD, linewidth=1, linestyle=(0, (4, 2))))
+    if failed:
+        found.append(_key("simulation failed", marker="x", color=FAILED, linestyle="", markeredgewidth=2))
+    return found
+
+
+def _key(text: str, **style: Any) -> Line2D:
+    return Line2D([], [], label=text, **style)
+
+
+def describe(values: object) -> str:
+    """Return elements of s0 as text such as ``mass = 45, friction = 0.8``, with the last words of their addresses."""
+    if not isinstance(values, dict) or not values:
+        return "as the scenario is"
+    return ", ".join(f"{_short(address, values)} = {_number(value)}" for address, value in values.items())
+
+
+def _short(address: str, others: dict[str, object]) -> str:
+    words = address.split(".")
+    for count in range(1, len(words)):
+        tail = words[-count:]
+        if sum(other.split(".")[-count:] == tail for other in others) == 1:
+            return ".".join(tail)
+    return address
+
+
+def _number(value: object) -> str:
+    array = np.asarray(value, dtype=float)
+    return f"{array:g}" if array.ndim == 0 else np.array2string(array, precision=4, separator=", ", threshold=6)
+
+
+# It must stand out from every colour of the map.
+_THRESHOLD = "#f4a582"
+
+
+def worst(sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct points, shape (n, p), and the worst h over their conditions, shape (n,).
+
+    h is NaN where a condition is missing or its simulation failed.
+    """
+    points, where = np.unique(sweep.points, axis=0, return_inverse=True)
+    where = where.reshape(-1)
+    h = np.full(len(points), np.inf)
+    # Unlike fmin, minimum keeps a NaN.
+    np.minimum.at(h, where, sweep.h)
+    h[np.bincount(where, minlength=len(points)) < len(sweep.conditions)] = np.nan
+    return points, h
+
+
+def draw_landscape(axes: Axes, sweep: Sweep) -> None:
+    """Draw h as an image on a full grid, else as coloured points, with contour lines, failures and the best point."""
+    points, h = worst(sweep)
+    x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
+    known = np.isfinite(h)
+    threshold = sweep.rollouts[0].threshold
+    if len(points) == x.size * y.size and min(x.size, y.size) > 1:
+        # np.unique has sorted the points by x, then y.
+        image = h.reshape(x.size, y.size).T
+        log = sweep.parameters[0].log, sweep.parameters[1].log
+        drawn: ScalarMappable = draw_mesh(axes, x, y, image, log=log, lines=min(x.size, y.size) > 2)
+        if known.any() and np.nanmin(h) < threshold < np.nanmax(h):
+            axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
+            axes.plot([], [], color=_THRESHOLD, linewidth=2, label=f"f_m = {threshold:g}")
+    else:
+        x_known, y_known = points[known].T
+        drawn = axes.scatter(x_known, y_known, c=h[known], cmap="viridis", s=60, gid="h")
+    if not known.all():
+        axes.plot(*points[~known].T, "x", color=FAILED, mew=2, label="failed or not finished", gid="failed")
+    _draw_best(axes, sweep)
+    first, second = (label(p.address, unit) for p, unit in zip(sweep.parameters, sweep.units, strict=True))
+    axes.set(xlabel=first, ylabel=second)
+    several = len(sweep.conditions) > 1
+    axes.set_title(f"h(s⁰), the worst of {len(sweep.conditions)} conditions" if several else "h(s⁰)")
+    axes.figure.colorbar(drawn, ax=axes, label="h(s⁰) = f'(s⁰, t*)", pad=0.02)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
+
+
+def draw_mesh(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    image: np.ndarray,
+    *,
+    log: tuple[bool, bool] = (False, False),
+    lines: bool = True,
+    cmap: str | Colormap = "viridis",
+) -> ScalarMappable:
+    """Draw values on a full grid as cells around its points, with lines of equal value.
+
+    Args:
+        x, y: where the points lie, ascending, shapes (n,) and (m,).
+        image: the values, shape (m, n); NaN leaves a hole.
+        log: whether the cells lie around their points on a logarithmic scale, in x and y.
+        lines: draw the lines.
+    """
+    cells = axes.pcolormesh(
+        _edges(x, log=log[0]), _edges(y, log=log[1]), np.ma.masked_invalid(image), cmap=cmap, gid="h"
+    )
+    known = image[np.isfinite(image)]
+    if lines and known.size and known.max() > known.min():
+        levels = np.linspace(known.min(), known.max(), 9)[1:-1]
+        axes.contour(x, y, image, levels=levels, colors="white", linewidths=0.6, alpha=0.6)
+    return cells
+
+
+def _edges(centers: np.ndarray, *, log: bool) -> np.ndarray:
+    """Return the edges of cells, halfway between their centers, shape (n + 1,) for n >= 2."""
+    c = np.log(centers) if log else centers
+    middle = (c[:-1] + c[1:]) / 2.0
+    edges = np.concatenate([[2.0 * c[0] - middle[0]], middle, [2.0 * c[-1] - middle[-1]]])
+    return np.exp(edges) if log else edges
+
+
+def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: float = 18) -> None:
+    """Mark the best point with a star."""
+    axes.plot(
+        x,
+        y,
+        "*",
+        color="#d6604d",
+        markersize=size,
+        markeredgecolor="white",
+        clip_on=False,
+        zorder=4,
+        label=text,
+        gid="best",
+    )
+
+
+def _draw_best(axes: Axes, sweep: Sweep) -> None:
+    several = len(sweep.minimize) > 1
+    if several or sweep.risk is None or not any(evaluation.feasible for evaluation in sweep.evaluations):
+        return
+    point, best = sweep.best()
+    text = ", ".join(f"{value:.4g}" for value in point.values())
+    mark_best(axes, *point.values(), text=f"s⁰* = [{text}], h = {best:.4g}")
+
 
 _BOUNDARY = "#f4a582"
 _VALUES = colormaps["viridis"]
@@ -40,7 +312,7 @@ _SINGLE = "#2166ac"
 
 
 def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
-    """h over the parameters (Figure 6).
+    """Plot h over one or two parameters (Figure 6).
 
     Over one parameter: h, with the boundary interval shaded if there is a threshold, beside the quality trajectories
     with t* marked (Figure 5), coloured by the parameter's value. Where f' takes two values only (tipped over or not),
@@ -79,7 +351,7 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
 
 
 def plot_quality(rollouts: Sequence[RolloutResult]) -> Figure:
-    """The quality trajectories f'(t) of some rollouts, with f_m, the samples in G1 and t* (Figure 5).
+    """Plot the quality trajectories f'(t) of some rollouts, with f_m, the samples in G1 and t* (Figure 5).
 
     Raises:
         ValueError: there is none, or one has no quality.
@@ -177,7 +449,7 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
 
 
 def _draw_boundary(axes: Axes, sweep: Sweep, boundary: Boundary, handles: list[Artist]) -> str:
-    """Shades the boundary interval; returns what it says."""
+    """Shade the boundary interval, and return a title that states it."""
     lower = max(boundary.lower, float(sweep.points[:, 0].min()))
     upper = min(boundary.upper, float(sweep.points[:, 0].max()))
     if lower < upper and np.isfinite([boundary.lower, boundary.upper]).all():
@@ -205,7 +477,7 @@ def _draw_trajectories(axes: Axes, sweep: Sweep) -> None:
 
 
 def _draw_bars(axes: Axes, sweep: Sweep) -> None:
-    """One bar over time for each rollout, at its parameter value."""
+    """Draw one bar over time for each rollout, at its parameter value."""
     count = len(sweep.conditions)
     distinct = np.unique(sweep.points[:, 0])
     spacing = float(np.diff(distinct).min()) if distinct.size > 1 else 1.0

@@ -1,37 +1,428 @@
-"""Pictures of a study: its history, slices, importances and Pareto front."""
+"""Plots of studies: their history, one parameter against the value, two parameters, several qualities."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
+from math import isnan
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.tri import Triangulation
 
-from vtbdrake.visualization.figure import Picture, finish
-from vtbdrake.visualization.study_landscape import draw_slice, plot_landscape
-from vtbdrake.visualization.study_points import (
-    BEST,
-    BROKEN_STYLE,
-    Points,
-    draw_points,
-    name,
-    point_keys,
-    quality_label,
-    scales,
-    values,
-)
+from vtbdrake.optimization.outcome import Trial
+from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.visualization.plots import FAILED, Picture, draw_mesh, finish, label, mark_best
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.study_record import StudyRecord
+
+BEST = "#d6604d"
+_BROKEN = "0.45"
+_DROPPED = "0.6"
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of a study, grouped by their outcome.
+
+    Attributes:
+        kept: they have a value and keep all constraints.
+        broken: they have a value, but break a constraint.
+        dropped: by racing; their value is only known to be no better than their bound.
+        failed: a simulation failed.
+    """
+
+    kept: tuple[Trial, ...]
+    broken: tuple[Trial, ...]
+    dropped: tuple[Trial, ...]
+    failed: tuple[Trial, ...]
+
+    @classmethod
+    def of(cls, study: StudyRecord) -> Points:
+        """
+        Raises:
+            ValueError: there are none.
+        """
+        sorted_: dict[str, list[Trial]] = {"kept": [], "broken": [], "dropped": [], "failed": []}
+        for trial in study.trials:
+            sorted_[_kind(trial)].append(trial)
+        if not any(sorted_.values()):
+            raise ValueError("the study has no judged points yet, so that there is nothing to draw: run it first")
+        return cls(**{kind: tuple(trials) for kind, trials in sorted_.items()})
+
+    @property
+    def known(self) -> tuple[Trial, ...]:
+        """Return the points that have a value."""
+        return (*self.kept, *self.broken)
+
+    def best_at(self, place: Callable[[Sequence[Trial]], np.ndarray], quality: int, sign: float) -> Points:
+        """Return the best point in one quality at each of the places, which have shape (n, k) for n points.
+
+        One that keeps the constraints is better than one that does not, and this better than one without a value.
+        """
+        groups = (self.kept, self.broken, self.dropped, self.failed)
+        trials = [trial for group in groups for trial in group]
+        rank = np.repeat(range(4), [len(group) for group in groups])
+        worth = np.where(rank < 2, sign * values(trials, quality), 0.0)
+        # Sorted from good to bad, the first of each place is the best there.
+        order = np.lexsort((-worth, rank))
+        _, first = np.unique(place(trials)[order], axis=0, return_index=True)
+        chosen = order[first]
+        kept, broken, dropped, failed = (
+            tuple(trials[k] for k in chosen if rank[k] == group) for group in range(len(groups))
+        )
+        return Points(kept, broken, dropped, failed)
+
+    def best(self, study: StudyRecord, quality: int) -> Trial | None:
+        """Return the best point in one quality; None if no point keeps the constraints."""
+        sign = study.signs[quality]
+        return max(self.kept, key=lambda trial: sign * trial.values[quality], default=None)
+
+
+def _kind(trial: Trial) -> str:
+    # The bound of a dropped point may be infinite; only a failed simulation gives NaN.
+    if any(isnan(value) for value in trial.values):
+        return "failed"
+    if not trial.exact:
+        return "dropped"
+    return "kept" if trial.feasible else "broken"
+
+
+def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
+    """Return the values of one quality, shape (n,)."""
+    return np.array([trial.values[quality] for trial in trials], dtype=float)
+
+
+def name(study: StudyRecord, quality: int) -> str:
+    """Return the name of a quality; h if its function has none."""
+    found = study.names[quality]
+    return found if found.isidentifier() else "h(s⁰)"
+
+
+def quality_label(study: StudyRecord, quality: int) -> str:
+    """Return an axis label such as ``energy (cost, worst of 5 conditions)``."""
+    described = study.record["problem"]
+    conditions = len(described["conditions"])
+    remarks = ["cost"] if study.directions[quality] == "minimize" else []
+    if conditions > 1:
+        # Of a repr: Worst(), CVaR(level=0.2).
+        risk = described["risk"].removesuffix("()")
+        remarks.append(f"{risk.lower() if risk.isalpha() else risk} of {conditions} conditions")
+    return f"{name(study, quality)} ({', '.join(remarks)})" if remarks else name(study, quality)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The axis of a parameter: numbers as they are, options side by side."""
+
+    dimension: Dimension
+    unit: str
+
+    @property
+    def is_log(self) -> bool:
+        return not isinstance(self.dimension, Choice) and self.dimension.log
+
+    def places(self, trials: Sequence[Trial]) -> np.ndarray:
+        """Return the positions of points on the axis, shape (n,)."""
+        found = [trial.parameters[self.dimension.address] for trial in trials]
+        if isinstance(self.dimension, Choice):
+            found = [self.dimension.options.index(self.dimension.check(value)) for value in found]
+        return np.array(found, dtype=float)
+
+    def set_up(self, axes: Axes, which: str, *, width: int = 60) -> None:
+        """Set label (wrapped after about ``width`` letters), scale and ticks of the axis ``x`` or ``y``."""
+        axis = axes.xaxis if which == "x" else axes.yaxis
+        if isinstance(self.dimension, Choice):
+            axis.set_ticks(range(len(self.dimension.options)), [str(option) for option in self.dimension.options])
+            _limits(axes, which)(-0.5, len(self.dimension.options) - 0.5)
+        elif self.is_log:
+            (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+        elif self.dimension.integer:
+            axis.set_major_locator(MaxNLocator(nbins="auto", integer=True))
+        axis.set_label_text(_wrapped(label(self.dimension.address, self.unit), width))
+
+
+def _limits(axes: Axes, which: str) -> Callable[[float, float], Any]:
+    return axes.set_xlim if which == "x" else axes.set_ylim
+
+
+def _wrapped(text: str, width: int) -> str:
+    lines = [""]
+    for word in text.replace(".", ".\0").replace(" [", "\0 [").split("\0"):
+        if lines[-1] and len(lines[-1] + word) > width:
+            lines.append("")
+        lines[-1] += word
+    return "\n".join(line.strip() for line in lines)
+
+
+def scales(study: StudyRecord) -> dict[str, Scale]:
+    """Return the axis of each parameter, by address."""
+    return {p.address: Scale(p, unit) for p, unit in zip(study.parameters, study.units, strict=True)}
+
+
+def draw_points(
+    axes: Axes,
+    study: StudyRecord,
+    points: Points,
+    x: Callable[[Sequence[Trial]], np.ndarray],
+    *,
+    quality: int,
+    **style: Any,
+) -> None:
+    """Draw all points at the places ``x`` and their values.
+
+    A failed one is a cross at the bottom, one that was dropped a triangle at its bound, or at the edge if that is
+    infinite.
+    """
+    style = {"s": 22, "zorder": 3, "linewidths": 0, **style}
+    axes.scatter(x(points.kept), values(points.kept, quality), gid="kept", **style)
+    axes.plot(x(points.broken), values(points.broken, quality), gid="broken", **BROKEN_STYLE)
+    bounds = values(points.dropped, quality)
+    finite = np.isfinite(bounds)
+    style_dropped = _dropped_style(study, quality)
+    places = x(points.dropped)
+    axes.plot(places[finite], bounds[finite], gid="dropped", **style_dropped)
+    if not finite.all():
+        edge = np.full(np.count_nonzero(~finite), 0.98)
+        axes.plot(places[~finite], edge, gid="unbounded", transform=axes.get_xaxis_transform(), **style_dropped)
+    # An empty line that is not clipped would take room in the corner of the figure.
+    if points.failed:
+        bottom = np.full(len(points.failed), 0.03)
+        axes.plot(x(points.failed), bottom, gid="failed", transform=axes.get_xaxis_transform(), **_FAILED_STYLE)
+
+
+BROKEN_STYLE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markerfacecolor": "none",
+    "markeredgecolor": _BROKEN,
+    "markersize": 4.5,
+    "markeredgewidth": 0.8,
+    "zorder": 2,
+}
+_DROPPED_STYLE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "v",
+    "color": _DROPPED,
+    "markersize": 4,
+    "markeredgewidth": 0,
+    "zorder": 1.5,
+}
+_FAILED_STYLE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "x",
+    "color": FAILED,
+    "markersize": 6,
+    "markeredgewidth": 1.5,
+    "zorder": 3,
+    "clip_on": False,
+}
+
+
+# It must stand out from every colour of a map, and from white.
+_BROKEN_ON_A_MAP: dict[str, Any] = {
+    **BROKEN_STYLE,
+    "markeredgecolor": "#f4a582",
+    "markersize": 7,
+    "markeredgewidth": 1.4,
+}
+
+
+def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]:
+    """Mark the points over two parameters that have no valid value, and return legend entries."""
+    marks = _marks(points, broken=_BROKEN_ON_A_MAP, dropped=("dropped by racing", _DROPPED_STYLE))
+    for gid, trials, style, _ in marks:
+        axes.plot(x.places(trials), y.places(trials), gid=gid, **style)
+    return _keys(marks)
+
+
+def point_keys(study: StudyRecord, points: Points) -> list[Line2D]:
+    """Return the legend entries of the marks that `draw_points` makes."""
+    dropped = "dropped by racing: no better than this", _dropped_style(study, 0)
+    return _keys(_marks(points, broken=BROKEN_STYLE, dropped=dropped))
+
+
+def _dropped_style(study: StudyRecord, quality: int) -> dict[str, Any]:
+    # It points to where the value may be.
+    return {**_DROPPED_STYLE, "marker": "v" if study.signs[quality] > 0.0 else "^"}
+
+
+def _marks(
+    points: Points, *, broken: dict[str, Any], dropped: tuple[str, dict[str, Any]]
+) -> list[tuple[str, tuple[Trial, ...], dict[str, Any], str]]:
+    marks = [
+        ("broken", points.broken, broken, "breaks a constraint"),
+        ("dropped", points.dropped, dropped[1], dropped[0]),
+        ("failed", points.failed, _FAILED_STYLE, "simulation failed"),
+    ]
+    return [mark for mark in marks if mark[1]]
+
+
+def _keys(marks: Sequence[tuple[str, tuple[Trial, ...], dict[str, Any], str]]) -> list[Line2D]:
+    return [Line2D([], [], label=f"{text} ({len(trials)})", **style) for _, trials, style, text in marks]
+
+
+_SINGLE = "#2166ac"
+_LEVELS = 12
+
+
+def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
+    """Plot every quality over one or two parameters; if others vary too, the best value at each place.
+
+    Over two: an image where the points fill a grid; else filled contours between the points if nothing but these two
+    numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
+
+    Args:
+        addresses: of the parameters; of a study over one or two, these.
+
+    Raises:
+        ValueError: there are no points, an address is none of the study's parameters, or there are not one or two.
+    """
+    points = Points.of(study)
+    known = scales(study)
+    chosen = addresses or tuple(known)
+    for address in chosen:
+        if address not in known:
+            raise ValueError(f"{address} is no parameter of the study; those are {', '.join(known)}")
+    if not 1 <= len(chosen) <= 2 or len(set(chosen)) < len(chosen):
+        raise ValueError(
+            f"a landscape lies over one or two different parameters, not over {', '.join(chosen)}: name two of them, "
+            "plot_landscape(first, second)"
+        )
+    count = len(study.names)
+    figure = Picture(7.2 if count == 1 else 6.0 * count, 5.4 if len(chosen) == 2 else 4.6)
+    draw = _draw_surface if len(chosen) == 2 else _draw_line
+    shown = [known[address] for address in chosen]
+    for quality, axes in enumerate(figure.subplots(1, count, squeeze=False)[0]):
+        handles = draw(axes, study, points, *shown, quality=quality, others=len(known) - len(chosen))
+        _legend_with_best(axes, study, points, chosen, handles, quality=quality)
+    return figure
+
+
+def draw_slice(
+    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
+) -> None:
+    """Draw one quality over one parameter, with the best point; coloured by the order of the points unless ``style`` has a
+    color."""
+    if "color" not in style:
+        style["c"] = [trial.number for trial in points.kept]
+    draw_points(axes, study, points, scale.places, quality=quality, **style)
+    best = points.best(study, quality)
+    if best is not None:
+        mark_best(axes, float(scale.places([best])[0]), best.values[quality], size=13)
+    scale.set_up(axes, "x", width=width)
+    finish(axes)
+
+
+def _draw_line(
+    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, others: int
+) -> list[Artist]:
+    """Draw the values and return legend entries."""
+    draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
+    axes.set_ylabel(quality_label(study, quality))
+    best = points.best_at(lambda trials: scale.places(trials)[:, None], quality, study.signs[quality])
+    handles: list[Artist] = []
+    # Where nearly every point has a place of its own, the best at each is no curve.
+    if not isinstance(scale.dimension, Choice) and (not others or 2 * len(best.known) <= len(points.known)):
+        order = np.argsort(scale.places(best.known))
+        text = f"the best over {_count(others)}" if others else None
+        (line,) = axes.plot(
+            scale.places(best.known)[order],
+            values(best.known, quality)[order],
+            color=_SINGLE,
+            linewidth=1.2,
+            zorder=2,
+            label=text,
+            gid="h",
+        )
+        handles = [line] if others else []
+    return [*handles, *point_keys(study, points)]
+
+
+def _draw_surface(
+    axes: Axes, study: StudyRecord, points: Points, x: Scale, y: Scale, *, quality: int, others: int
+) -> list[Artist]:
+    """Draw the values and return legend entries."""
+    sign = study.signs[quality]
+    # Bright is good.
+    style: dict[str, Any] = {"cmap": colormaps["viridis" if sign > 0.0 else "viridis_r"]}
+
+    def places(trials: Sequence[Trial]) -> np.ndarray:
+        return np.column_stack([x.places(trials), y.places(trials)])
+
+    best = points.best_at(places, quality, sign)
+    x.set_up(axes, "x")
+    y.set_up(axes, "y")
+    numbers = not any(isinstance(scale.dimension, Choice) for scale in (x, y))
+    everywhere = (*best.known, *best.dropped, *best.failed)
+    (xs, column), (ys, row) = (np.unique(found, return_inverse=True) for found in places(everywhere).T)
+    h = values(best.known, quality)
+    if len(everywhere) == xs.size * ys.size and min(xs.size, ys.size) > 1:
+        image = np.full((ys.size, xs.size), np.nan)
+        image[row[: h.size], column[: h.size]] = h
+        lines = numbers and min(image.shape) > 2
+        drawn: ScalarMappable = draw_mesh(axes, xs, ys, image, log=(x.is_log, y.is_log), lines=lines, **style)
+    else:
+        at = places(best.known)
+        if h.size:
+            style.update(vmin=h.min(), vmax=h.max())
+        if not others and numbers and _spans_a_plane(unit := _unit(at, x, y)):
+            triangles = Triangulation(at[:, 0], at[:, 1], Triangulation(unit[:, 0], unit[:, 1]).triangles)
+            axes.tricontourf(triangles, h, levels=_LEVELS, alpha=0.85, **style)
+        marks: dict[str, Any] = {"s": 26, "edgecolors": "white", "linewidths": 0.5, "zorder": 2, "gid": "h"}
+        drawn = axes.scatter(at[:, 0], at[:, 1], c=h, **marks, **style)
+    handles = draw_remarks(axes, best, x, y)
+    winner = points.best(study, quality)
+    if winner is not None:
+        mark_best(axes, *places([winner])[0])
+    axes.figure.colorbar(drawn, ax=axes, label=quality_label(study, quality), pad=0.02)
+    if others:
+        axes.set_title(f"at each place, the best over {_count(others)}", fontsize="medium")
+    return [*handles]
+
+
+def _count(others: int) -> str:
+    return f"{others} other parameter{'s' * (others > 1)}"
+
+
+def _unit(places: np.ndarray, x: Scale, y: Scale) -> np.ndarray:
+    """Return places in the unit square, where parameters of different units and scales are comparable."""
+    columns = zip((x, y), places.T, strict=True)
+    return np.column_stack([[scale.dimension.to_unit(value) for value in column] for scale, column in columns])
+
+
+def _spans_a_plane(unit: np.ndarray) -> bool:
+    return len(unit) >= 3 and bool(np.linalg.matrix_rank(unit - unit[0], tol=1e-6) == 2)
+
+
+def _legend_with_best(
+    axes: Axes, study: StudyRecord, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
+) -> None:
+    best = points.best(study, quality)
+    if best is not None:
+        (star,) = (line for line in axes.get_lines() if line.get_gid() == "best")
+        at = ", ".join(_text(best.parameters[address]) for address in chosen)
+        star.set_label(f"s⁰* = [{at}], {name(study, quality)} = {best.values[quality]:.4g}")
+        handles = [star, *handles]
+    if handles:
+        where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13)}
+        axes.legend(handles=handles, fontsize="small", ncols=2, frameon=False, **where)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
 
 __all__ = ["plot_history", "plot_importances", "plot_landscape", "plot_pareto", "plot_slices"]
 
@@ -43,7 +434,7 @@ _ORDER_LABEL = "point, in the order of the study"
 
 
 def plot_history(study: StudyRecord) -> Figure:
-    """Every quality in the order of the points, coloured by the method that asked for them, and the best so far.
+    """Plot every quality in the order of the points, coloured by solver, with the best value so far.
 
     Raises:
         ValueError: there are no points.
@@ -91,7 +482,7 @@ def plot_history(study: StudyRecord) -> Figure:
 
 
 def plot_slices(study: StudyRecord) -> Figure:
-    """Every quality over every parameter, coloured by the order of the points; the best point as a star.
+    """Plot every quality over every parameter, coloured by the order of the points; the best point is a star.
 
     Raises:
         ValueError: there are no points.
@@ -124,7 +515,7 @@ def plot_slices(study: StudyRecord) -> Figure:
 
 
 def plot_importances(study: StudyRecord) -> Figure:
-    """How much each parameter decides about whether a point is among the best tenth, for every quality.
+    """Plot how much each parameter decides whether a point is among the best tenth, for every quality.
 
     See `vtbdrake.optimization.optuna_bridge.importances`.
 
@@ -154,7 +545,7 @@ def plot_importances(study: StudyRecord) -> Figure:
 
 
 def plot_pareto(study: StudyRecord) -> Figure:
-    """Two qualities against each other, with the Pareto front; of three qualities, every pair of them.
+    """Plot two qualities against each other with the Pareto front; of three qualities, every pair.
 
     Raises:
         ValueError: there are no points, or not two or three qualities.

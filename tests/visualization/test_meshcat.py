@@ -1,5 +1,7 @@
 """What Meshcat writes is read back: keyframes, their times, their poses and their paths."""
 
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from pydrake.geometry import Meshcat
 from tests.testbeds import AcrobotScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Motion
-from vtbdrake.visualization import make_meshcat, save_html, show_motion, show_motions
+from vtbdrake.visualization import make_meshcat, show_motion, show_motions
 
 UPPER = "Acrobot/upper_link"
 
@@ -81,7 +83,8 @@ def test_surroundings_of_one_scenario_are_drawn_once(meshcat: Meshcat) -> None:
 
 
 def test_tint_and_opacity_are_of_the_moving_bodies(meshcat: Meshcat) -> None:
-    legend = show_motions(meshcat, {"a": motion(), "b": motion()}, colors={"b": (1.0, 0.0, 0.0)}, opacity={"b": 0.5})
+    tint, strength = {"b": (1.0, 0.0, 0.0)}, {"b": 0.5}
+    legend = show_motions(meshcat, {"a": motion(), "b": motion()}, colors=tint, opacity=strength).legend
     assert legend == {"b": "#ff0000"}
     # Drake's acrobot has a red upper and a blue lower link, of which the tint keeps the brightness.
     assert set(colors(meshcat, "rollout/a/Acrobot/upper")) == {(0xFF0000, 1.0)}
@@ -91,7 +94,7 @@ def test_tint_and_opacity_are_of_the_moving_bodies(meshcat: Meshcat) -> None:
 
 
 def test_motions_are_told_apart_by_default(meshcat: Meshcat) -> None:
-    legend = show_motions(meshcat, {"a": motion(), "b": motion()})
+    legend = show_motions(meshcat, {"a": motion(), "b": motion()}).legend
     assert len(set(legend.values())) == 2
     assert colors(meshcat, "rollout/a/Acrobot/upper") != colors(meshcat, "rollout/b/Acrobot/upper")
 
@@ -122,14 +125,21 @@ def test_states_of_another_plant_are_refused(meshcat: Meshcat) -> None:
 
 
 def test_page_is_written_whole_with_its_legend(meshcat: Meshcat, tmp_path: Path) -> None:
-    legend = show_motions(meshcat, {"0 kg": motion(), "<45> kg": motion()})
+    scene = replace(show_motions(meshcat, {"0 kg": motion(), "<45> kg": motion()}), title="Moon & Mars")
     path = tmp_path / "overlay.html"
-    save_html(meshcat, path, title="Moon & Mars", legend=legend)
+    scene.save(path)
     page = path.read_text(encoding="utf-8")
     assert "<b>Moon &amp; Mars</b>" in page
-    assert f'color:{legend["<45> kg"]}">&#9632;</span> &lt;45&gt; kg' in page
+    assert f'color:{scene.legend["<45> kg"]}">&#9632;</span> &lt;45&gt; kg' in page
     assert any(m["type"] == "set_animation" for m in messages(page))
     assert [p.name for p in tmp_path.iterdir()] == ["overlay.html"]
+
+
+def test_notebook_cell_shows_the_page_itself(meshcat: Meshcat) -> None:
+    scene = show_motion(meshcat, motion())
+    frame = ElementTree.fromstring(scene._repr_html_())
+    assert frame.tag == "iframe"
+    assert any(m["type"] == "set_animation" for m in messages(frame.attrib["srcdoc"]))
 
 
 def test_meshcat_listens_on_this_machine_only(meshcat: Meshcat) -> None:

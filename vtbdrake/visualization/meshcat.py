@@ -1,10 +1,11 @@
-"""Motions of the simulated world as recordings in Meshcat; several of them overlaid (Figure 7)."""
+"""Recordings of motions in Meshcat, one or several overlaid (Figure 7), in a notebook or as a web page."""
 
 from __future__ import annotations
 
 import html
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import cycle
 from typing import TYPE_CHECKING
 
@@ -41,19 +42,67 @@ _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 _RESOLUTION = 1000.0
 
 
+@dataclass(frozen=True)
+class Scene:
+    """The scene of a Meshcat with its recording, which shows itself in a notebook.
+
+    Attributes:
+        meshcat: the server whose scene is shown; the scene is copied when it is displayed or saved.
+        title: a caption.
+        legend: label -> colour, below the caption.
+        height: of the notebook's cell output, in pixels.
+    """
+
+    meshcat: Meshcat
+    title: str = ""
+    legend: Mapping[str, str] = field(default_factory=dict)
+    height: int = 400
+
+    def page(self) -> str:
+        """Return the scene as one self-contained HTML page."""
+        head, tag, tail = self.meshcat.StaticHtml().rpartition("</body>")
+        return f"{head}{self._caption()}{tag}{tail}"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the `page` to a file. The file is written completely or not at all."""
+        with whole_file(path) as partial:
+            partial.write_text(self.page(), encoding="utf-8")
+
+    def _caption(self) -> str:
+        rows = [f"<b>{html.escape(self.title)}</b>"] if self.title else []
+        rows += [
+            f'<span style="color:{html.escape(color, quote=True)}">&#9632;</span> {html.escape(name)}'
+            for name, color in self.legend.items()
+        ]
+        style = (
+            "position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,0.85);border-radius:6px;"
+            "font:14px/1.5 sans-serif;color:#222"
+        )
+        return f'<div id="caption" style="{style}">{"<br>".join(rows)}</div>\n' if rows else ""
+
+    def _repr_html_(self) -> str:
+        style = f"width: 100%; height: {self.height}px; border: 0"
+        return f'<iframe srcdoc="{html.escape(self.page())}" style="{style}"></iframe>'
+
+
 def make_meshcat() -> Meshcat:
-    """A Meshcat server that listens on this machine only, unlike Drake's default."""
+    """Start a Meshcat server that listens on this machine only (Drake's default listens on all interfaces)."""
     return Meshcat(MeshcatParams(host="localhost"))
 
 
-def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> None:
-    """Puts a motion into ``meshcat`` as its recording, under ``prefix``; one second of it is one simulated second.
+def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> Scene:
+    """Record a motion in ``meshcat``; one second of the recording is one simulated second.
 
-    It replaces the recording that is there, and what is drawn under ``prefix``. To see several motions at a time, use
-    `show_motions`.
+    It replaces the present recording, and what is drawn under ``prefix``. `show_motions` shows several motions.
 
     Args:
+        meshcat: the server that shows it.
+        motion: the states over time.
+        prefix: the Meshcat path under which it is drawn.
         rate: keyframes per second at most.
+
+    Returns:
+        The scene, which shows itself in a notebook.
 
     Raises:
         ValueError: the motion has no sample, its states do not fit the scenario's plant, or there is nothing to draw.
@@ -61,6 +110,7 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
     _record(meshcat, [_Actor(motion, prefix)], rate)
+    return Scene(meshcat)
 
 
 def show_motions(
@@ -72,22 +122,24 @@ def show_motions(
     opacity: float | Mapping[str, float] = 1.0,
     spacing: ArrayLike = (0.0, 0.0, 0.0),
     rate: float = 20.0,
-) -> dict[str, str]:
-    """Overlays motions in one recording (Figure 7): the unloaded and the loaded robot, say.
+) -> Scene:
+    """Record several motions overlaid (Figure 7), for example of the unloaded and the loaded robot.
 
-    Each is drawn under ``<prefix>/<label>``, its moving bodies tinted; of several in one scenario, the surroundings are
-    drawn once. A motion that ends earlier stands still until the last one has ended.
+    Each is drawn under ``<prefix>/<label>`` with its moving bodies tinted. The surroundings of motions of one scenario
+    are drawn once. A motion that ends earlier stands still until the last one has ended.
 
     Args:
+        meshcat: the server that shows them.
         motions: label -> motion.
-        colors: label -> tint, any matplotlib colour; a label that is missing keeps its own colours. Left out, every
-            motion gets a tint.
+        prefix: the Meshcat path under which they are drawn.
+        colors: label -> tint, any matplotlib colour; a motion without an entry keeps its own colours. By default every
+            motion is tinted.
         opacity: of the moving bodies, in (0, 1], for all or by label.
-        spacing: the n-th motion is drawn displaced by n times this, in metres; shape (3,).
+        spacing: displacement from each motion to the next, in metres; shape (3,).
         rate: keyframes per second at most.
 
     Returns:
-        label -> tint as ``#rrggbb``, for the ``legend`` of `save_html`.
+        The scene, whose legend names the tints; it shows itself in a notebook.
 
     Raises:
         ValueError: there is no motion, a label or opacity makes no sense, or as in `show_motion`.
@@ -116,43 +168,7 @@ def show_motions(
         )
     meshcat.Delete(prefix)
     _record(meshcat, actors, rate)
-    return tints
-
-
-def page(meshcat: Meshcat, *, title: str = "", legend: Mapping[str, str] | None = None) -> str:
-    """What ``meshcat`` shows, with its recording, as one self-contained HTML page.
-
-    Args:
-        title: a caption on the page.
-        legend: label -> colour, also on the page; see `show_motions`.
-    """
-    head, tag, tail = meshcat.StaticHtml().rpartition("</body>")
-    return f"{head}{_caption(title, legend or {}) if title or legend else ''}{tag}{tail}"
-
-
-def save_html(
-    meshcat: Meshcat,
-    path: str | os.PathLike[str],
-    *,
-    title: str = "",
-    legend: Mapping[str, str] | None = None,
-) -> None:
-    """Writes the `page`, whole or not at all."""
-    with whole_file(path) as partial:
-        partial.write_text(page(meshcat, title=title, legend=legend), encoding="utf-8")
-
-
-def _caption(title: str, legend: Mapping[str, str]) -> str:
-    rows = [f"<b>{html.escape(title)}</b>"] if title else []
-    rows += [
-        f'<span style="color:{html.escape(color, quote=True)}">&#9632;</span> {html.escape(name)}'
-        for name, color in legend.items()
-    ]
-    style = (
-        "position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,0.85);border-radius:6px;"
-        "font:14px/1.5 sans-serif;color:#222"
-    )
-    return f'<div id="caption" style="{style}">{"<br>".join(rows)}</div>\n'
+    return Scene(meshcat, legend=tints)
 
 
 def _check(motion: Motion, path: str, rate: float) -> None:
@@ -242,7 +258,7 @@ class _Actor:
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
-    """(time, number of the sample) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
+    """Return (time, number of the sample) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
     stamps = np.round(np.asarray(times, dtype=float) * _RESOLUTION) / _RESOLUTION
     chosen: list[tuple[float, int]] = []
     for sample, stamp in enumerate(stamps):
