@@ -252,7 +252,7 @@ class _Drawing:
         self._world_arrows(top + 18, height, SIM)
 
     def _world_arrows(self, top: int, height: int, color: str) -> None:
-        """Draw the arrows from actuators to the system, between system and environment, and from both to the sensors."""
+        """Draw the arrows: actuators to system, system and environment both ways, both to sensors."""
         y = top + height // 2
         (sense, sense_width), (system, width), (env, env_width), (act, _) = WORLD_BOXES
         around = (

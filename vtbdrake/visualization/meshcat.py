@@ -258,7 +258,7 @@ class _Actor:
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
-    """Return (time, number of the sample) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
+    """Return (time, sample number) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
     stamps = np.round(np.asarray(times, dtype=float) * _RESOLUTION) / _RESOLUTION
     chosen: list[tuple[float, int]] = []
     for sample, stamp in enumerate(stamps):

@@ -50,9 +50,10 @@ class Points:
 
     @classmethod
     def of(cls, study: StudyRecord) -> Points:
-        """
+        """Group the points of a study.
+
         Raises:
-            ValueError: there are none.
+            ValueError: the study has no points.
         """
         sorted_: dict[str, list[Trial]] = {"kept": [], "broken": [], "dropped": [], "failed": []}
         for trial in study.trials:
@@ -313,7 +314,7 @@ def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
 def draw_slice(
     axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
 ) -> None:
-    """Draw one quality over one parameter, with the best point; coloured by the order of the points unless ``style`` has a
+    """Draw one quality over one parameter, with the best point; coloured by the points' order unless ``style`` has a
     color."""
     if "color" not in style:
         style["c"] = [trial.number for trial in points.kept]
