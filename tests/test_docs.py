@@ -34,7 +34,6 @@ def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
     script.write_text(program(page), "utf-8")
     search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"PYTHONPATH": search, "MPLBACKEND": "agg"}
-    run = [sys.executable, script]
     done = subprocess.run(
         [sys.executable, script],
         cwd=tmp_path,

@@ -314,8 +314,10 @@ def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
 def draw_slice(
     axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
 ) -> None:
-    """Draw one quality over one parameter, with the best point; coloured by the points' order unless ``style`` has a
-    color."""
+    """Draw one quality over one parameter, with the best point.
+
+    Points are coloured by their order unless ``style`` has a color.
+    """
     if "color" not in style:
         style["c"] = [trial.number for trial in points.kept]
     draw_points(axes, study, points, scale.places, quality=quality, **style)
