@@ -14,8 +14,7 @@ from benchmarks.loop_rig import PERIOD, Rig, loop_rig
 from benchmarks.measure import HIGHER, LOWER, Benchmark, seconds, spread
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.monitoring.live.service import LiveService
-from vtbdrake.recording.control_log import ControlLog
-from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone

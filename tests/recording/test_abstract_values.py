@@ -72,14 +72,14 @@ def test_images_are_replayed_from_their_messages(hub: Hub, tmp_path: Path) -> No
     assert (log.sources["image"] != 0).tolist() == [i % 3 == 0 for i in range(30)]
     report = replay(log)
     assert report.identical and report.digests == 30, report
-    assert report.commands["velocity"][:, 0].tolist() == [brightness(shown[i // 3]) for i in range(30)]
+    assert report.actuation["velocity"][:, 0].tolist() == [brightness(shown[i // 3]) for i in range(30)]
 
 
 def test_a_recording_that_would_lack_the_present_image_is_refused(hub: Hub, tmp_path: Path) -> None:
     loop = Seeing(hub)
     loop.bridge.open()
     loop.show()
-    with pytest.raises(ValueError, match="signal image is abstract, .* begin to record before the bridge is opened"):
+    with pytest.raises(ValueError, match="signal image is abstract, .* start to record before the bridge is opened"):
         Recorder(loop.runtime, tmp_path / "run.lcm")
     loop.bridge.close()
     assert not (tmp_path / "run.lcm").exists()

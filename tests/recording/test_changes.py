@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from vtbdrake.control.cycle import Change
-from vtbdrake.recording.changes import change_events, changes_of
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
+from vtbdrake.recording.log_format import decode_changes, encode_changes
 
 IMAGE = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
 
@@ -26,9 +26,9 @@ IMAGE = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     ],
 )
 def test_values_come_back_as_they_were(values: dict[str, Any]) -> None:
-    messages = change_events([Change("first", {"x": 1.0}), Change("kind", values), Change("last", {})], 42, 1)
+    messages = encode_changes([Change("first", {"x": 1.0}), Change("kind", values), Change("last", {})], 42, 1)
     sent = [lcmt_vtb_change.decode(message.encode()) for message in messages]
-    (_, first), (number, change), (_, last) = changes_of(sent)
+    (_, first), (number, change), (_, last) = decode_changes(sent)
     assert (first.kind, change.kind, last.kind, number) == ("first", "kind", "last", 42)
     _assert_equal(change.values, values)
 
@@ -47,5 +47,5 @@ def _assert_equal(found: Any, expected: Any) -> None:
 
 
 def test_changes_that_follow_each_other_in_two_cycles_stay_apart() -> None:
-    messages = [*change_events([Change("reset", {})], 1, 0), *change_events([Change("reset", {})], 2, 0)]
-    assert changes_of(messages) == [(1, Change("reset", {})), (2, Change("reset", {}))]
+    messages = [*encode_changes([Change("reset", {})], 1, 0), *encode_changes([Change("reset", {})], 2, 0)]
+    assert decode_changes(messages) == [(1, Change("reset", {})), (2, Change("reset", {}))]

@@ -7,7 +7,7 @@ import pytest
 
 from tests.control.scripted import ServoScenario
 from tests.control.slow import SlowScenario
-from vtbdrake.recording.digest import StateDigest
+from vtbdrake.recording.recorder import StateDigest
 from vtbdrake.testbed import DpsAlone
 
 

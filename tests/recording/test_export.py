@@ -10,9 +10,8 @@ import pandas
 import pytest
 
 from tests.recording.servo import Servo
-from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.export import export
-from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 
 SIGNALS = ("sense.position", "sense.speed", "command.velocity", "sent.velocity")
@@ -41,7 +40,7 @@ def test_pandas_reads_every_number_to_the_last_bit(log: ControlLog, tmp_path: Pa
     for column, values in [
         ("time", log.times),
         ("sense.position[1]", log.fed["position"][:, 1]),
-        ("command.velocity[0]", log.commands["velocity"][:, 0]),
+        ("command.velocity[0]", log.actuation["velocity"][:, 0]),
         ("sent.velocity[1]", log.sent["velocity"][:, 1]),
     ]:
         assert np.array_equal(table[column].to_numpy(dtype=float), values, equal_nan=True)

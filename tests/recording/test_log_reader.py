@@ -20,13 +20,10 @@ from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Change
 from vtbdrake.lcm.wire import decode
-from vtbdrake.recording.changes import change_events
-from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
-from vtbdrake.recording.log_events import LogEvents
-from vtbdrake.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, event
-from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, encode_changes, event
+from vtbdrake.recording.log_reader import ControlLog, LogEvents, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 
@@ -68,7 +65,7 @@ def assert_same(log: ControlLog, reference: ControlLog, rows: list[int]) -> None
     assert log.numbers.tolist() == reference.numbers[rows].tolist()
     for name in ("times", "now", "utimes", "ok"):
         assert np.array_equal(getattr(log, name), getattr(reference, name)[rows])
-    for name in ("fed", "commands", "sent"):
+    for name in ("fed", "actuation", "sent"):
         for signal_name, values in getattr(log, name).items():
             assert np.array_equal(values, getattr(reference, name)[signal_name][rows], equal_nan=True)
 
@@ -221,7 +218,7 @@ def test_a_cycle_that_was_held_up_is_no_jump_of_the_clock(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 something else", bytes(5000)], ids=["empty", "short", "zeros"])
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(LogError, match="is no log of a control loop: it has no event on VTB_LOG"):
+    with pytest.raises(LogError, match="is not a log of a control loop: it has no event on VTB_LOG"):
         read(tmp_path, content)
 
 
@@ -388,14 +385,14 @@ def framed(number: int, *messages: tuple[str, bytes], reference: ControlLog, who
         ({"shape": (3,)}, "cannot reshape"),
         ({"shape": ()}, "cannot reshape"),
         ({"data": b"123", "size": 3}, "buffer size"),
-        ({"number": 1000}, "is of cycle 1000, which is not there"),
-        ({"number": -(1 << 63)}, "which is not there"),
+        ({"number": 1000}, "is of cycle 1000, which is missing"),
+        ({"number": -(1 << 63)}, "which is missing"),
     ],
 )
 def test_a_change_that_cannot_be_is_a_damage(
     whole: bytes, reference: ControlLog, tmp_path: Path, fields: dict[str, object], told: str
 ) -> None:
-    [good] = change_events([Change("write", {"u.target": np.array([1.0, 2.0])})], 100, 0)
+    [good] = encode_changes([Change("write", {"u.target": np.array([1.0, 2.0])})], 100, 0)
     for name, value in fields.items():
         setattr(good, name, value)
     good.ndim = len(good.shape)
@@ -451,7 +448,7 @@ def test_random_damage_is_reported_or_an_error_of_its_own(whole: bytes, referenc
         read_again += 1
         assert set(log.numbers.tolist()) <= numbers
         missing = numbers - set(log.numbers.tolist())
-        told = {n for gap in log.gaps for n in range(gap.first, (gap.last or gap.first) + 1)}
+        told = {n for gap in log.gaps for n in range(gap.first, gap.last + 1)}
         assert missing <= told or not log.closed
         assert log.damages or not missing
     assert read_again >= 100

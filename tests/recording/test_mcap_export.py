@@ -13,9 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.recording.servo import Servo
-from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.export import export
-from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 
 
@@ -69,7 +68,7 @@ def test_sensors_commands_and_cycles_have_their_topics(log: ControlLog, entries:
         (1000 * log.utimes[i], log.times[i], log.fed["speed"][i].tolist()) for i in new
     ]
     commands = on(entries, "/command/velocity")
-    assert [content["value"] for _, content in commands[:10]] == log.commands["velocity"][10:20].tolist()
+    assert [content["value"] for _, content in commands[:10]] == log.actuation["velocity"][10:20].tolist()
     assert [content["value"] for _, content in on(entries, "/sent/velocity")] == log.sent["velocity"][10:].tolist()
     cycles = [content for _, content in on(entries, "/cycle")]
     assert [content["cycle"] for content in cycles] == list(range(25))

@@ -17,9 +17,8 @@ from tests.control.slow import SlowScenario, chaotic, picky
 from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.recording.control_log import ControlLog
 from vtbdrake.recording.log_format import LogError
-from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.state import AddressError
@@ -42,8 +41,8 @@ def test_replay_is_identical(tmp_path: Path, alone: bool) -> None:
     report = replay(log)
     assert report.outcome == "identical" and report.identical, report
     assert (report.cycles, report.digests) == (60, 60)
-    assert np.array_equal(report.commands["velocity"], servo.commands[1:])
-    assert len(np.unique(report.commands["velocity"], axis=0)) >= 30
+    assert np.array_equal(report.actuation["velocity"], servo.commands[1:])
+    assert len(np.unique(report.actuation["velocity"], axis=0)) >= 30
 
 
 def test_the_testbed_replays_every_switch(tmp_path: Path) -> None:
@@ -55,7 +54,7 @@ def test_the_testbed_replays_every_switch(tmp_path: Path) -> None:
             servo.runtime.run(cycles=10)
     report = replay(tmp_path / "run.lcm", record=["sim.sys.axes.discrete_state_0"])
     assert report.identical, report
-    assert np.isnan(report.commands["velocity"]).any(axis=1).tolist() == [
+    assert np.isnan(report.actuation["velocity"]).any(axis=1).tolist() == [
         *[True] * 20, *[False] * 20, *[True] * 10, *[False] * 10,
     ]  # fmt: skip
     world = report.record["sim.sys.axes.discrete_state_0"]
@@ -135,7 +134,7 @@ def test_replayed_at_once_and_cycle_by_cycle_it_is_the_same_to_the_last_bit(
     assert "cycle by cycle" not in caplog.text
     assert at_once.identical and by_cycle.identical and at_once.digests == by_cycle.digests == 2401
     assert np.array_equal(at_once.times, by_cycle.times)
-    assert np.array_equal(at_once.commands["velocity"], by_cycle.commands["velocity"], equal_nan=True)
+    assert np.array_equal(at_once.actuation["velocity"], by_cycle.actuation["velocity"], equal_nan=True)
 
 
 def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -157,7 +156,7 @@ def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogC
 def test_commands_that_are_not_finite_are_compared_too(tmp_path: Path) -> None:
     servo = Servo()
     log = recorded(tmp_path, servo, lambda: servo.runtime.write({"dps.trouble": 2.0}))
-    assert np.isnan(log.commands["velocity"][30:, 0]).all() and log.commanded["velocity"].all()
+    assert np.isnan(log.actuation["velocity"][30:, 0]).all() and log.commanded["velocity"].all()
     assert replay(log).identical
 
 
@@ -167,7 +166,7 @@ def test_the_dps_alone_replays_the_log_of_its_testbed(tmp_path: Path) -> None:
     log = recorded(tmp_path, servo, lambda: servo.runtime.switch("shadow"))
     report = replay(log, DpsAlone(servo.scenario))
     assert report.identical and report.digests == 60, report
-    assert not np.isnan(report.commands["velocity"]).any(), "in the shadow it commands as well"
+    assert not np.isnan(report.actuation["velocity"]).any(), "in the shadow it commands as well"
 
 
 def test_the_testbed_replays_the_log_of_its_dps_alone(tmp_path: Path) -> None:
@@ -193,7 +192,7 @@ def test_variables_and_ports_are_read_after_every_cycle(tmp_path: Path) -> None:
     servo = Servo()
     report = replay(recorded(tmp_path, servo), record=["dps.ticks", "dps.velocity", "u.target"])
     assert report.record["dps.ticks"].tolist() == list(range(1, 61))
-    assert np.array_equal(report.record["dps.velocity"], report.commands["velocity"])
+    assert np.array_equal(report.record["dps.velocity"], report.actuation["velocity"])
     assert report.record["u.target"].shape == (60, 2)
 
 
@@ -204,7 +203,7 @@ def test_other_values_hold_whatever_the_log_says_and_nothing_is_compared(tmp_pat
     assert report.outcome == "not compared" and not report.identical and report.first_difference is None
     position = log.fed["position"]
     target = np.where(np.arange(60)[:, None] < 30, 0.0, 0.1)
-    assert np.array_equal(report.commands["velocity"], 2.5 * (target - position))
+    assert np.array_equal(report.actuation["velocity"], 2.5 * (target - position))
 
 
 def test_an_unknown_address_is_refused(tmp_path: Path) -> None:
@@ -295,7 +294,7 @@ def test_another_version_of_the_scenario_is_refused_and_told(tmp_path: Path, mon
 def test_a_scenario_that_is_not_to_be_had_any_more_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = recorded(tmp_path, Servo())
     monkeypatch.delattr("tests.control.scripted.ServoScenario")
-    with pytest.raises(LogError, match="is not to be had in this version: .* has no scenario 'ServoScenario'"):
+    with pytest.raises(LogError, match="cannot be loaded in this version: .* has no scenario 'ServoScenario'"):
         replay(log)
 
 
@@ -337,4 +336,4 @@ def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[.
 
     report = replay(log, DpsAlone(scenario))
     assert report.identical and report.digests == 60, report
-    assert len(np.unique(report.commands["velocity"], axis=0)) > 10
+    assert len(np.unique(report.actuation["velocity"], axis=0)) > 10

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from vtbdrake.lcm.maps import LONGEST_CHANNEL_NAME
+from vtbdrake.recording.log_codec import find_events, whole_cycles
 from vtbdrake.recording.log_format import CYCLE, EVENT, SYNC, CycleLayout, LoggedSignal, event
-from vtbdrake.recording.scan import find_events, whole_cycles
 
 SYNC_WORD = SYNC.to_bytes(4, "big")
 LAYOUT = CycleLayout([LoggedSignal("position", 2, "m")], [LoggedSignal("force", 1, "N")])
@@ -160,7 +160,7 @@ def test_a_frame_that_reaches_beyond_the_file_is_a_wrong_checksum(size: int) -> 
 
 @pytest.mark.parametrize(("begin", "end"), [(-1, 3), (2, 1), (3, 11), (2**62, 2**62 + 1)])
 def test_a_place_that_is_not_in_the_file_is_refused(begin: int, end: int) -> None:
-    with pytest.raises(IndexError, match=f"bytes {begin} to {end} are not all in the 10 that there are"):
+    with pytest.raises(IndexError, match=f"bytes {begin} to {end} are outside the file, which has 10"):
         whole_cycles(bytes(10), np.array([[0, 0, begin, end]]), LAYOUT.dtype)
 
 

@@ -11,8 +11,7 @@ from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import Setting, output, set_option, settings
 from vtbdrake.cli.recording import WRITERS
 from vtbdrake.recording.log_reader import read_log
-from vtbdrake.recording.replay import replay
-from vtbdrake.recording.replay_report import DIFFERENT
+from vtbdrake.recording.replay import DIFFERENT, replay
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.testbed.scenario import class_name, scenario_class
 

@@ -1,80 +1,227 @@
-"""Logs as tables: CSV and Parquet, one row per cycle."""
+"""Export of logs to CSV, Parquet and MCAP."""
 
 from __future__ import annotations
 
 import csv
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vtbdrake.recording.control_log import ControlLog
-from vtbdrake.recording.mcap_export import export_mcap
+from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.recording.log_reader import ControlLog
 from vtbdrake.state.files import whole_file
 
 
-def columns(log: ControlLog) -> dict[str, np.ndarray]:
-    """The table of a log, n rows: ``cycle``, ``time`` (of the DPS, s), ``now`` (on the loop's clock, s), ``utime`` (us
-    since 1970), ``ok``, and the entries of all vector signals.
+def export(log: ControlLog, path: str | os.PathLike[str]) -> None:
+    """Write a log in the format that the file's suffix names: .csv, .mcap or .parquet.
 
-    ``sense.<signal>`` is the newest value, ``command.<signal>`` what the DPS commanded and ``sent.<signal>`` what was
-    sent after the guards; a signal of several entries has a column ``sense.<signal>[i]`` for each. NaN where there is
-    none.
+    CSV and Parquet get the table of `columns`. MCAP gets JSON messages with their schemas, for Foxglove, under the
+    topics ``/sense/<signal>``, ``/command/<signal>`` (actuator commands of the DPS) and ``/sent/<signal>`` (after the
+    guards), wherever they have a new value; ``/cycle``; and, when they happen, ``/switches``, ``/variable/<address>``
+    (variables that were changed, the commands u among them), ``/result/<slow part>``, ``/faults`` and ``/reset`` (of
+    the guards). Their times are the log's times of day; values that are not finite are null. Abstract signals are left
+    out.
+
+    Args:
+        log: The log.
+        path: Path of the file. It is written as a whole or not at all.
+
+    Raises:
+        ValueError: The suffix is none of them.
+        ModuleNotFoundError: The library for the format is not installed.
+    """
+    suffix = Path(path).suffix
+    if suffix not in EXPORTS:
+        raise ValueError(f"a log is exported to a file that ends in {', '.join(EXPORTS)}, unlike {os.fspath(path)!r}")
+    with whole_file(path) as partial:
+        EXPORTS[suffix](log, partial)
+
+
+def columns(log: ControlLog) -> dict[str, np.ndarray]:
+    """Return a log as a table of n rows, one per cycle.
+
+    The columns are ``cycle``, ``time`` (of the DPS, s), ``now`` (on the loop's clock, s), ``utime`` (us since 1970),
+    ``ok``, and the entries of all vector signals: ``sense.<signal>`` is the newest value, ``command.<signal>`` the
+    actuator command of the DPS and ``sent.<signal>`` the one sent after the guards. A signal of several entries has a
+    column ``sense.<signal>[i]`` for each. Missing values are NaN.
     """
     table = {"cycle": log.numbers, "time": log.times, "now": log.now, "utime": log.utimes, "ok": log.ok}
-    for kind, signals in (("sense", log.fed), ("command", log.commands), ("sent", log.sent)):
-        table |= {name: column for signal, values in signals.items() for name, column in _entries(kind, signal, values)}
+    for kind, signals in (("sense", log.fed), ("command", log.actuation), ("sent", log.sent)):
+        for signal, values in signals.items():
+            size = values.shape[1]
+            for i in range(size):
+                table[f"{kind}.{signal}[{i}]" if size > 1 else f"{kind}.{signal}"] = values[:, i]
     return table
 
 
-def _entries(kind: str, signal: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    size = values.shape[1]
-    for i in range(size):
-        yield f"{kind}.{signal}[{i}]" if size > 1 else f"{kind}.{signal}", values[:, i]
-
-
-def export_csv(log: ControlLog, path: str | os.PathLike[str]) -> None:
-    """Writes `columns` with their names in the first row; every number reads back to the last bit."""
+def _write_csv(log: ControlLog, path: Path) -> None:
+    """Write a CSV file whose numbers read back to the last bit."""
     table = columns(log)
-    with whole_file(path) as partial, partial.open("w", newline="") as file:
+    with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table)
         writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
 
 
-def export_parquet(log: ControlLog, path: str | os.PathLike[str]) -> None:
-    """Writes `columns` as a Parquet file.
-
-    Raises:
-        ModuleNotFoundError: pyarrow is not installed.
-    """
+def _write_parquet(log: ControlLog, path: Path) -> None:
     try:
         import pyarrow
         from pyarrow import parquet
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("Parquet needs pyarrow: pip install 'vtbdrake[recording]'") from error
-    with whole_file(path) as partial:
-        parquet.write_table(pyarrow.table(columns(log)), partial)
+    parquet.write_table(pyarrow.table(columns(log)), path)
 
 
-EXPORTS: Mapping[str, Callable[[ControlLog, Any], None]] = {
-    ".csv": export_csv,
-    ".mcap": export_mcap,
-    ".parquet": export_parquet,
+# -- MCAP
+
+_NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}  # JSON has no NaN.
+_TIME = {"type": "number", "description": "of the DPS, in seconds"}
+_INFO, _ERROR = 2, 4  # levels of foxglove.Log
+
+_SCHEMAS: Mapping[str, Mapping[str, Any]] = {
+    "vtbdrake.Value": {"time": _TIME, "value": _NUMBERS},
+    "vtbdrake.Cycle": {
+        "time": _TIME,
+        "cycle": {"type": "integer"},
+        "now": {"type": "number", "description": "on the loop's clock, in seconds"},
+        "since_last": {"type": ["number", "null"], "description": "cycle, in seconds"},
+        "ok": {"type": "boolean", "description": "the DPS's commands were sent, not the fallbacks'"},
+    },
+    "vtbdrake.Switches": {"time": _TIME, "positions": {"type": "object", "additionalProperties": {"type": "string"}}},
+    "vtbdrake.Result": {"time": _TIME, "tick": {"type": "integer"}, "missing": {"type": "boolean"}},
+    "vtbdrake.Reset": {"time": _TIME},
+    # As Foxglove's log panel expects it.
+    "foxglove.Log": {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "level": {"type": "integer"},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+        "file": {"type": "string"},
+        "line": {"type": "integer"},
+    },
 }
-"""By the suffix of the file."""
+
+_Entry = tuple[int, str, str, Mapping[str, Any]]  # time in nanoseconds, topic, schema, message
 
 
-def export(log: ControlLog, path: str | os.PathLike[str]) -> None:
-    """Writes a log in the format that the file's suffix names: .csv, .mcap or .parquet.
+def _write_mcap(log: ControlLog, path: Path) -> None:
+    try:
+        from mcap.writer import Writer
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("MCAP needs mcap: pip install 'vtbdrake[recording]'") from error
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="vtbdrake")
 
-    Raises:
-        ValueError: the suffix is none of them.
-        ModuleNotFoundError: the library for it is not installed.
-    """
-    suffix = Path(path).suffix
-    if suffix not in EXPORTS:
-        raise ValueError(f"a log is exported to a file that ends in {', '.join(EXPORTS)}, unlike {os.fspath(path)!r}")
-    EXPORTS[suffix](log, path)
+        @cache
+        def schema(name: str) -> int:
+            content = {"title": name, "type": "object", "properties": _SCHEMAS[name]}
+            return int(writer.register_schema(name, "jsonschema", json.dumps(content).encode()))
+
+        @cache
+        def channel(topic: str, name: str) -> int:
+            return int(writer.register_channel(topic, "json", schema(name)))
+
+        for sequence, (time, topic, name, message) in enumerate(_entries(log)):
+            data = json.dumps(message, allow_nan=False).encode()
+            writer.add_message(channel(topic, name), time, data, time, sequence)
+        writer.finish()
+
+
+def _entries(log: ControlLog) -> Iterator[_Entry]:
+    """Yield all messages in the order of time."""
+    times_ns = [1000 * utime for utime in log.utimes.tolist()]
+    occasional: dict[int, list[_Entry]] = {}
+    for i, topic, schema, message in [*_initial(log), *_changes(log), *_faults(log, times_ns)]:
+        occasional.setdefault(i, []).append((times_ns[i], topic, schema, message))
+    series = [(topic, _json_rows(values), present.tolist()) for topic, values, present in _series(log)]
+    times = log.times.tolist()
+    since_last = [None, *np.diff(log.now).tolist()]
+    rows = zip(times, log.numbers.tolist(), log.now.tolist(), since_last, log.ok.tolist(), strict=False)
+    for i, (ns, row) in enumerate(zip(times_ns, rows, strict=True)):
+        yield from occasional.get(i, ())
+        yield ns, "/cycle", "vtbdrake.Cycle", dict(zip(_SCHEMAS["vtbdrake.Cycle"], row, strict=True))
+        for topic, values, present in series:
+            if present[i]:
+                yield ns, topic, "vtbdrake.Value", {"time": times[i], "value": values[i]}
+
+
+def _series(log: ControlLog) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    for name, values in log.fed.items():
+        yield f"/sense/{name}", values, log.sources[name] != 0
+    for name, values in log.actuation.items():
+        yield f"/command/{name}", values, log.commanded[name]
+    for name, values in log.sent.items():
+        yield f"/sent/{name}", values, ~np.isnan(values).all(axis=1)
+
+
+def _json_rows(values: np.ndarray) -> list[list[float | None]]:
+    rows: list[list[float | None]] = values.tolist()
+    for i in np.flatnonzero(~np.isfinite(values).all(axis=1)):
+        rows[i] = [entry if np.isfinite(entry) else None for entry in values[i].tolist()]
+    return rows
+
+
+def _initial(log: ControlLog) -> Iterator[tuple[int, str, str, Mapping[str, Any]]]:
+    """Yield the initial values of switches and of variables that change later."""
+    if not len(log):
+        return
+    time = log.start.time
+    if log.header.positions:
+        positions = {f"{side}.{name}": at for side, by in log.header.positions.items() for name, at in by.items()}
+        yield 0, "/switches", "vtbdrake.Switches", {"time": time, "positions": positions}
+    changed = {address for _, change in log.changes if change.kind == WRITE for address in change.values}
+    for address in sorted(changed & log.start.values.keys()):
+        value = _json_rows(np.reshape(log.start[address], (1, -1)))[0]
+        yield 0, f"/variable/{address}", "vtbdrake.Value", {"time": time, "value": value}
+
+
+def _changes(log: ControlLog) -> Iterator[tuple[int, str, str, Mapping[str, Any]]]:
+    for i, change in log.changes:
+        for topic, schema, message in _change_messages(change):
+            yield i, topic, schema, {"time": float(log.times[i]), **message}
+
+
+def _change_messages(change: Change) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    if change.kind == SWITCH:
+        yield "/switches", "vtbdrake.Switches", {"positions": dict(change.values)}
+    elif change.kind == WRITE:
+        for address, value in change.values.items():
+            row = _json_rows(np.reshape(np.asarray(value, dtype=float), (1, -1)))[0]
+            yield f"/variable/{address}", "vtbdrake.Value", {"value": row}
+    elif change.kind == RESET:
+        yield "/reset", "vtbdrake.Reset", {}
+    elif change.kind == RESULT:
+        for path, result in change.values.items():
+            message = {"tick": int(result["tick"]), "missing": len(result) == 1}
+            yield f"/result/{path}", "vtbdrake.Result", message
+
+
+def _faults(log: ControlLog, times_ns: list[int]) -> Iterator[tuple[int, str, str, Mapping[str, Any]]]:
+    for i, reasons in log.faults:
+        seconds, nanoseconds = divmod(times_ns[i], 10**9)
+        yield i, "/faults", "foxglove.Log", {
+            "timestamp": {"sec": seconds, "nsec": nanoseconds},
+            "level": _ERROR if reasons else _INFO,
+            "message": "; ".join(reasons) or "no fault any more",
+            "name": "guards",
+            "file": "",
+            "line": 0,
+        }  # fmt: skip
+
+
+EXPORTS: Mapping[str, Callable[[ControlLog, Path], None]] = {
+    ".csv": _write_csv,
+    ".mcap": _write_mcap,
+    ".parquet": _write_parquet,
+}
+"""Writers by the suffix of the file."""

@@ -1,75 +1,84 @@
-"""The bytes of a log: LCM's events, and the layout of the cycles in it."""
+"""The format of a log: LCM events, the header, the layout of a cycle, and changes between cycles."""
 
 from __future__ import annotations
 
+import json
+import platform
+import re
 import struct
-from collections.abc import Sequence
-from itertools import accumulate
-from typing import NamedTuple
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from itertools import accumulate, groupby
+from math import inf
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from vtbdrake.control.cycle import Change
+from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
+from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake.testbed.scenario import is_imported
 
 VERSION = 3
 LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END = (
     f"VTB_{name}" for name in ("LOG", "STATE", "CYCLE", "CHANGE", "FAULT", "DIGEST", "END")
 )
-OWN = "VTB_"
-"""With what the names of a log's own channels begin."""
+OWN_PREFIX = "VTB_"
+"""Prefix of the channels that the recorder itself writes."""
 
 SYNC = 0xEDA1DA01
 EVENT = struct.Struct(">IqqII")
-"""Sync word, number of the event, time in microseconds, length of the channel's name, length of the data."""
+"""Head of an event: sync word, event number, time in microseconds, length of the channel name, length of the data."""
 
 MAX_CHANNELS = 10_000
-"""Of a log; in memory each costs much more than its smallest event in the file."""
+"""Limit on the channels of a log: in memory, a channel costs much more than its smallest event in the file."""
 MAX_DAMAGES = 1000
-"""So many places where a file is damaged are told one by one."""
+"""Number of damaged places that are reported individually."""
 MAX_SIZE = 1 << 20
-"""Of all signals of one side together, in numbers."""
+"""Limit on the entries of all signals of one side together."""
 
 DIGEST_SIZE = 16
 VECTOR = -1
-"""`lcmt_vtb_cycle.source` of a vector signal."""
+"""Value of `lcmt_vtb_cycle.source` for a new value of a vector signal."""
 COMMANDED, SENT = 1, 2
 """Bits of `lcmt_vtb_cycle.act`."""
 
+TESTBED, DPS = "testbed", "dps"
+_MAX_COUNT = 1 << 52
+
 
 class LogError(ValueError):
-    """A file that is no log of a control loop, or a log that does not fit what it is used for."""
+    """A file that is not a log of a control loop, or a log that does not fit what it is used for."""
 
 
 def event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
-    """One event of an LCM log; ``utime`` in microseconds."""
+    """Return one event of an LCM log; ``utime`` is in microseconds since 1970."""
     return EVENT.pack(SYNC, number, utime, len(channel), len(data)) + channel + data
 
 
 class LoggedSignal(NamedTuple):
-    """What a log tells of a signal: its name, its size (None if it is abstract) and its unit."""
+    """A signal as a log describes it: name, size (None if it is abstract) and unit."""
 
     name: str
     size: int | None
     unit: str
 
 
-def parts(signals: Sequence[LoggedSignal]) -> dict[str, slice]:
-    """Which entries belong to which signal, where those of all vector signals lie one after the other."""
-    vectors = [(signal.name, signal.size) for signal in signals if signal.size is not None]
-    ends = accumulate(size for _, size in vectors)
-    return {name: slice(end - size, end) for (name, size), end in zip(vectors, ends, strict=True)}
-
-
 class CycleLayout:
-    """Where everything lies in the data of a ``VTB_CYCLE`` event; the same for all cycles of one interface.
+    """The layout of the data of a ``VTB_CYCLE`` event, which is the same for all cycles of a log.
 
     Attributes:
-        dtype: of the data as one NumPy record, with the fields of `lcmt_vtb_cycle` and ``fingerprint``.
-        fed, commands: which entries of ``fed``, and of ``commands`` and ``sent``, belong to which vector signal.
+        dtype: NumPy type of the data, with the fields of `lcmt_vtb_cycle` and its ``fingerprint``.
+        fed: slice of each vector sensor signal in the field ``fed``.
+        actuation: slice of each vector actuator signal in the fields ``commands`` and ``sent``.
     """
 
     def __init__(self, sense: Sequence[LoggedSignal], act: Sequence[LoggedSignal]) -> None:
-        self.fed, self.commands = parts(sense), parts(act)
+        self.fed, self.actuation = _slices(sense), _slices(act)
         self._fixed = {
             "fingerprint": lcmt_vtb_cycle().get_hash(),
             "num_sense": len(sense),
@@ -100,7 +109,7 @@ class CycleLayout:
         )
 
     def blank(self) -> np.ndarray:
-        """A record, of shape (1,), of a cycle in which nothing happened."""
+        """Return a record, of shape (1,), of a cycle in which nothing happened."""
         record = np.zeros(1, self.dtype)
         for name in ("fed", "commands", "sent"):
             record[name] = np.nan
@@ -108,9 +117,236 @@ class CycleLayout:
             record[name] = value
         return record
 
-    def fits(self, records: np.ndarray) -> np.ndarray:
-        """Which of some records, of shape (n,), have this layout: booleans of shape (n,)."""
-        good = np.ones(len(records), bool)
-        for name, value in self._fixed.items():
-            good &= records[name] == value
-        return good
+    def fits(self, records: np.ndarray) -> bool:
+        """Return whether all records, of shape (n,), have this layout."""
+        return all((records[name] == value).all() for name, value in self._fixed.items())
+
+
+def _slices(signals: Sequence[LoggedSignal]) -> dict[str, slice]:
+    vectors = [(signal.name, signal.size) for signal in signals if signal.size is not None]
+    ends = accumulate(size for _, size in vectors)
+    return {name: slice(end - size, end) for (name, size), end in zip(vectors, ends, strict=True)}
+
+
+# -- header
+
+_FIELDS: dict[str, tuple[type, ...]] = {
+    "scenario": (str,),
+    "record": (dict,),
+    "target": (str,),
+    "period": (int, float),
+    "start_time": (int, float),
+    "steps": (int,),
+    "first_cycle": (int,),
+    "initialized": (bool,),
+    "idle": (bool,),
+    "pace": (str, type(None)),
+    "positions": (dict,),
+    "versions": (dict,),
+}
+"""Allowed JSON types of a header's fields."""
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of vtbdrake, drake and Python that run here."""
+    try:
+        own = metadata.version("vtbdrake")
+    except metadata.PackageNotFoundError:
+        own = "not installed"
+    return {"vtbdrake": own, "drake": metadata.version("drake"), "python": platform.python_version()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogHeader:
+    """The first event of a log: what was recorded, and how it can be built again.
+
+    Attributes:
+        version: version of the format.
+        scenario: text of the scenario as `Scenario.save` writes it; empty if it was built by hand or is not plain data.
+        record: what identifies the scenario, see `Scenario.record`.
+        target: ``testbed``, or ``dps`` if the DPS was stepped alone.
+        sense, act, commands: the signals.
+        period: period of the loop in seconds.
+        start_time: time of the DPS in seconds from which its steps count.
+        steps: number of steps before the first recorded cycle.
+        first_cycle: number of the first recorded cycle.
+        initialized, idle: see `Runtime`.
+        pace: the sensor signal that began the cycles; None for the clock.
+        positions: positions of a testbed's switches before the first recorded cycle.
+        versions: versions of vtbdrake, drake and Python.
+    """
+
+    version: int = VERSION
+    scenario: str
+    record: Mapping[str, Any]
+    target: str
+    sense: Sequence[LoggedSignal]
+    act: Sequence[LoggedSignal]
+    commands: Sequence[LoggedSignal]
+    period: float
+    start_time: float
+    steps: int
+    first_cycle: int
+    initialized: bool
+    idle: bool
+    pace: str | None
+    positions: Mapping[str, Mapping[str, str]]
+    versions: Mapping[str, str] = field(default_factory=installed_versions)
+
+    def to_json(self) -> str:
+        """Return the header as JSON."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> LogHeader:
+        """Return the header that `to_json` has written.
+
+        Raises:
+            LogError: The text is not a header, or is one of another version.
+        """
+        try:
+            values = json.loads(text)
+            if values["version"] != VERSION:
+                raise LogError(f"the log has the format {values['version']}, this version of vtbdrake reads {VERSION}")
+            for side in ("sense", "act", "commands"):
+                values[side] = tuple(LoggedSignal(*signal) for signal in values[side])
+            header = cls(**values)
+            header._check_fields()
+            return header
+        except LogError:
+            raise
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            raise LogError(f"the log's header cannot be read: {error!r}") from error
+
+    def _check_fields(self) -> None:
+        for name, kinds in _FIELDS.items():
+            if type(value := getattr(self, name)) not in kinds:
+                raise ValueError(f"{name} cannot be {str(value)[:50]!r}")
+        if self.target not in (TESTBED, DPS) or not 0.0 < self.period < inf or not abs(self.start_time) < inf:
+            raise ValueError(f"target {self.target!r}, period {self.period}, start_time {self.start_time}")
+        if not 0 <= self.steps < _MAX_COUNT or not 0 <= self.first_cycle < _MAX_COUNT:
+            raise ValueError(f"steps {self.steps}, first_cycle {self.first_cycle}")
+        for signals in (self.sense, self.act, self.commands):
+            for name, size, unit in signals:
+                if not isinstance(name, str) or not isinstance(unit, str) or not (size is None or type(size) is int):
+                    raise ValueError(f"a signal cannot be {str((name, size, unit))[:50]}")
+            sizes = [size for _, size, _ in signals if size is not None]
+            if min(sizes, default=0) < 0 or sum(sizes) > MAX_SIZE or len(signals) > MAX_SIZE:
+                raise ValueError(f"the signals of one side together have more than {MAX_SIZE} entries, or less than 0")
+        if not all(isinstance(side, dict) for side in self.positions.values()):
+            raise ValueError(f"positions cannot be {str(self.positions)[:50]!r}")
+
+    @property
+    def scenario_name(self) -> str:
+        """Return ``package.module:Class`` of the scenario; empty if the log does not say how to build one."""
+        return str(self.record.get("scenario", "")) if self.scenario else ""
+
+    def make_scenario(self) -> Scenario:
+        """Return the scenario that was recorded. Its module must be imported already.
+
+        Raises:
+            LogError: The module is not imported, or the scenario cannot be loaded or has changed since.
+        """
+        if not self.scenario:
+            raise LogError("the log does not say how to build its scenario: pass the target to replay it with")
+        name = self.scenario_name
+        if not is_imported(name):
+            raise LogError(
+                f"the log is of the scenario {name}, and importing its module runs its code: if you trust it, import "
+                f"it first, or name it on the command line (vtbdrake replay FILE --scenario {name})"
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "scenario.yaml"
+            path.write_text(self.scenario)
+            try:
+                scenario = load_scenario(f"{name}@{path}")
+            except ScenarioError as error:
+                raise LogError(f"the scenario of the log, {name}, cannot be loaded in this version: {error}") from error
+        self.check(scenario)
+        return scenario
+
+    def check(self, scenario: Scenario | None) -> None:
+        """Check that this scenario was recorded.
+
+        Raises:
+            LogError: Another one was recorded, or another version of it; the error lists the differences.
+        """
+        mine = scenario_record(scenario)
+        keys = ["scenario"] if mine.get("scenario") != self.record.get("scenario") else sorted({*mine, *self.record})
+        missing = object()
+        differing = [
+            f"{key}: {self.record.get(key, 'nothing')!r} in the log, {mine.get(key, 'nothing')!r} here"
+            for key in keys
+            if mine.get(key, missing) != self.record.get(key, missing)
+        ]
+        if differing:
+            raise LogError(f"the log is of another scenario, or of another version of it ({'; '.join(differing)})")
+
+
+def target_kind(target: VirtualTestbed | DpsAlone) -> str:
+    """Return `LogHeader.target` for a target."""
+    return DPS if isinstance(target, DpsAlone) else TESTBED
+
+
+def scenario_record(scenario: Scenario | None) -> Any:
+    """Return `Scenario.record` as it is after a JSON round trip."""
+    record = scenario.record() if scenario is not None else {}
+    return json.loads(json.dumps(record, default=lambda value: getattr(value, "__qualname__", None) or repr(value)))
+
+
+# -- changes between two cycles
+
+
+def encode_changes(changes: Iterable[Change], number: int, utime: int) -> Iterator[lcmt_vtb_change]:
+    """Yield the messages of the changes before the step of cycle ``number``."""
+    for index, (kind, values) in enumerate(changes):
+        for address, name, value in _entries(values):
+            array = np.ascontiguousarray(value)
+            message = lcmt_vtb_change()
+            message.utime, message.number, message.change = utime, number, index
+            message.kind, message.address, message.name = kind, address, name
+            message.dtype, message.shape = array.dtype.str, np.shape(value)
+            message.ndim = len(message.shape)
+            message.data = array.tobytes()
+            message.size = len(message.data)
+            yield message
+
+
+def _entries(values: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    if not values:
+        yield "", "", 0
+    for address, value in values.items():
+        if isinstance(value, Mapping):
+            yield from ((address, name, part) for name, part in value.items())
+        else:
+            yield address, "", value
+
+
+def decode_changes(messages: Iterable[lcmt_vtb_change]) -> list[tuple[int, Change]]:
+    """Return the changes of messages that `change_value` accepts, in order, each with the number of its cycle."""
+    found = []
+    for (number, _), group in groupby(messages, key=lambda message: (message.number, message.change)):
+        values: dict[str, Any] = {}
+        kind = ""
+        for message in group:
+            kind = message.kind
+            if message.name:
+                parts = values.setdefault(message.address, {})
+                if isinstance(parts, dict):
+                    parts[message.name] = change_value(message)
+            elif message.address:
+                values[message.address] = change_value(message)
+        found.append((number, Change(kind, values)))
+    return found
+
+
+def change_value(message: lcmt_vtb_change) -> Any:
+    """Return the number, the text, or the array of those, that a message carries.
+
+    Raises:
+        ValueError: The message carries something else.
+    """
+    if not re.fullmatch(r"[<>|][biufU][0-9]{1,5}", message.dtype) or any(size < 0 for size in message.shape):
+        raise ValueError(f"an array of type {message.dtype[:20]!r} and shape {message.shape[:9]}")
+    array = np.frombuffer(message.data, np.dtype(message.dtype)).reshape(message.shape)
+    return array if message.shape else array.item()

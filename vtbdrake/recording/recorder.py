@@ -1,57 +1,80 @@
-"""The recorder of a control loop: it writes down all that determined the DPS, and all that crossed the boundary."""
+"""The recorder of a control loop."""
 
 from __future__ import annotations
 
 import logging
 import os
+import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
+
+from pydrake.systems.framework import Context
 
 from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.worker_process import WorkerProcess
-from vtbdrake.recording.changes import change_events
-from vtbdrake.recording.cycle_writer import CycleWriter
-from vtbdrake.recording.digest import StateDigest
+from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
-from vtbdrake.recording.log_format import CHANGE, DIGEST, END, FAULT, LOG, STATE, CycleLayout, LogError, event
-from vtbdrake.recording.log_header import LogHeader
+from vtbdrake.recording.log_codec import CycleWriter
+from vtbdrake.recording.log_format import (
+    CHANGE,
+    DIGEST,
+    DIGEST_SIZE,
+    END,
+    FAULT,
+    LOG,
+    STATE,
+    CycleLayout,
+    LogError,
+    LoggedSignal,
+    LogHeader,
+    encode_changes,
+    event,
+    scenario_record,
+    target_kind,
+)
 from vtbdrake.recording.log_reader import read_log
-from vtbdrake.recording.log_writer import Loss, write_log
-from vtbdrake.recording.start import check_recordable
 from vtbdrake.state import snapshot as snapshots
+from vtbdrake.state.abstract_state import abstract_state
+from vtbdrake.state.snapshot import numeric_groups
+from vtbdrake.state.systems import leaves, read_group
+from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
+from vtbdrake.testbed.addressed import AddressedDiagram
 
 _log = logging.getLogger(__name__)
+
+_MAX_HASHED = 1 << 14  # bytes of an array in a digest
+_POLL_PERIOD = 0.02  # s; the socket buffers more than arrives meanwhile
 
 
 class Recorder:
     """Records a loop to a file from now on, until it is closed; a context manager.
 
-    The loop only makes the bytes; another process writes them. When that process dies, or the disk is full, the loop
-    goes on: what is not in the file is counted (`lost`), logged, and missing in the log in whole cycles.
+    The loop only forms the bytes; a worker process writes them. If that process dies, or the disk is full, the loop
+    goes on: cycles that are not in the file are counted (`lost`), logged, and missing in the log as a whole.
 
-    To begin takes some milliseconds: it is done before `Runtime.run`, or in the loop's thread between two cycles.
+    Starting takes some milliseconds: do it before `Runtime.run`, or in the loop's thread between two cycles.
 
     Args:
-        runtime: the loop. What a snapshot cannot hold of it is refused, see Raises.
-        path: of the file; by custom, its name ends in ``.lcm``.
-        overwrite: whether the file may exist.
-        digest_period: how often, in seconds of the loop's cycles, a digest of the DPS's state is recorded.
-        backlog: bytes that may wait for the other process; what is beyond them is lost.
+        runtime: The loop. A loop whose state a snapshot cannot hold is rejected, see Raises.
+        path: Path of the file; by custom, it ends in ``.lcm``.
+        overwrite: Whether to replace an existing file.
+        digest_period: Period in seconds of the loop's cycles in which a digest of the DPS's state is recorded.
+        backlog: Bytes that may wait for the worker process; cycles beyond that are lost.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
 
     Raises:
-        OSError: the file cannot be written, or exists.
-        ValueError: a replay could not repeat the loop exactly; it says why.
+        OSError: The file cannot be written, or exists.
+        ValueError: A replay could not repeat the loop exactly; the error says why.
     """
 
     def __init__(
@@ -63,16 +86,16 @@ class Recorder:
         digest_period: float = 1.0,
         backlog: int = 1 << 26,
     ) -> None:
-        check_recordable(runtime)
+        _check_recordable(runtime)
         if not digest_period >= runtime.period:
-            raise ValueError(f"a digest is recorded once in {runtime.period} s or more, not in {digest_period} s")
+            raise ValueError(f"digest_period must be at least the period, {runtime.period} s, not {digest_period} s")
         self.path = Path(path)
         self._runtime = runtime
         self._clock = runtime.clock
         self._epoch = time.time() - self._clock.now()
         self._digest = StateDigest(runtime.target, runtime.context)
         self._digest_every = round(digest_period / runtime.period)
-        header = LogHeader.of(runtime)
+        header = _header(runtime)
         self._cycle = CycleWriter(CycleLayout(header.sense, header.act), runtime)
         self._events: list[bytes] = []
         self._count = 0
@@ -81,11 +104,11 @@ class Recorder:
         self._missing: int | None = None
         self._recorded = 0
         self._last = runtime.cycles - 1
-        self._told = False
+        self._warned = False
         self._closed = False
-        begin = [self._header_event(header), self._state_event()]
+        first_events = [self._header_event(header), self._state_event()]
         if overwrite and self.path.is_file():
-            # A new file: who has read the old one still has it open, and must not lose it under his hands.
+            # A new file: whoever has mapped the old one keeps it.
             self.path.unlink()
         try:
             self.path.open("wb" if overwrite else "xb").close()
@@ -94,19 +117,19 @@ class Recorder:
         self._worker = WorkerProcess(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
-        self._worker.post(*begin)
+        self._worker.post(*first_events)
         self._next_tap: Callable[[str, bytes], None] | None = runtime.bridge.tap
         runtime.bridge.tap = self._tap
         runtime.watch(self)
 
     @property
     def lost(self) -> int:
-        """How many cycles (with their messages) are not in the file; exact once the recorder is closed."""
+        """Return the number of cycles that are not in the file; it is exact once the recorder is closed."""
         return self._worker.dropped + self._unwritten if self._missing is None else self._missing
 
     @property
     def pid(self) -> int:
-        """Of the process that writes."""
+        """Return the process id of the worker process."""
         return self._worker.pid
 
     def __enter__(self) -> Self:
@@ -120,29 +143,32 @@ class Recorder:
     def _utime(self) -> int:
         return int(1e6 * (self._epoch + self._clock.now()))
 
-    def _add(self, channel: str, data: bytes, utime: int) -> None:
-        self._events.append(event(self._count, utime, channel.encode(), data))
+    def _event(self, channel: str, data: bytes, utime: int) -> bytes:
         self._count += 1
+        return event(self._count - 1, utime, channel.encode(), data)
+
+    def _add(self, channel: str, data: bytes, utime: int) -> None:
+        self._events.append(self._event(channel, data, utime))
 
     def _tap(self, channel: str, data: bytes) -> None:
         if self._next_tap is not None:
             self._next_tap(channel, data)
-        if self._closed:  # before another recorder that began later, and still calls it
+        if self._closed:  # Another recorder that began later may still call this tap.
             return
-        self._cycle.hear(channel, self._count)
+        self._cycle.note_message(channel, self._count)
         self._add(channel, data, self._utime())
 
     def __call__(self, cycle: Cycle) -> None:
-        """Records a cycle; the runtime calls it."""
+        """Record a cycle, as a watcher of the runtime."""
         utime = self._utime()
         if cycle.changes:
-            for message in change_events(cycle.changes, cycle.number, utime):
+            for message in encode_changes(cycle.changes, cycle.number, utime):
                 self._add(CHANGE, message.encode(), utime)
         faults = cycle.verdict.faults
         if faults or self._faults:
-            self._note(cycle, utime)
+            self._add_faults(cycle, utime)
         if (cycle.number + 1) % self._digest_every == 0:
-            self._add(DIGEST, self._digest_message(cycle.number, utime), utime)
+            self._add_digest(cycle.number, utime)
             self._take_losses()
         self._events.append(self._cycle.event(cycle, self._count, utime, sum(map(len, self._events))))
         self._count += 1
@@ -151,10 +177,10 @@ class Recorder:
         self._recorded += 1
         self._last = cycle.number
         if not self._worker.post(frame, zlib.crc32(frame).to_bytes(4, "big")):
-            self._tell("its process does not take them")
+            self._warn("its process does not take them")
 
-    def _note(self, cycle: Cycle, utime: int) -> None:
-        """Faults are recorded when they begin and end."""
+    def _add_faults(self, cycle: Cycle, utime: int) -> None:
+        """Record the faults if they are others than before."""
         faults = {(fault.signal, fault.kind) for fault in cycle.verdict.faults}
         if faults == self._faults:
             return
@@ -165,20 +191,20 @@ class Recorder:
         message.count = len(message.reasons)
         self._add(FAULT, message.encode(), utime)
 
-    def _digest_message(self, number: int, utime: int) -> bytes:
+    def _add_digest(self, number: int, utime: int) -> None:
         message = lcmt_vtb_digest()
         message.utime, message.number, message.digest = utime, number, self._digest()
-        return bytes(message.encode())
+        self._add(DIGEST, message.encode(), utime)
 
     def _take_losses(self) -> None:
         for data in self._worker.take():
-            loss = Loss.from_bytes(data)
-            self._unwritten = loss.frames
-            self._tell(loss.reason)
+            lost, _, reason = data.decode().partition(" ")
+            self._unwritten = int(lost)
+            self._warn(reason)
 
-    def _tell(self, reason: str) -> None:
-        if not self._told:
-            self._told = True
+    def _warn(self, reason: str) -> None:
+        if not self._warned:
+            self._warned = True
             _log.error("cycles of the loop are not recorded in %s: %s", self.path, reason)
 
     # -- begin and end
@@ -188,55 +214,190 @@ class Recorder:
         message.utime = self._utime()
         message.header = header.to_json()
         message.crc = _signed_crc(message.header.encode())
-        return self._single(LOG, message)
+        return self._event(LOG, message.encode(), message.utime)
 
     def _state_event(self) -> bytes:
-        runtime = self._runtime
-        target = runtime.target
+        target = self._runtime.target
         message = lcmt_vtb_state()
         message.utime = self._utime()
-        message.snapshot = snapshots.take(target.diagram, runtime.context, target.variables()).to_bytes()
+        message.snapshot = snapshots.take(target.diagram, self._runtime.context, target.variables()).to_bytes()
         message.size = len(message.snapshot)
         message.crc = _signed_crc(message.snapshot)
-        return self._single(STATE, message)
-
-    def _single(self, channel: str, message: Any) -> bytes:
-        self._add(channel, message.encode(), message.utime)
-        return self._events.pop()
+        return self._event(STATE, message.encode(), message.utime)
 
     def close(self) -> None:
-        """Ends the recording, in the loop's thread or after the loop: what is under way is written, what is lost is
-        counted."""
+        """End the recording: write what is pending and count what is lost.
+
+        Call it in the loop's thread, or after the loop.
+        """
         if self._closed:
             return
         self._closed = True
         self._runtime.unwatch(self)
         if self._runtime.bridge.tap == self._tap:
             self._runtime.bridge.tap = self._next_tap
-        # So that there is room for the last frame.
+        # Makes room for the last frame.
         self._worker.drain()
         self._take_losses()
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
         message.crc = _signed_crc(message.encode()[:-4])
-        self._events.append(self._single(END, message))
-        self._worker.post(*self._events)
+        self._worker.post(*self._events, self._event(END, message.encode(), message.utime))
         self._events.clear()
         code = self._worker.close()
         self._take_losses()
         if code or self.lost:
-            # What was on its way to a process that died is lost as well: the file tells what has arrived.
-            self._missing = self._recorded - self._arrived()
+            # Bytes on their way to a process that died are lost as well: count what has arrived in the file.
+            self._missing = self._recorded - self._num_arrived()
         if self.lost:
             _log.error("%d of %d cycles are not in %s", self.lost, self._recorded, self.path)
 
-    def _arrived(self) -> int:
+    def _num_arrived(self) -> int:
         try:
-            return len(read_log(self.path).numbers)
+            return len(read_log(self.path))
         except (LogError, OSError):
             return 0
 
 
 def _signed_crc(data: bytes) -> int:
     crc = zlib.crc32(data)
-    return crc - (1 << 32) if crc >> 31 else crc  # LCM's integers have a sign
+    return crc - (1 << 32) if crc >> 31 else crc  # Integers of LCM are signed.
+
+
+def _check_recordable(runtime: Runtime) -> None:
+    """Raise a ValueError if a replay could not repeat what this loop does from now on."""
+    context, bridge, diagram = runtime.context, runtime.bridge, runtime.target.diagram
+    if runtime.steps and context.num_continuous_states() and runtime.target.simulator_fields.use_error_control:
+        raise ValueError(
+            f"the integrator has a memory of its first {runtime.steps} steps, which a replay would not have: start to "
+            "record before the first step, or switch error control off"
+        )
+    for signal in runtime.target.interface.sense:
+        if signal.is_vector:
+            continue
+        if signal.name not in bridge.channels:
+            raise ValueError(
+                f"sensor signal {signal.name} is abstract and is recorded by its raw messages, which "
+                f"{type(bridge).__name__} does not have: make it a vector, or use a bridge with raw messages"
+            )
+        if bridge.sensed[signal.name].count or diagram.GetInputPort(f"real.sense.{signal.name}").HasValue(context):
+            raise ValueError(
+                f"sensor signal {signal.name} is abstract, and the message with its present value was not recorded: "
+                "start to record before the bridge is opened"
+            )
+
+
+def _header(runtime: Runtime) -> LogHeader:
+    def logged(signals: Sequence[Signal]) -> tuple[LoggedSignal, ...]:
+        return tuple(LoggedSignal(signal.name, signal.size, signal.unit) for signal in signals)
+
+    target, interface = runtime.target, runtime.target.interface
+    return LogHeader(
+        scenario=_scenario_text(target.scenario) if target.scenario else "",
+        record=scenario_record(target.scenario),
+        target=target_kind(target),
+        sense=logged(interface.sense),
+        act=logged(interface.act),
+        commands=logged(interface.commands),
+        period=runtime.period,
+        start_time=runtime.start_time,
+        steps=runtime.steps,
+        first_cycle=runtime.cycles,
+        initialized=runtime.initialized,
+        idle=runtime.idle,
+        pace=runtime.pace,
+        positions=target.positions(runtime.context) if isinstance(target, VirtualTestbed) else {},
+    )
+
+
+def _scenario_text(scenario: Scenario) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        try:
+            scenario.save(path)
+        except Exception as error:  # Drake's writer refuses types in many ways, failed assertions among them.
+            _log.warning("YAML cannot hold the scenario, so a replay needs it as an argument: %r", error)
+            return ""
+        return path.read_text()
+
+
+class StateDigest:
+    """A BLAKE2b digest of the DPS's state: all its numeric groups, and its abstract states as their codecs give them.
+
+    An array beyond 16 KiB, such as an image, enters by name and shape only, so that the loop need not wait for it. The
+    digest of the DPS alone and that of the DPS in its testbed are equal if their states are.
+
+    Args:
+        target: The testbed, or the DPS alone.
+        context: Root context of the target.
+    """
+
+    def __init__(self, target: AddressedDiagram, context: Context) -> None:
+        self._parts = []
+        for path, system in leaves(target.diagram):
+            if path != "dps" and not path.startswith("dps."):
+                continue
+            leaf_context = system.GetMyContextFromRoot(context)
+            groups = list(numeric_groups(leaf_context))
+            abstract = abstract_state(path, system, leaf_context)
+            if groups or abstract:
+                self._parts.append((leaf_context, groups, abstract))
+
+    def __call__(self) -> bytes:
+        """Return the digest of the present state, 16 bytes."""
+        digest = blake2b(digest_size=DIGEST_SIZE)
+        for leaf_context, groups, abstract in self._parts:
+            for group, index in groups:
+                digest.update(read_group(leaf_context, group, index).tobytes())
+            arrays = abstract.read(leaf_context)
+            for key in sorted(arrays, key=_index_and_name):
+                array = arrays[key]
+                digest.update(f"{_index_and_name(key)[1]}{array.shape}".encode())
+                if array.nbytes <= _MAX_HASHED:
+                    digest.update(array.tobytes())
+        return digest.digest()
+
+
+def _index_and_name(key: str) -> tuple[int, str]:
+    index, _, name = key.partition("/")
+    return int(index), name
+
+
+# -- in the worker process
+
+
+def write_log(connection: FrameConnection, path: str) -> None:
+    """Append every frame to an existing file, whole or not at all, and report the number of those that failed.
+
+    Args:
+        connection: Brings the frames, and takes reports: the number of failed frames, a space, and the reason.
+        path: Path of the file.
+    """
+    file = os.open(path, os.O_WRONLY | os.O_APPEND)
+    end, lost = os.fstat(file).st_size, 0
+    try:
+        while True:
+            frame = _next_frame(connection)
+            try:
+                view = memoryview(frame)
+                while view:
+                    view = view[os.write(file, view) :]
+                end += len(frame)
+            except OSError as error:
+                # Part of a frame would be damage, its absence is a gap. Once there is room again, the log goes on.
+                os.ftruncate(file, end)
+                lost += 1
+                connection.send(f"{lost} {error.strerror or error}".encode())
+    except EOFError:
+        pass
+    finally:
+        os.close(file)
+
+
+def _next_frame(connection: FrameConnection) -> bytes:
+    # Polls: waking up a waiting process would cost the loop more than all the rest.
+    while True:
+        try:
+            return connection.receive(0.0)
+        except TimeoutError:
+            time.sleep(_POLL_PERIOD)

@@ -1,35 +1,106 @@
-"""Replays a log: the DPS does again, bit for bit, what it did."""
+"""Replay of a log: the DPS repeats, bit for bit, what it did when it was recorded."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context
+from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
+from pydrake.systems.primitives import Demultiplexer, TrajectorySource, VectorLogSink
+from pydrake.trajectories import DiscreteTimeTrajectory
 
-from vtbdrake.control.cycle import SWITCH, times_after
-from vtbdrake.recording.control_log import ControlLog
-from vtbdrake.recording.log_format import LogError
-from vtbdrake.recording.log_header import DPS, versions
-from vtbdrake.recording.log_reader import read_log
-from vtbdrake.recording.replay_report import (
-    DIFFERENT,
-    IDENTICAL,
-    NOT_COMPARED,
-    ReplayReport,
-    largest_differences,
-)
-from vtbdrake.recording.replay_run import ReplayRun
-from vtbdrake.recording.replay_sources import Sources, SourcesError
-from vtbdrake.recording.replay_start import Target, recorded_target
-from vtbdrake.testbed import DpsAlone
+from vtbdrake.control.boundary import RealPorts
+from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after, times_after
+from vtbdrake.control.parameters import parameters_at_hand
+from vtbdrake.control.switching import throw
+from vtbdrake.lcm.maps import Reader
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.recording.log_format import DPS, TESTBED, LogError, installed_versions, target_kind
+from vtbdrake.recording.log_reader import ControlLog, read_log
+from vtbdrake.recording.recorder import StateDigest
+from vtbdrake.state import Snapshot, SnapshotError
+from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
+from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.interrupt import Interruptible
+from vtbdrake.testbed.switch import COMMAND, REAL
 
 _log = logging.getLogger(__name__)
+
+IDENTICAL, DIFFERENT, NOT_COMPARED = "identical", "different", "not compared"
+
+Target = VirtualTestbed | DpsAlone
+
+_TICK = "tick"  # key of a sample's number in a result of a slow part
+_BATCH = 250  # cycles; a trajectory source searches all its samples in every step
+_TOLERANCE = 1e-9  # s, of the time of a sample
+
+
+class Difference(NamedTuple):
+    """A difference between a replay and its log.
+
+    It has the number of the cycle, the DPS's time after it in seconds, ``what`` differs (an actuator signal, ``time``,
+    or ``state`` by its digest), and what was recorded and replayed.
+    """
+
+    cycle: int
+    time: float
+    what: str
+    recorded: Any
+    replayed: Any
+
+    def __str__(self) -> str:
+        return f"{self.what} in cycle {self.cycle} (t = {self.time:g} s): {self.replayed} instead of {self.recorded}"
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayReport:
+    """The outcome of a replay; n is the number of cycles that were replayed.
+
+    Attributes:
+        outcome: ``identical`` (every actuator command, the time after every cycle and every digest, to the last bit),
+            ``different``, or ``not compared`` (the replay had other values).
+        cycles: number of replayed cycles.
+        ended: why not all cycles of the log were replayed; empty if they were.
+        first_difference: the first difference; None if there is none.
+        max_difference: largest absolute difference by vector actuator signal; inf where an actuator command is missing
+            on one side or not finite.
+        digests: number of digests of the DPS's state that were compared.
+        versions: whatever runs here in another version than was recorded; bits may differ for that reason.
+        times: times of the DPS at the ends of the cycles, in seconds, (n,).
+        actuation: actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
+        errors: exceptions of the DPS, by the number of the cycle.
+        record: recorded values at the ends of the cycles by address, (n, ...); a list, if they are not arrays.
+    """
+
+    outcome: str
+    cycles: int
+    ended: str
+    first_difference: Difference | None
+    max_difference: Mapping[str, float]
+    digests: int
+    versions: tuple[str, ...]
+    times: np.ndarray
+    actuation: Mapping[str, np.ndarray]
+    errors: Mapping[int, str]
+    record: Mapping[str, Any]
+
+    @property
+    def identical(self) -> bool:
+        """Return whether the whole log was replayed and everything is the same to the last bit."""
+        return self.outcome == IDENTICAL and not self.ended
+
+    def __str__(self) -> str:
+        lines = [f"{self.cycles} cycles replayed, {self.digests} digests of the state: {self.outcome}"]
+        if self.first_difference is not None:
+            lines.append(f"the first difference: {self.first_difference}")
+            lines += [f"{name}: up to {value:.3g}" for name, value in self.max_difference.items() if value]
+        return "\n".join([*lines, *([self.ended] if self.ended else []), *self.versions])
 
 
 def replay(
@@ -39,40 +110,41 @@ def replay(
     values: Mapping[str, Any] | None = None,
     record: Sequence[str] = (),
 ) -> ReplayReport:
-    """Has the DPS do again what it did when ``log`` was recorded, and compares.
+    """Replay a log and compare.
 
-    It begins in the recorded state, gets in every cycle what it got, and is stepped as it was; its commands, its time
-    and the digests of its state must be the same to the last bit. A cycle in which the DPS raised raises again. Where
-    cycles are missing in the log, the replay ends.
+    The replay begins in the recorded state, feeds in every cycle what was fed, and steps as the loop did; the DPS's
+    actuator commands, its time and the digests of its state must be the same to the last bit. A cycle in which the DPS
+    raised raises again. The replay ends where cycles are missing in the log.
 
     Args:
-        log: as of `read_log`, or a file.
-        target: what is stepped; by default what was recorded, built from the log's scenario. A `DpsAlone` can replay
-            the log of a testbed whose sensor signals were all on real; a testbed can replay the log of a DPS alone,
-            with its simulated world idle beside it.
-        values: of variables, by address, that hold from the beginning on, whatever the log says of them: what would the
-            DPS have commanded with another gain? Nothing is compared then.
-        record: addresses of variables or output ports to be read after every cycle.
+        log: A log, or the path of its file.
+        target: What is stepped; by default what was recorded, built from the log's scenario. A `DpsAlone` can replay
+            the log of a testbed whose sensor signals were all on real. A testbed can replay the log of a DPS alone;
+            its simulated world is idle then.
+        values: Values of variables by address, which hold from the beginning on, whatever the log says of them: what
+            would the DPS have commanded with another gain? Nothing is compared then.
+        record: Addresses of variables or output ports to be read after every cycle.
 
     Raises:
-        OSError, LogError: the log cannot be read, or is of another scenario or another version of it; it says what
-            differs.
-        AddressError: an address is unknown.
+        OSError: The file cannot be read.
+        LogError: The file is not a log, or is one of another scenario or of another version of it; the error lists the
+            differences.
+        AddressError: An address is unknown.
     """
     log = log if isinstance(log, ControlLog) else read_log(log)
-    run = None if target or values or record else _at_once(log)
+    run = None if target or values or record else _replay_in_batches(log)
     if run is None:
-        run = ReplayRun(log, target or recorded_target(log), dict(values or {}), record)
+        run = _Replay(log, target or _recorded_target(log), dict(values or {}), record)
         run.run()
     found = run.differences()
     outcome = NOT_COMPARED if values else DIFFERENT if found else IDENTICAL
-    here = versions()
+    here = installed_versions()
     return ReplayReport(
         outcome=outcome,
         cycles=run.count,
         ended=run.ended,
         first_difference=found[0] if outcome == DIFFERENT else None,
-        max_difference={} if values else largest_differences(log, run.commands),
+        max_difference={} if values else _largest_differences(log, run.actuation),
         digests=len(run.digests),
         versions=tuple(
             f"recorded with {name} {version}, replayed with {here.get(name)}"
@@ -80,58 +152,306 @@ def replay(
             if here.get(name) != version
         ),
         times=run.times,
-        commands=run.commands,
+        actuation=run.actuation,
         errors=run.errors,
         record={address: _stacked(samples) for address, samples in run.record.items()},
     )
 
 
-class _AtOnce(ReplayRun):
-    """One replay of a DPS alone, with Python only where something is changed or looked at."""
+def _stacked(samples: list[Any]) -> Any:
+    return np.array(samples) if all(isinstance(sample, float | np.ndarray) for sample in samples) else samples
 
-    def __init__(self, log: ControlLog, target: DpsAlone) -> None:
-        self._sources = Sources(log, target)
-        super().__init__(log, target, {}, ())
+
+def _recorded_target(log: ControlLog) -> Target:
+    scenario = log.scenario
+    return DpsAlone(scenario) if log.header.target == DPS else scenario.build()
+
+
+class _Replay:
+    """A replay cycle by cycle, up to the first gap.
+
+    Attributes:
+        same_kind: whether the target is of the recorded kind, testbed or DPS alone.
+        errors: exceptions of the DPS, by the number of the cycle.
+    """
+
+    def __init__(self, log: ControlLog, target: Target, values: dict[str, Any], record: Sequence[str]) -> None:
+        header = log.header
+        self.same_kind = target_kind(target) == header.target
+        self._log, self._target, self._values = log, target, values
+        self._context = context = self._new_context()
+        _restore(log, target, context)
+        target.write(context, values)
+        self._simulator = self._new_simulator()
+        # Keep alive: stops pydrake from wrapping the parameters anew in every step.
+        self._parameters = parameters_at_hand(target.diagram, context)
+        self._ports = RealPorts(target, context)
+        self._slow_parts = slow_parts(target.diagram)
+        self._idle, self._steps = header.idle, header.steps
+        self._digest = StateDigest(target, context)
+        self._readers = {address: target.reader(address) for address in record}
+        self._decoders = _abstract_decoders(log, target)
+        self._handlers: dict[str, Callable[[Mapping[str, Any]], None]] = {
+            WRITE: self._write,
+            SWITCH: self._switch,
+            RESET: lambda values: None,  # The guards are not replayed: what was sent is in the log.
+            RESULT: self._deliver,
+        }
+        self.count = n = int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)
+        self.ended = f"the replay ends where the log lacks {log.gaps[0]}" if log.gaps else ""
+        self.times = np.empty(n)
+        self.actuation = {name: np.full((n, values.shape[1]), np.nan) for name, values in log.actuation.items()}
+        self.commanded = {name: np.zeros(n, bool) for name in log.commanded}
+        self.digests: list[tuple[int, bytes]] = []
+        self.errors: dict[int, str] = {}
+        self.record: dict[str, list[Any]] = {address: [] for address in record}
+        self._now, self._next = self._time(self._steps), self._time(self._steps + 1)
+        self._outputs: list[tuple[Callable[[Context], Any], np.ndarray | None, np.ndarray]] = []
+        self._find_outputs()
 
     def _new_context(self) -> Context:
-        return self._sources.diagram.CreateDefaultContext()
+        return self._target.default_context()
 
     def _new_simulator(self) -> Simulator:
-        return self._sources.simulator(self._context, restored=self._log.header.initialized)
+        return self._target.simulator(self._context, restored=self._log.header.initialized)
 
-    def _look(self) -> None:
-        """A DPS alone commands all its signals, from its beginning on."""
+    def _time(self, steps: int) -> float:
+        return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)
 
     def run(self) -> None:
-        changes, digests = self._changes(), {i for i, _ in self._log.digests}
-        switched = [i for i, change in self._log.changes if change.kind == SWITCH]
-        first = min([*switched, self.count] if self._idle else [0])
-        header, steps = self._log.header, self._steps + np.arange(self.count - first + 1)
-        times = times_after(steps, start=header.start_time, period=header.period)
-        self.times[:first], self.times[first:] = self._now, times[1:]
-        if first < self.count and not self._sources.complete_from(first):
-            raise SourcesError("the DPS begins without a value of every sensor signal")
-        looked = {*changes, *(i + 1 for i in digests), *range(first + 1)}
-        for i, end in pairwise([*sorted(i for i in looked if i < self.count), self.count]):
-            for change in changes.get(i, ()):
-                self._apply(change)
-            if i >= first:
-                self._sources.advance(self._simulator, i, end, times[i - first : end - first + 1])
-            if end - 1 in digests:
-                self.digests.append((end - 1, self._digest()))
-        for name, values in self._sources.commands(self._context, times[1:]).items():
-            self.commands[name][first:], self.commanded[name][first:] = values, True
+        log, feed, context = self._log, self._ports.feed, self._context
+        vectors = [(_changed(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
+        changes = self._changes_by_cycle()
+        digests = {i for i, _ in log.digests}
+        with Interruptible() as interruptible:
+            for i in range(self.count):
+                interruptible.check()
+                for changed, name, values in vectors:
+                    if changed[i]:
+                        feed(name, values[i])
+                for name, decode in self._decoders.items():
+                    if event := log.sources[name][i]:
+                        feed(name, decode(event))
+                # After the feed: a switch may let the DPS see it.
+                for change in changes.get(i, ()):
+                    self._apply(change)
+                if not self._idle:
+                    self._step(i)
+                self.times[i] = self._now
+                if i in digests:
+                    self.digests.append((i, self._digest()))
+                for address, read in self._readers.items():
+                    self.record[address].append(read(context))
+
+    def _step(self, i: int) -> None:
+        try:
+            self._simulator.AdvanceTo(self._next)
+            self._steps += 1
+            self._now, self._next = self._next, self._time(self._steps + 1)
+            for evaluate, values, commanded in self._outputs:
+                value = evaluate(self._context)
+                if values is not None:
+                    values[i] = value
+                commanded[i] = True
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # The loop may have had the same exception and gone on without actuator commands: the comparison tells.
+            self.errors[int(self._log.numbers[i])] = f"{type(error).__name__}: {error}"
+            for _, values, commanded in self._outputs:
+                commanded[i] = False
+                if values is not None:
+                    values[i] = np.nan
+
+    def _find_outputs(self) -> None:
+        """Find the output ports of the actuator signals that are on real."""
+        self._outputs = [
+            (
+                self._target.diagram.GetOutputPort(f"real.act.{name}").Eval,
+                self.actuation.get(name),
+                self.commanded[name],
+            )
+            for name in (() if self._idle else self._ports.active())
+        ]
+
+    def differences(self) -> list[Difference]:
+        """Return the first difference of every kind from the log, in the order of the cycles."""
+        log, found = self._log, []
+
+        def look(what: str, differs: np.ndarray, recorded: np.ndarray, replayed: np.ndarray) -> None:
+            if differs.any():
+                i = int(np.argmax(differs))
+                found.append(Difference(int(log.numbers[i]), float(log.times[i]), what, recorded[i], replayed[i]))
+
+        n = len(self.times)
+        look("time", log.times[:n] != self.times, log.times, self.times)
+        for name, commanded in self.commanded.items():
+            expected = log.commanded[name][:n]
+            # Targets of different kinds have other switches: one may command where the other does not.
+            differs = commanded != expected if self.same_kind else expected & ~commanded
+            look(name, differs, log.commanded[name], commanded)
+            if name in self.actuation:
+                bits = (_bits(self.actuation[name]) != _bits(log.actuation[name][:n])).any(axis=1)
+                look(name, commanded & expected & bits, log.actuation[name], self.actuation[name])
+        digests = dict(log.digests)
+        for i, digest in self.digests:
+            if digest != digests[i]:
+                both = digests[i].hex(), digest.hex()
+                found.append(Difference(int(log.numbers[i]), float(log.times[i]), "state", *both))
+                break
+        return sorted(found, key=lambda difference: difference.cycle)
+
+    # -- changes
+
+    def _changes_by_cycle(self) -> Mapping[int, list[Change]]:
+        changes: dict[int, list[Change]] = {}
+        for i, change in self._log.changes:
+            changes.setdefault(i, []).append(change)
+        return changes
+
+    def _apply(self, change: Change) -> None:
+        if change.kind not in self._handlers:
+            raise LogError(
+                f"the log has a change of the kind {change.kind!r}, which this version of vtbdrake does not know; it "
+                f"knows {', '.join(self._handlers)}"
+            )
+        self._handlers[change.kind](change.values)
+
+    def _write(self, values: Mapping[str, Any]) -> None:
+        # The DPS alone has no variables of the simulated world.
+        self._target.write(self._context, {a: value for a, value in values.items() if a in self._target.variables()})
+        self._target.write(self._context, self._values)
+
+    def _switch(self, values: Mapping[str, Any]) -> None:
+        if self.same_kind and isinstance(self._target, VirtualTestbed):
+            sides: dict[str, dict[str, str]] = {"sense": {}, "act": {}}
+            for name, position in values.items():
+                side, _, signal = name.partition(".")
+                sides[side][signal] = position
+            throw(self._target, self._context, sides["sense"], sides["act"])
+        elif isinstance(self._target, VirtualTestbed):
+            self._target.switch(self._context, "real")
+        self._idle = False
+        self._find_outputs()
+
+    def _deliver(self, values: Mapping[str, Any]) -> None:
+        for path, result in values.items():
+            arrays = {name: np.asarray(array) for name, array in result.items() if name != _TICK}
+            self._slow_parts[path].deliver(self._context, result[_TICK], arrays)
 
 
-def _at_once(log: ControlLog) -> ReplayRun | None:
-    """The replay of the DPS alone that was recorded, or None if it needs every cycle looked at.
+def _bits(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=float).view(np.uint64)
 
-    What differs from the log proves nothing here: then a replay cycle by cycle tells.
+
+def _changed(values: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """Return where a vector signal has a new value of other bits than before, which is all that must be fed."""
+    bits, new = values.view(np.uint64), sources != 0
+    new[1:] &= (bits[1:] != bits[:-1]).any(axis=1) | (np.cumsum(new)[1:] == 1)
+    return new
+
+
+def _largest_differences(log: ControlLog, actuation: Mapping[str, np.ndarray]) -> dict[str, float]:
+    largest = {}
+    for name, replayed in actuation.items():
+        recorded = log.actuation[name][: len(replayed)]
+        same = _bits(recorded) == _bits(replayed)
+        with np.errstate(invalid="ignore"):
+            apart = np.where(same, 0.0, np.abs(recorded - replayed))
+        largest[name] = float(np.where(np.isnan(apart), np.inf, apart).max(initial=0.0))
+    return largest
+
+
+# -- the beginning
+
+
+def _restore(log: ControlLog, target: Target, context: Context) -> None:
+    """Bring a context of ``target`` into the state before the first recorded cycle.
+
+    Raises:
+        LogError: The log is of another scenario, or was fed by a simulated world that the DPS alone does not have.
+    """
+    log.header.check(target.scenario)
+    if isinstance(target, DpsAlone) and log.header.target == TESTBED:
+        _check_fed_by_machine(log)
+    try:
+        if isinstance(target, DpsAlone) or log.header.target == TESTBED:
+            target.restore(context, log.start)
+        else:
+            _restore_dps(target, context, log.start)
+    except SnapshotError as error:
+        raise LogError(f"the scenario is built in another way than the one of {log.path}: {error}") from error
+
+
+def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> None:
+    """Restore the DPS and its commands u; the simulated world begins anew."""
+    own = testbed.snapshot(context)
+    groups = {key: value for key, value in start.groups.items() if key.partition("/")[0].split(".")[0] == "dps"}
+    values = {address: value for address, value in start.values.items() if address.startswith("dps.")}
+    testbed.restore(context, Snapshot(start.time, {**own.values, **values}, {**own.groups, **groups}))
+    commands = [f"{COMMAND}{signal.name}" for signal in testbed.interface.commands]
+    testbed.write(context, {a: start[a] for a in commands if a in testbed.variables()})
+
+
+def _check_fed_by_machine(log: ControlLog) -> None:
+    positions = {f"sense.{name}": position for name, position in log.header.positions["sense"].items()}
+    switched = [change.values for _, change in log.changes if change.kind == SWITCH]
+    for values in (positions, *switched):
+        simulated = [name for name, position in values.items() if name.startswith("sense.") and position != REAL]
+        if simulated:
+            raise LogError(
+                f"{', '.join(simulated)} came from the simulated world in {log.path}, which the DPS alone does not "
+                "have: replay it through the testbed"
+            )
+
+
+def _abstract_decoders(log: ControlLog, target: AddressedDiagram) -> dict[str, Callable[[int], Any]]:
+    """Return by abstract sensor signal a function from the number of a message's event to the signal's value.
+
+    Raises:
+        LogError: There is no scenario that says how to decode the messages.
+        ProtocolError: The scenario has no protocol.
+    """
+    signals = {signal.name: signal for signal in target.interface.sense}
+    abstract = [name for name, signal in signals.items() if not signal.is_vector]
+    if not abstract:
+        return {}
+    if target.scenario is None:
+        raise LogError(f"the target has no scenario, whose protocol says how to decode {', '.join(abstract)}")
+    found = {}
+    for map in protocol_of(target.scenario).sense:
+        reader = map.reader([signals[name] for name in map.signals])
+        for name in map.signals:
+            if name in abstract:
+                found[name] = _message_decoder(log, map.channel, reader, name)
+    return found
+
+
+def _message_decoder(log: ControlLog, channel: str, reader: Reader, name: str) -> Callable[[int], Any]:
+    places = {number: (begin, end) for number, _, begin, end in log.events.on(channel)}
+
+    def decode(event: int) -> Any:
+        if event not in places:
+            raise LogError(f"{log.path} lacks the message with the value of {name}, event {event} on {channel}")
+        return reader(log.events.data(*places[event])).values[name]
+
+    return decode
+
+
+# -- the quick way
+
+
+class _BatchError(RuntimeError):
+    """A DPS that can only be replayed cycle by cycle."""
+
+
+def _replay_in_batches(log: ControlLog) -> _Replay | None:
+    """Return the replay of the DPS alone if that was recorded and replays identically in batches, otherwise None.
+
+    A difference proves nothing here: the replay cycle by cycle decides.
     """
     if log.header.target != DPS:
         return None
     try:
-        run = _AtOnce(log, cast(DpsAlone, recorded_target(log)))
+        run = _BatchReplay(log, cast(DpsAlone, _recorded_target(log)))
         run.run()
     except LogError:
         raise
@@ -144,5 +464,92 @@ def _at_once(log: ControlLog) -> ReplayRun | None:
     return run
 
 
-def _stacked(samples: list[Any]) -> Any:
-    return np.array(samples) if all(isinstance(sample, float | np.ndarray) for sample in samples) else samples
+class _BatchReplay(_Replay):
+    """A replay of the DPS alone without Python per cycle: systems in C++ feed it and log its actuator commands.
+
+    A sensor value exists at the time of its cycle's beginning only: a DPS that reads its inputs at another time raises.
+    Actuator commands are logged where a cycle ends, before what is updated at that time.
+
+    Args:
+        log: The log.
+        target: The DPS alone, which becomes part of another Diagram.
+
+    Raises:
+        _BatchError: A signal is abstract, the DPS has continuous state, or its actuator commands have direct
+            feedthrough from its sensor values.
+    """
+
+    def __init__(self, log: ControlLog, target: DpsAlone) -> None:
+        interface, inner = target.interface, target.diagram
+        if not all(signal.is_vector for signal in (*interface.sense, *interface.act)) or not interface.sense:
+            raise _BatchError("a signal is abstract, or there is no sensor signal")
+        sense = [inner.GetInputPort(f"real.sense.{signal.name}") for signal in interface.sense]
+        act = {signal.name: inner.GetOutputPort(f"real.act.{signal.name}") for signal in interface.act}
+        if any(inner.HasDirectFeedthrough(i.get_index(), o.get_index()) for i in sense for o in act.values()):
+            raise _BatchError("the actuator commands have direct feedthrough from the sensor values")
+        self._fed = np.hstack([log.fed[signal.name] for signal in interface.sense])
+        builder = DiagramBuilder()
+        builder.AddSystem(inner)
+        nothing = DiscreteTimeTrajectory([0.0], [np.zeros((self._fed.shape[1], 1))])
+        self._source = builder.AddSystem(TrajectorySource(nothing))
+        split = builder.AddSystem(Demultiplexer([port.size() for port in sense]))
+        builder.Connect(self._source.get_output_port(), split.get_input_port())
+        for i, port in enumerate(sense):
+            builder.Connect(split.get_output_port(i), port)
+        self._sinks = {}
+        for name, output in act.items():
+            self._sinks[name] = builder.AddSystem(VectorLogSink(output.size(), {TriggerType.kPerStep}, 0.0))
+            builder.Connect(output, self._sinks[name].get_input_port())
+        self._diagram: Diagram = builder.Build()
+        if self._diagram.CreateDefaultContext().num_continuous_states():
+            raise _BatchError("the DPS has continuous state")
+        super().__init__(log, target, {}, ())
+
+    def _new_context(self) -> Context:
+        return self._diagram.CreateDefaultContext()
+
+    def _new_simulator(self) -> Simulator:
+        simulator = Simulator(self._diagram, self._context)
+        if self._log.header.initialized:
+            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        return simulator
+
+    def _find_outputs(self) -> None:
+        """Do nothing: a DPS alone commands all its signals, from its beginning on."""
+
+    def run(self) -> None:
+        log, header = self._log, self._log.header
+        changes, digests = self._changes_by_cycle(), {i for i, _ in log.digests}
+        switched = [i for i, change in log.changes if change.kind == SWITCH]
+        first = min([*switched, self.count] if self._idle else [0])
+        steps = self._steps + np.arange(self.count - first + 1)
+        times = times_after(steps, start=header.start_time, period=header.period)
+        self.times[:first], self.times[first:] = self._now, times[1:]
+        if first < self.count and not all(source[: first + 1].any() for source in log.sources.values()):
+            raise _BatchError("the DPS begins without a value of every sensor signal")
+        stops = {*changes, *(i + 1 for i in digests), *range(first + 1)}
+        for i, end in pairwise([*sorted(i for i in stops if i < self.count), self.count]):
+            for change in changes.get(i, ()):
+                self._apply(change)
+            if i >= first:
+                self._advance(i, end, times[i - first : end - first + 1])
+            if end - 1 in digests:
+                self.digests.append((end - 1, self._digest()))
+        self._take_actuation(first, times[1:])
+
+    def _advance(self, first: int, end: int, times: np.ndarray) -> None:
+        """Step the cycles ``first`` to ``end`` - 1, which begin and end at ``times``."""
+        for a, b in pairwise([*range(first, end, _BATCH), end]):
+            begins = times[a - first : b - first].tolist()
+            values = list(self._fed[a:b, :, np.newaxis])
+            self._source.UpdateTrajectory(DiscreteTimeTrajectory(begins, values, _TOLERANCE))
+            self._simulator.AdvanceTo(times[b - first])
+
+    def _take_actuation(self, first: int, times: np.ndarray) -> None:
+        for name, sink in self._sinks.items():
+            logged = sink.FindLog(self._context)
+            where = np.minimum(np.searchsorted(logged.sample_times(), times), logged.num_samples() - 1)
+            if not np.array_equal(logged.sample_times()[where], times):
+                raise _BatchError("the steps do not end where cycles do")
+            self.actuation[name][first:] = logged.data().T[where]
+            self.commanded[name][first:] = True

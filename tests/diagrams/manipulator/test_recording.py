@@ -54,11 +54,11 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
         bridge.close()
     assert not runtime.guards.latched
     log = read_log(path)
-    assert len(log) == CYCLES and len(np.unique(log.commands["joint_torque"], axis=0)) > 0.9 * CYCLES
+    assert len(log) == CYCLES and len(np.unique(log.actuation["joint_torque"], axis=0)) > 0.9 * CYCLES
 
     for target in (None, scenario.build()):
         report = replay(log, target, record=["dps.impl.motion", "u.motion"])
         assert report.identical and report.cycles == CYCLES and report.digests == 15, report
-        assert np.array_equal(report.commands["joint_torque"], log.commands["joint_torque"])
+        assert np.array_equal(report.actuation["joint_torque"], log.actuation["joint_torque"])
         assert SWING in report.record["dps.impl.motion"]
         assert set(report.record["u.motion"].ravel()) == {SWING, CIRCLE}
