@@ -61,10 +61,11 @@ def answer_all(
     registry: Registry = APPLICATIONS,
     echo: Callable[[str], Any] = print,
 ) -> list[Answer | Crash]:
-    """Runs the applications named, or all. One that raises is a `Crash`, and the others still run.
+    """Run the named applications, or all. One that raises becomes a `Crash`, and the others still run.
 
     Args:
-        full: the long versions.
+        only: the names of the applications; by default all.
+        full: run the long versions.
         registry: name -> function ``(full) -> Answer``.
         echo: gets a line when an application begins.
 
@@ -83,7 +84,7 @@ def answer_all(
 
 
 def answers_table(answers: Sequence[Answer | Crash]) -> str:
-    """One row each, and the notes below."""
+    """Return the table of the answers, with the notes below it."""
     header = ("id", "question", "answer", "the paper's", "time", "holds")
     rows = [_crash_row(a) if isinstance(a, Crash) else _row(a) for a in answers]
     notes = [f"{a.id}: {a.note}" for a in answers if isinstance(a, Answer) and a.note]
@@ -117,7 +118,7 @@ def _interval(interval: tuple[float, float] | None) -> str:
 
 
 def write_answers(path: Path, answers: Sequence[Answer | Crash]) -> None:
-    """Writes what was answered, with the fields `FIELDS`; a crash has neither answer nor time, and does not hold."""
+    """Write the answers with the fields `FIELDS`; a crash has neither answer nor time, and does not hold."""
     write_json(path, [_fields(answer) for answer in answers])
 
 
@@ -131,7 +132,7 @@ def _fields(answer: Answer | Crash) -> dict[str, Any]:
 @click.argument("only", nargs=-1)
 @click.option("--full", is_flag=True, help="The long versions.")
 def main(only: tuple[str, ...], full: bool) -> None:
-    """Answer the questions of the applications ONLY (O4, say), or of all."""
+    """Answer the questions of the applications ONLY (for example O4), or of all."""
     try:
         answers = answer_all(only, full=full, echo=lambda line: click.echo(line, err=True))
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The row O4 of the table of answers."""
+"""Application O4 in the table of answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOCKED_STEP = 1.0
 
 
 def payload(full: bool) -> Answer:
-    """How heavy may the attachment be, in all environments?
+    """Answer O4: how heavy may the attachment be, in each environment?
 
     The short version tries every other start phase in all environments but the moon's; the long one tries all, and
     masses twice as fine.
@@ -60,7 +60,7 @@ def payload(full: bool) -> Answer:
 
 
 def _range(boundary: Boundary) -> str:
-    """The interval, how often what lies in it was unsafe, and the same interval of the best start phase."""
+    """Return the interval as text, with the unsafe rollouts within it, and the interval of the best start phase."""
     upper = f"{boundary.upper:g}" if isfinite(boundary.upper) else "more"
     between = [c for c in boundary.worst_chances if boundary.lower < c.value < boundary.upper]
     counts = ", ".join(f"{c.unsafe} of {c.rollouts} at {c.value:g}" for c in between)

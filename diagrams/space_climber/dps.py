@@ -20,7 +20,7 @@ SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": 
 
 
 def make_dps(gait: str = "tripod", *, period: float, morphology: Morphology | None = None) -> Diagram:
-    """The DPS: ``sense`` calibrates and filters, ``env`` perceives, ``impl`` walks, ``act`` limits.
+    """Build the DPS: ``sense`` calibrates and filters, ``env`` perceives, ``impl`` walks, ``act`` limits.
 
     Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the
     torso's), ``joint_encoders`` (18, rad), ``foot_contact`` (6, 0 or 1) and the commands ``heading`` (the yaw to walk
@@ -63,7 +63,7 @@ def _make_sense(*, period: float, morphology: Morphology) -> Diagram:
 
 
 class Calibration(LeafSystem):
-    """Calibrates the raw sensor values and filters the IMU's.
+    """A system that calibrates the raw sensor values and filters those of the IMU.
 
     .. pydrake_system::
 
@@ -112,7 +112,7 @@ class Calibration(LeafSystem):
 
 
 class CommandLimiter(LeafSystem):
-    """Keeps joint commands within the joints' ranges and speed.
+    """A system that keeps joint commands within the ranges and the speed of the joints.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""The perceived environment of the robot: where it is and how it stands, by its own senses."""
+"""The perceived environment of the robot: its pose, estimated from its own sensors."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from vtbdrake.state.collectable import NO_DICT
 
 
 def wrap(angle: float) -> float:
-    """``angle`` in [-pi, pi)."""
+    """Return ``angle`` wrapped to [-pi, pi)."""
     return (angle + pi) % (2.0 * pi) - pi
 
 
 class PerceivedEnvironment(LeafSystem):
-    r"""Attitude by a complementary filter, position by counting steps.
+    r"""An estimator: attitude by a complementary filter, position by leg odometry.
 
     .. pydrake_system::
 
@@ -101,7 +101,7 @@ class PerceivedEnvironment(LeafSystem):
         state.set_value(1, np.array(remembered))
 
     def _feet_in_world(self, attitude: list[float], q: list[float]) -> list[tuple[float, float, float]]:
-        """p_BF_W of the six feet."""
+        """Return p_BF_W of the six feet."""
         roll, pitch, yaw = attitude
         sr, cr, sp, cp, sy, cy = sin(roll), cos(roll), sin(pitch), cos(pitch), sin(yaw), cos(yaw)
         feet = []
@@ -113,7 +113,7 @@ class PerceivedEnvironment(LeafSystem):
 
 
 def complementary_filter(attitude: list[float], imu: list[float], *, period: float, trust: float) -> list[float]:
-    """(roll, pitch, yaw) after one period; ``trust`` in [0, 1] is the weight of the specific force."""
+    """Return (roll, pitch, yaw) after one period; ``trust`` in [0, 1] is the weight of the specific force."""
     roll, pitch, yaw = attitude
     wx, wy, wz, fx, fy, fz = imu
     sr, cr = sin(roll), cos(roll)

@@ -19,21 +19,21 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Gait:
-    """Duty factor beta, and the legs' delays in cycles, in the order of LEGS."""
+    """A gait: its duty factor beta, and the delays of the legs in cycles, in the order of LEGS."""
 
     duty: float
     delays: tuple[float, float, float, float, float, float]
 
     def speed(self, *, stroke: float, period: float) -> float:
-        """Body speed (m/s) of a walk with this stroke (m) and period (s)."""
+        """Return the body speed (m/s) of a walk with this stroke (m) and period (s)."""
         return stroke / (self.duty * period)
 
     def leg_phases(self, phase: float) -> list[float]:
-        """The legs' phases in [0, 1) at the gait's phase (cycles)."""
+        """Return the phases of the legs in [0, 1) at the phase of the gait (cycles)."""
         return [(phase - delay) % 1.0 for delay in self.delays]
 
     def swing(self, leg_phase: float) -> float:
-        """Progress of the swing from 0 to 1; 0 for a leg that stands."""
+        """Return the progress of a leg's swing from 0 to 1; 0 for a leg in stance."""
         return (leg_phase - self.duty) / (1.0 - self.duty) if leg_phase > self.duty else 0.0
 
 
@@ -50,12 +50,12 @@ GAITS = {"tripod": TRIPOD, "ripple": RIPPLE, "wave": WAVE}
 
 
 def glide(progress: float) -> float:
-    """Share of its way that a swinging foot has covered, from 0 to 1, with zero speed at both ends."""
+    """Return the share of its way that a swinging foot has covered, from 0 to 1, with zero speed at both ends."""
     return progress * progress * (3.0 - 2.0 * progress)
 
 
 def lift(progress: float) -> float:
-    """Height of a swinging foot, from 0 over 1 in the middle to 0, with zero speed at both ends."""
+    """Return the height of a swinging foot, from 0 over 1 in the middle to 0, with zero speed at both ends."""
     rest = progress * (1.0 - progress)
     return 16.0 * rest * rest
 
@@ -70,7 +70,7 @@ def advance(
     step: tuple[float, float, float],
     stance_steps: float,
 ) -> list[float]:
-    """Horizontal feet [x0, y0, x1, ...] after one step of the body.
+    """Return the horizontal foot positions [x0, y0, x1, ...] after one step of the body.
 
     ``step`` is the body's motion in this step, (forward, left, yaw). Standing feet move the opposite way. Swinging feet
     cover the share of their remaining way that takes them along `glide` from where they left the ground, without anyone
@@ -94,5 +94,5 @@ def advance(
 
 
 def heights(gait: Gait, phase: float) -> list[float]:
-    """Heights of the feet over the ground, per unit of clearance."""
+    """Return the heights of the feet over the ground, per unit of clearance."""
     return [lift(gait.swing(leg)) for leg in gait.leg_phases(phase)]

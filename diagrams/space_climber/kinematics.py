@@ -24,7 +24,7 @@ Point = tuple[float, float, float]
 
 
 class LegKinematics:
-    """Joint angles from feet and feet from joint angles, legs in the order of LEGS."""
+    """Forward and inverse kinematics of the legs, in the order of LEGS."""
 
     def __init__(self, morphology: Morphology | None = None) -> None:
         m = morphology or Morphology()
@@ -32,11 +32,11 @@ class LegKinematics:
         self._coxa, self._femur, self._tibia = m.coxa, m.femur, m.tibia
 
     def forward(self, q: ArrayLike) -> NDArray[np.float64]:
-        """p_BF, (6, 3), for joint angles q, (6, 3) or (18,)."""
+        """Return p_BF, (6, 3), for joint angles q, (6, 3) or (18,)."""
         return np.array(self.feet(np.ravel(q).tolist()))
 
     def inverse(self, p_BF: ArrayLike) -> NDArray[np.float64]:
-        """Joint angles, (6, 3), that put the feet at p_BF, (6, 3).
+        """Return the joint angles, (6, 3), that put the feet at p_BF, (6, 3).
 
         A target out of reach is replaced by the point of the leg plane's reach in its direction from the basal joint.
         Joint ranges are not looked at.
@@ -44,7 +44,7 @@ class LegKinematics:
         return np.array(self.angles(np.asarray(p_BF, dtype=float).tolist())).reshape(len(LEGS), 3)
 
     def feet(self, q: Sequence[float]) -> list[Point]:
-        """`forward` for a sequence of 18 floats."""
+        """Compute `forward` for a sequence of 18 floats."""
         coxa, femur, tibia = self._coxa, self._femur, self._tibia
         feet = []
         k = 0
@@ -56,7 +56,7 @@ class LegKinematics:
         return feet
 
     def angles(self, p_BF: Iterable[Sequence[float]]) -> list[float]:
-        """`inverse` for six points; 18 floats."""
+        """Compute `inverse` for six points, as 18 floats."""
         coxa, femur, tibia = self._coxa, self._femur, self._tibia
         squares, products = femur * femur + tibia * tibia, 2.0 * femur * tibia
         q: list[float] = []

@@ -44,7 +44,7 @@ _ALONG_Y = f"{_RIGHT_ANGLE} 0 0"
 
 
 def climber_sdf(morphology: Morphology | None = None) -> str:
-    """The robot: model ``climber``, floating link ``base``, 18 joints, frames ``imu`` and ``attachment``."""
+    """Return the SDF of the robot: floating link ``base``, 18 joints, frames ``imu`` and ``attachment``."""
     m = morphology or Morphology()
     root, model = start_model("climber", "base", note=NOTE)
     _torso(model, m)
@@ -56,7 +56,7 @@ def climber_sdf(morphology: Morphology | None = None) -> str:
 
 
 def payload_sdf(morphology: Morphology | None = None) -> str:
-    """The attachment: model ``payload``, one link ``payload``, a cube of 1 kg that collides with nothing.
+    """Return the SDF of the attachment: one link ``payload``, a cube of 1 kg without collision geometry.
 
     The Context's ``SetMass`` scales its inertia with its mass.
     """
@@ -88,7 +88,7 @@ def _torso(model: ET.Element, m: Morphology) -> None:
 
 
 def _leg(model: ET.Element, m: Morphology, leg: str, *, p_BH: np.ndarray) -> None:
-    """Three links in a row; each link's frame is its joint's frame."""
+    """Return three links in a row; the frame of each link is that of its joint."""
     # Coxa: the thorax joint's housing (upright) and the basal joint's housing (across).
     half = m.coxa_mass / 2
     thorax = SpatialInertia.SolidCylinderWithMass(half, m.housing_radius, m.housing_length, [0, 0, 1])
@@ -136,7 +136,7 @@ def _sum(a: SpatialInertia, b: SpatialInertia) -> SpatialInertia:
 
 
 def write() -> None:
-    """Rewrites the shipped files."""
+    """Write the model files that are part of the repository."""
     MODELS.mkdir(exist_ok=True)
     CLIMBER_SDF.write_text(climber_sdf())
     PAYLOAD_SDF.write_text(payload_sdf())

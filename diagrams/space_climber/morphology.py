@@ -41,7 +41,7 @@ chapter 9, 1991), whose middle is 0.84. 0.8 lies between.
 
 @dataclass(frozen=True)
 class Morphology:
-    """Dimensions (m), masses (kg) and limits of the robot. [P], [D] and [A] are explained above."""
+    """The dimensions (m), masses (kg) and limits of the robot. [P], [D] and [A] are explained above."""
 
     # Torso: a box, with a plate on its front.
     torso_length: float = 0.80  # [A] leaves 0.2 m of CREX's 1 m [P] to head and legs
@@ -102,27 +102,27 @@ class Morphology:
 
     @property
     def attachment_x(self) -> float:
-        """Lever of the attachment: half the torso, the plate, half the cube."""
+        """Return the lever of the attachment: half the torso, the plate, half the cube."""
         return self.torso_length / 2 + self.plate_thickness + self.attachment_edge / 2
 
     @property
     def hips(self) -> NDArray[np.float64]:
-        """p_BH of the six hips, (6, 3)."""
+        """Return p_BH of the six hips, (6, 3)."""
         return _grid(self.hip_x, self.hip_y, 0.0)
 
     @property
     def stance(self) -> NDArray[np.float64]:
-        """p_BF of the six feet's centres in the nominal stance, (6, 3)."""
+        """Return p_BF of the centres of the six feet in the nominal stance, (6, 3)."""
         return _grid(self.stance_x, self.stance_y, self.foot_radius - self.torso_clearance)
 
     @property
     def joint_lower(self) -> NDArray[np.float64]:
-        """Lower ends of the joint ranges, (18,)."""
+        """Return the lower ends of the joint ranges, (18,)."""
         return np.tile([r[0] for r in (self.thorax_range, self.basal_range, self.distal_range)], len(LEGS))
 
     @property
     def joint_upper(self) -> NDArray[np.float64]:
-        """Upper ends of the joint ranges, (18,)."""
+        """Return the upper ends of the joint ranges, (18,)."""
         return np.tile([r[1] for r in (self.thorax_range, self.basal_range, self.distal_range)], len(LEGS))
 
 

@@ -1,4 +1,4 @@
-"""How heavy may a component attached to the robot's front be before it is no longer stable?
+"""Application O4: how heavy may a component on the front of the robot be before it is no longer stable?
 
 What could bend the answer was fixed before the first payload was simulated:
 
@@ -55,12 +55,12 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 
 
 def tipped_over(pitch: float) -> float:
-    """f of the paper: 0 while the pitch (rad) is within 45 deg, else 1."""
+    """Return f of the paper: 0 while the pitch (rad) is within 45 deg, else 1."""
     return 0.0 if abs(pitch) < np.pi / 4 else 1.0
 
 
 def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE, **environment: Any) -> vtb.Problem:
-    """The paper's five steps.
+    """State the question in the paper's five steps.
 
     Args:
         phases: start phases of the gait, in cycles.
@@ -79,7 +79,7 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
 
 
 def static_limit(testbed: vtb.VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: float = 0.0) -> float:
-    """The attached mass in kg at which the centre of mass lies over the front edge of the support polygon.
+    """Return the attached mass in kg at which the centre of mass lies over the front edge of the support polygon.
 
     The robot is in its default posture on level ground; the rest is the balance of moments
     m (x_a - x_e) = M (x_e - x_c) about the point x_e of the edge that lies straight ahead of the centre of mass.
@@ -108,7 +108,7 @@ def static_limit(testbed: vtb.VirtualTestbed, *, legs: Sequence[str] = LEGS, ahe
 
 
 def _front_edge(feet: np.ndarray, y: float) -> float:
-    """The largest x at ``y`` in the convex hull of the feet, shape (n, 2)."""
+    """Return the largest x at ``y`` in the convex hull of the feet, shape (n, 2)."""
     found = [
         a[0] + (y - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
         for a, b in itertools.permutations(feet, 2)
@@ -118,7 +118,7 @@ def _front_edge(feet: np.ndarray, y: float) -> float:
 
 
 def statics(testbed: vtb.VirtualTestbed) -> dict[str, float]:
-    """The static limit in kg for each way in which the feet stand during a tripod gait, and for six feet that rest."""
+    """Return the static limit in kg for each phase of a tripod gait, and for six feet at rest."""
     half = testbed.read(testbed.default_context(), STROKE) / 2.0
     tripod = [leg for leg, delay in zip(LEGS, TRIPOD.delays, strict=True) if delay == 0.0]
     return {
@@ -130,7 +130,7 @@ def statics(testbed: vtb.VirtualTestbed) -> dict[str, float]:
 
 
 def locked_problem(*, lower: float = 70.0, upper: float = 120.0) -> vtb.Problem:
-    """The same question for a robot that stands on six legs with all joints locked, where statics knows the answer."""
+    """State the question for a robot on six legs with locked joints, for which statics gives the answer."""
     scenario = SpaceClimberScenario(
         plant=vtb.PlantFields(time_step=0.002, contact_model="point", discrete_contact_approximation="sap"),
         simulator=vtb.SimulatorFields(),

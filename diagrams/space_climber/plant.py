@@ -1,4 +1,4 @@
-"""The robot's body in a MultibodyPlant: what scenario and benchmark both need around the SDF."""
+"""The body of the robot in a MultibodyPlant, for the scenario and for the benchmarks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, Morpholog
 def add_climber(
     plant: MultibodyPlant, *, morphology: Morphology | None = None, joint_stops: bool = False
 ) -> ModelInstanceIndex:
-    """Adds the robot, its joints' position servos, and its nominal stance as the default: feet on the plane z = 0.
+    """Add the robot with position servos at its joints; its default is the nominal stance, feet on the plane z = 0.
 
     The servos are Drake's implicit PD controllers (honoured by SAP, the lagged scheme and CENIC, not by explicit
     integrators), limited to the model's joint torque. Their gains cannot change after ``plant.Finalize``.
@@ -41,7 +41,7 @@ def add_climber(
 
 
 def add_payload(plant: MultibodyPlant, climber: ModelInstanceIndex) -> ModelInstanceIndex:
-    """Bolts the attachment (1 kg until ``SetMass`` of its body ``payload``) onto the front plate."""
+    """Weld the attachment (1 kg until ``SetMass`` of its body ``payload``) to the front plate."""
     (payload,) = Parser(plant).AddModels(str(PAYLOAD_SDF))
     frame = plant.GetFrameByName("attachment", climber)
     plant.WeldFrames(frame, plant.GetBodyByName("payload", payload).body_frame())
@@ -51,7 +51,7 @@ def add_payload(plant: MultibodyPlant, climber: ModelInstanceIndex) -> ModelInst
 def set_foot_friction(
     plant: MultibodyPlant, scene_graph: SceneGraph, climber: ModelInstanceIndex, friction: float
 ) -> None:
-    """Static and dynamic friction of all feet, before contexts are made.
+    """Set static and dynamic friction of all feet; to be called before contexts are made.
 
     Drake combines the frictions a and b of two bodies to 2 a b / (a + b): on ground of the same friction it is that.
     """

@@ -145,7 +145,7 @@ class SpaceClimberScenario(Scenario):
         self._declare_belief(builder)
 
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
-        """The robot believes itself to be where its odometry says, at the attitude and with the joints it senses."""
+        """Declare that the estimated pose and the sensed joint angles set the state of the simulated robot."""
         builder.believe(
             "sim.sys.climber.base.pose",
             of=["dps.env.position", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],

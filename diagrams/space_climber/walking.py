@@ -15,7 +15,7 @@ from vtbdrake.state.collectable import NO_DICT
 
 
 class GaitGenerator(LeafSystem):
-    """Turns a walk command and a heading into joint positions.
+    """A system that computes joint positions from a walk command and a heading.
 
     .. pydrake_system::
 
@@ -111,7 +111,7 @@ class GaitGenerator(LeafSystem):
 
 
 def make_walking(gait: Gait, *, period: float, morphology: Morphology) -> Diagram:
-    """The subsystem ``gait`` behind the input ports ``pose``, ``heading`` and ``walk``."""
+    """Build the subsystem ``gait`` with the input ports ``pose``, ``heading`` and ``walk``."""
     builder = DiagramBuilder()
     # One vector input costs a Python system a third of three.
     inputs = builder.AddNamedSystem("inputs", Multiplexer([6, 1, 1]))
@@ -124,5 +124,5 @@ def make_walking(gait: Gait, *, period: float, morphology: Morphology) -> Diagra
 
 
 def clamp(value: float, limit: float) -> float:
-    """``value`` within +- ``limit``."""
+    """Return ``value`` limited to +- ``limit``."""
     return limit if value > limit else (-limit if value < -limit else value)

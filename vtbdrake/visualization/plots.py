@@ -257,10 +257,13 @@ def draw_mesh(
     """Draw values on a full grid as cells around its points, with lines of equal value.
 
     Args:
-        x, y: where the points lie, ascending, shapes (n,) and (m,).
+        axes: where it is drawn.
+        x: where the columns lie, ascending, shape (n,).
+        y: where the rows lie, ascending, shape (m,).
         image: the values, shape (m, n); NaN leaves a hole.
         log: whether the cells lie around their points on a logarithmic scale, in x and y.
         lines: draw the lines.
+        cmap: the colour map.
     """
     cells = axes.pcolormesh(
         _edges(x, log=log[0]), _edges(y, log=log[1]), np.ma.masked_invalid(image), cmap=cmap, gid="h"

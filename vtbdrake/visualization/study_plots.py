@@ -285,7 +285,8 @@ def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
     numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
 
     Args:
-        addresses: of the parameters; of a study over one or two, these.
+        study: what is drawn.
+        addresses: one or two parameters; by default all of a study that has one or two.
 
     Raises:
         ValueError: there are no points, an address is none of the study's parameters, or there are not one or two.
