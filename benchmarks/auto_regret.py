@@ -16,6 +16,7 @@ from functools import cache, partial
 from multiprocessing import get_context
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
 from benchmarks.measure import LOWER, Benchmark
@@ -24,7 +25,6 @@ from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers import Evaluation, Point, make_solver
 from vtbdrake.rollout import RolloutRunner
-from vtbdrake.testbed import SimulatorFields
 
 BUDGETS = (30, 100, 400)
 SEEDS = range(5)
@@ -189,7 +189,7 @@ def pendulum() -> Problem:
     """Which swing of a pendulum ends near 0.3 rad, whatever its damping is? At worst, at each of `DAMPINGS`."""
     return vtb.Problem(
         # Less exact than usual, so that the benchmark is quick.
-        scenario=PendulumScenario(simulator=SimulatorFields(accuracy=1e-4, max_step_size=0.1)),
+        scenario=PendulumScenario(simulator_config=SimulatorConfig(accuracy=1e-4, max_step_size=0.1)),
         parameters=[vtb.Parameter(ANGLE, -1.5, 1.5), vtb.Parameter(RATE, -6.0, 6.0)],
         quality=vtb.Quality(lambda theta: abs(theta - 0.3), ANGLE, minimize=True, reading="end"),
         horizon=0.8,

@@ -67,5 +67,5 @@ class CppClimberScenario(SpaceClimberScenario):
         set_foot_friction(plant, scene_graph, climber, self.friction)
         rest = np.vstack([np.eye(JOINTS), np.zeros((JOINTS, JOINTS))])
         servos = builder.add("act", "servos", MatrixGain(rest))
-        builder.builder.Connect(servos.get_output_port(), plant.get_desired_state_input_port(climber))
+        builder.connect(servos.get_output_port(), plant.get_desired_state_input_port(climber))
         builder.sim_actuator("joint_position", servos.get_input_port())

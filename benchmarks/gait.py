@@ -129,7 +129,7 @@ def rebuilt(point: np.ndarray) -> float:
     """The quality at a point, of a testbed that is built for it."""
     testbed = SCENARIO.build()
     simulator = Simulator(testbed.diagram)
-    ApplySimulatorConfig(testbed.simulator_fields.config(), simulator)
+    ApplySimulatorConfig(testbed.simulator_config, simulator)
     context = simulator.get_mutable_context()
     for address, value in {**CONDITION, **dict(zip(BOUNDS, point, strict=True))}.items():
         testbed.variables()[address].set(context, value)

@@ -30,14 +30,14 @@ class PlainClimber:
     def simulator(self) -> Simulator:
         """A new simulator at t = 0."""
         simulator = Simulator(self.diagram)
-        ApplySimulatorConfig(self.scenario.simulator.config(), simulator)
+        ApplySimulatorConfig(self.scenario.simulator_config, simulator)
         return simulator
 
 
 def build_plain_climber(scenario: SpaceClimberScenario, *, heading: float = 0.0, walk: float = 1.0) -> PlainClimber:
     """The same world and DPS as the scenario's, on level ground."""
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(scenario.plant.config(), builder)
+    plant, scene_graph = AddMultibodyPlant(scenario.plant_config, builder)
     climber = add_climber(plant)
     add_payload(plant, climber)
     contact = CoulombFriction(scenario.friction, scenario.friction)

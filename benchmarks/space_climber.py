@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import Simulator, SimulatorConfig
 
 import vtbdrake as vtb
 from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, seconds, spread
@@ -16,7 +16,7 @@ from diagrams.space_climber.payload import HORIZON, MASS, PITCH, SAMPLE_PERIOD, 
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 
 DISTANCE = "sim.sys.climber.base.x"
-REFERENCE = vtb.SimulatorFields("cenic", 0.1, 1e-6)
+REFERENCE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.1, accuracy=1e-6)
 
 
 def testbed_overhead(repeats: int = 20, chunk: float = 0.5) -> Benchmark:
@@ -114,15 +114,18 @@ def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
     """Simulated seconds per wall second of one rollout with the scenario's settings, and why it has them."""
     scenario = SpaceClimberScenario()
     reference = _walk(scenario, REFERENCE)
-    step = scenario.simulator.max_step_size
-    candidates = {f"accuracy {a:g}": vtb.SimulatorFields("cenic", step, a) for a in (1e-2, 1e-3, 1e-4)}
+    step = scenario.simulator_config.max_step_size
+    candidates = {
+        f"accuracy {a:g}": SimulatorConfig(integration_scheme="cenic", max_step_size=step, accuracy=a)
+        for a in (1e-2, 1e-3, 1e-4)
+    }
     rows = []
     for name, fields in candidates.items():
         rtf, distance = _measured(scenario, fields, 2)
         rows.append(f"{name}: RTF {rtf:.1f}, distance {100 * (distance / reference - 1):+.2f} %")
-    rtf, distance = _measured(scenario, scenario.simulator, repeats)
+    rtf, distance = _measured(scenario, scenario.simulator_config, repeats)
     error = abs(distance / reference - 1.0)
-    chosen, fine = (_first_tipping(scenario, fields) for fields in (scenario.simulator, REFERENCE))
+    chosen, fine = (_first_tipping(scenario, fields) for fields in (scenario.simulator_config, REFERENCE))
     study = "; ".join(rows)
     return [
         Benchmark(
@@ -140,26 +143,26 @@ def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
     ]  # fmt: skip
 
 
-def _runner(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> RolloutRunner:
+def _runner(scenario: SpaceClimberScenario, fields: SimulatorConfig) -> RolloutRunner:
     quality = vtb.Quality(tipped_over, of=PITCH)
-    scenario = replace(scenario, simulator=fields)
+    scenario = replace(scenario, simulator_config=fields)
     return RolloutRunner(
         RolloutTask(scenario, HORIZON, quality, threshold=0.9, sample_period=SAMPLE_PERIOD, record=(DISTANCE,))
     )
 
 
-def _walk(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> float:
+def _walk(scenario: SpaceClimberScenario, fields: SimulatorConfig) -> float:
     return float(_runner(scenario, fields).run({MASS: 0.0}).record[DISTANCE][-1])
 
 
-def _measured(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields, repeats: int) -> tuple[float, float]:
+def _measured(scenario: SpaceClimberScenario, fields: SimulatorConfig, repeats: int) -> tuple[float, float]:
     """(real-time factor, distance walked), the median of ``repeats`` rollouts."""
     runner = _runner(scenario, fields)
     results = [runner.run({MASS: 0.0}) for _ in range(repeats)]
     return HORIZON / float(np.median([r.wall_time for r in results])), float(results[0].record[DISTANCE][-1])
 
 
-def _first_tipping(scenario: SpaceClimberScenario, fields: vtb.SimulatorFields) -> float:
+def _first_tipping(scenario: SpaceClimberScenario, fields: SimulatorConfig) -> float:
     """The least of the masses around the boundary, in steps of 1 kg, that tips the robot over."""
     runner = _runner(scenario, fields)
     return next((m for m in np.arange(32.0, 45.0) if runner.run({MASS: m}).end == "threshold"), np.inf)

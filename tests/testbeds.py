@@ -8,14 +8,20 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
 from pydrake.systems.primitives import Adder, Demultiplexer, Gain, ZeroOrderHold
 
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PENDULUM = "package://drake/examples/pendulum/Pendulum.urdf"
 ACROBOT = "package://drake/examples/acrobot/Acrobot.urdf"
+
+
+def _accurate() -> SimulatorConfig:
+    return SimulatorConfig(accuracy=1e-6, max_step_size=0.05)
 
 
 @dataclass
@@ -25,7 +31,9 @@ class PendulumScenario(Scenario):
     With gains of zero it swings freely.
     """
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-6, max_step_size=0.05))
+    simulator_config: SimulatorConfig = field(
+        default_factory=lambda: SimulatorConfig(accuracy=1e-6, max_step_size=0.05)
+    )
     stiffness: float = 0.0
     damping: float = 0.0
     idle: float = 0.0
@@ -57,7 +65,7 @@ class PendulumScenario(Scenario):
         return builder.Build()
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, _ = builder.add_plant(PlantFields())
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=0.0))
         Parser(plant).AddModelsFromUrl(PENDULUM)
         plant.Finalize()
         builder.sim_sensor("joint_state", plant.get_state_output_port())
@@ -105,7 +113,9 @@ class SampledFeedback(LeafSystem):
 class AcrobotScenario(Scenario):
     """Drake's acrobot with a sampled Python DPS; one joint sensor, held and thereby delayed by a period."""
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields(accuracy=1e-6, max_step_size=0.05))
+    simulator_config: SimulatorConfig = field(
+        default_factory=lambda: SimulatorConfig(accuracy=1e-6, max_step_size=0.05)
+    )
     period: float = 0.02
     time_step: float = 0.0
 
@@ -119,11 +129,11 @@ class AcrobotScenario(Scenario):
         return SampledFeedback(self.period)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, _ = builder.add_plant(PlantFields(time_step=self.time_step))
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
         Parser(plant).AddModelsFromUrl(ACROBOT)
         plant.Finalize()
         sensor = builder.add("sense", "joints", ZeroOrderHold(self.period, 4))
-        builder.builder.Connect(plant.get_state_output_port(), sensor.get_input_port())
+        builder.connect(plant.get_state_output_port(), sensor.get_input_port())
         builder.sim_sensor("joint_state", sensor.get_output_port())
         builder.sim_actuator("torque", plant.get_actuation_input_port())
 

@@ -7,6 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 from drake import lcmt_force_torque, lcmt_scope
+from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 
 from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
@@ -22,8 +23,6 @@ from vtbdrake.components.sensors import (
     JointEncoders,
     JointTachometers,
     JointTorqueSensors,
-    SampledSensor,
-    connect_to_plant,
 )
 from vtbdrake.control.operation import Operation
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
@@ -32,7 +31,6 @@ from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.testbed import (
     Interface,
-    PlantFields,
     Scenario,
     ScenarioError,
     Signal,
@@ -43,9 +41,9 @@ LARGEST_DELAY = 50
 """Of the drives' commands, in periods."""
 
 
-def _plant() -> PlantFields:
+def _plant() -> MultibodyPlantConfig:
     # Unsampled: reaction forces follow from the state, so that copies of it continue with the same readings.
-    return PlantFields(time_step=0.001, contact_model="point", use_sampled_output_ports=False)
+    return MultibodyPlantConfig(time_step=0.001, contact_model="point", use_sampled_output_ports=False)
 
 
 @dataclass
@@ -53,7 +51,7 @@ class ManipulatorScenario(Scenario):
     """A torque-controlled arm; the command ``u.motion`` chooses what it does, the gains are ``dps.impl.*``."""
 
     # Discrete: reaction forces and contact of the same step.
-    plant: PlantFields = field(default_factory=_plant)
+    plant_config: MultibodyPlantConfig = field(default_factory=_plant)
     # joint_impedance, cartesian_impedance or admittance.
     law: str = "cartesian_impedance"
     # Of sensors, DPS and drives, in seconds.
@@ -81,7 +79,7 @@ class ManipulatorScenario(Scenario):
         checks = {
             "law": (self.law in LAWS, f"one of {', '.join(LAWS)}"),
             "period": (self.period > 0.0, "positive, in s"),
-            "plant.time_step": (self.plant.time_step > 0.0, "positive, in s: the testbed is discrete"),
+            "plant_config.time_step": (self.plant_config.time_step > 0.0, "positive, in s: the testbed is discrete"),
             "wall_stiffness": (self.wall_stiffness > 0.0, "positive, in N/m"),
             "wall_dissipation": (self.wall_dissipation >= 0.0, "not negative"),
             "wall_friction": (self.wall_friction >= 0.0, "not negative"),
@@ -89,7 +87,7 @@ class ManipulatorScenario(Scenario):
         for name, (good, expected) in checks.items():
             if not good:
                 owner, _, item = f"self.{name}".rpartition(".")
-                value = self.plant.time_step if owner.endswith("plant") else getattr(self, item)
+                value = self.plant_config.time_step if owner.endswith("plant_config") else getattr(self, item)
                 raise ScenarioError(f"ManipulatorScenario.{name} must be {expected}, not {value!r}")
         for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors"):
             try:
@@ -185,7 +183,7 @@ class ManipulatorScenario(Scenario):
         from diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
 
         arm = Arm()
-        plant, scene_graph = builder.add_plant(self.plant)
+        plant, scene_graph = builder.add_plant(self.plant_config)
         instance = add_arm(plant, arm)
         if self.wall:
             add_wall(
@@ -201,16 +199,12 @@ class ManipulatorScenario(Scenario):
         joints = [plant.GetJointByName(name, instance) for name in JOINT_NAMES]
         flange = plant.GetJointByName("flange", instance)
         T = self.period
-        sensors: dict[str, SampledSensor] = {
-            "joint_position": JointEncoders(plant, joints, period=T, errors=self.position_errors),
-            "joint_velocity": JointTachometers(plant, joints, period=T, errors=self.velocity_errors),
-            "joint_torque_measured": JointTorqueSensors(plant, joints, period=T, errors=self.torque_errors),
-            "wrench": ForceTorqueSensor(plant, flange, period=T, errors=self.wrench_errors),
-        }
-        for signal, sensor in sensors.items():
-            builder.add("sense", signal, sensor)
-            connect_to_plant(builder.builder, sensor, plant)
-            builder.sim_sensor(signal, sensor.get_output_port())
+        builder.add_sensor("joint_position", JointEncoders(plant, joints, period=T, errors=self.position_errors))
+        builder.add_sensor("joint_velocity", JointTachometers(plant, joints, period=T, errors=self.velocity_errors))
+        builder.add_sensor(
+            "joint_torque_measured", JointTorqueSensors(plant, joints, period=T, errors=self.torque_errors)
+        )
+        builder.add_sensor("wrench", ForceTorqueSensor(plant, flange, period=T, errors=self.wrench_errors))
 
         drives = JointDrives(
             plant,
@@ -225,12 +219,12 @@ class ManipulatorScenario(Scenario):
             initial=gravity_torque(ArmDynamics(arm)),
         )
         builder.add("act", "drives", drives)
-        builder.builder.Connect(plant.get_state_output_port(), drives.GetInputPort("state"))
-        builder.builder.Connect(drives.get_output_port(), plant.get_actuation_input_port(instance))
+        builder.connect(plant.get_state_output_port(), drives.GetInputPort("state"))
+        builder.connect(drives.get_output_port(), plant.get_actuation_input_port(instance))
         builder.sim_actuator("joint_torque", drives.GetInputPort("command"))
 
         push = builder.add("env", "push", Push(plant, "tip"))
-        builder.builder.Connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
+        builder.connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
         for k, name in enumerate(JOINT_NAMES):
             for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
                 # All joints in one reading: whoever looks at the belief while the loop runs has little time.

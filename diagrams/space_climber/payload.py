@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
 from diagrams.space_climber.gait import TRIPOD
@@ -132,8 +134,8 @@ def statics(testbed: vtb.VirtualTestbed) -> dict[str, float]:
 def locked_problem(*, lower: float = 70.0, upper: float = 120.0) -> vtb.Problem:
     """State the question for a robot on six legs with locked joints, for which statics gives the answer."""
     scenario = SpaceClimberScenario(
-        plant=vtb.PlantFields(time_step=0.002, contact_model="point", discrete_contact_approximation="sap"),
-        simulator=vtb.SimulatorFields(),
+        plant_config=MultibodyPlantConfig(time_step=0.002, contact_model="point", discrete_contact_approximation="sap"),
+        simulator_config=SimulatorConfig(),
     )
     locks = {f"sim.sys.climber.{name}.locked": 1.0 for name in JOINT_NAMES}
     return vtb.Problem(

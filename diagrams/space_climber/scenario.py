@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import CoulombFriction
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
@@ -23,33 +24,35 @@ from diagrams.space_climber.morphology import (
     Morphology,
 )
 from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
-from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, connect_to_plant
+from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
 from vtbdrake.testbed import (
     Interface,
-    PlantFields,
     Scenario,
     ScenarioError,
     Signal,
-    SimulatorFields,
     VirtualTestbedBuilder,
 )
 
 JOINTS = len(JOINT_NAMES)
 
 
-def _cenic() -> SimulatorFields:
+def _cenic() -> SimulatorConfig:
     # Chosen by the convergence study that the benchmark `rollout_rtf` prints. The samples of the DPS end every step, so
     # that the largest step only has to be longer than their period.
-    return SimulatorFields(integration_scheme="cenic", max_step_size=0.025, accuracy=1e-3)
+    return SimulatorConfig(integration_scheme="cenic", max_step_size=0.025, accuracy=1e-3)
+
+
+def _continuous() -> MultibodyPlantConfig:
+    return MultibodyPlantConfig(time_step=0.0, contact_model="point", stiction_tolerance=1e-3)
 
 
 @dataclass
 class SpaceClimberScenario(Scenario):
     """A six-legged robot on a plane; the address ``sim.sys.payload.mass`` is the mass attached to its front."""
 
-    simulator: SimulatorFields = field(default_factory=_cenic)
+    simulator_config: SimulatorConfig = field(default_factory=_cenic)
     # Contact is between point feet and a plane. A continuous plant is for CENIC; its joints cannot be locked.
-    plant: PlantFields = field(default_factory=lambda: PlantFields(contact_model="point", stiction_tolerance=1e-3))
+    plant_config: MultibodyPlantConfig = field(default_factory=_continuous)
     # Acceleration of free fall in m/s^2.
     gravity: float = LUNAR_GRAVITY
     # The ground falls in the direction of x, in which the robot looks, by this angle; uphill it is negative.
@@ -107,7 +110,7 @@ class SpaceClimberScenario(Scenario):
         return make_dps(self.gait, period=self.period)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, scene_graph = builder.add_plant(self.plant)
+        plant, scene_graph = builder.add_plant(self.plant_config)
         climber = add_climber(plant, joint_stops=self.joint_stops)
         if self.payload:
             add_payload(plant, climber)
@@ -128,19 +131,14 @@ class SpaceClimberScenario(Scenario):
         feet = [plant.GetBodyByName(name, climber) for name in FOOT_LINKS]
         joints = [plant.GetJointByName(name, climber) for name in JOINT_NAMES]
         imu_frame = plant.GetFrameByName("imu", climber)
-        sensors = {
-            "imu": builder.add("sense", "imu", Imu(plant, imu_frame, period=self.period)),
-            "joint_encoders": builder.add("sense", "encoders", JointEncoders(plant, joints, period=self.period)),
-            "foot_contact": builder.add("sense", "foot_contact", ContactSensor(plant, feet, period=self.period)),
-        }
-        for signal, sensor in sensors.items():
-            connect_to_plant(builder.builder, sensor, plant)
-            builder.sim_sensor(signal, sensor.get_output_port())
+        builder.add_sensor("imu", Imu(plant, imu_frame, period=self.period))
+        builder.add_sensor("joint_encoders", JointEncoders(plant, joints, period=self.period), name="encoders")
+        builder.add_sensor("foot_contact", ContactSensor(plant, feet, period=self.period))
 
         # The servos are the plant's own PD controllers; they are to reach the position and to rest there.
         rest = np.vstack([np.eye(JOINTS), np.zeros((JOINTS, JOINTS))])
         servos = builder.add("act", "servos", MatrixGain(rest))
-        builder.builder.Connect(servos.get_output_port(), plant.get_desired_state_input_port(climber))
+        builder.connect(servos.get_output_port(), plant.get_desired_state_input_port(climber))
         builder.sim_actuator("joint_position", servos.get_input_port())
         self._declare_belief(builder)
 

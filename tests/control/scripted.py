@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, ZeroOrderHold
 
 from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.clock import Clock
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.001
 
@@ -105,7 +106,7 @@ class Servo(LeafSystem):
 class ServoScenario(Scenario):
     """Two axes without mass that are commanded by their velocity; a rate of 0 is no limit."""
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-6))
+    simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1, accuracy=1e-6))
     rate: float = 2.0
 
     def interface(self) -> Interface:
@@ -124,7 +125,7 @@ class ServoScenario(Scenario):
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         axes = builder.add("sys", "axes", DiscreteTimeIntegrator(2, PERIOD))
         drives = builder.add("act", "drives", ZeroOrderHold(PERIOD, 2))
-        builder.builder.Connect(drives.get_output_port(), axes.get_input_port())
+        builder.connect(drives.get_output_port(), axes.get_input_port())
         builder.sim_sensor("position", axes.get_output_port())
         builder.sim_sensor("speed", drives.get_output_port())
         builder.sim_actuator("velocity", drives.get_input_port())

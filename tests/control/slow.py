@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, DiscreteTimeIntegrator, Gain, ZeroOrderHold
 
 from tests.control.scripted import PERIOD
-from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, SlowPart, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, SlowPart, VirtualTestbedBuilder
 
 
 def chaotic(position: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +58,7 @@ def picky(position: np.ndarray) -> np.ndarray:
 class SlowScenario(Scenario):
     """Two axes whose velocity is estimate - position."""
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-6))
+    simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1, accuracy=1e-6))
     period: float = 0.02
     latency: float = 0.01
     function: Callable[..., Any] = chaotic

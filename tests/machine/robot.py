@@ -11,13 +11,15 @@ import lcm
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import Demultiplexer
 
 from tests.testbeds import ACROBOT
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.001
 ELBOW = "sim.sys.Acrobot.elbow.position"
@@ -55,7 +57,7 @@ class Swing(LeafSystem):
 class RobotScenario(Scenario):
     """The acrobot in steps of a millisecond."""
 
-    simulator: SimulatorFields = field(default_factory=SimulatorFields)
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     time_step: float = PERIOD
 
     def interface(self) -> Interface:
@@ -68,11 +70,11 @@ class RobotScenario(Scenario):
         return Swing(PERIOD)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, _ = builder.add_plant(PlantFields(time_step=self.time_step))
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
         Parser(plant).AddModelsFromUrl(ACROBOT)
         plant.Finalize()
         split = builder.add("sense", "joints", Demultiplexer([2, 2]))
-        builder.builder.Connect(plant.get_state_output_port(), split.get_input_port())
+        builder.connect(plant.get_state_output_port(), split.get_input_port())
         builder.sim_sensor("position", split.get_output_port(0))
         builder.sim_sensor("velocity", split.get_output_port(1))
         builder.sim_actuator("torque", plant.get_actuation_input_port())

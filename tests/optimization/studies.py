@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import System
 from pydrake.systems.primitives import LinearSystem, MatrixGain
 
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.rollout import Executor, Quality, RolloutResult, RolloutTask
-from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 THETA = "sim.sys.Pendulum.theta.position"
 RATE = "sim.sys.Pendulum.theta.velocity"
@@ -42,7 +43,7 @@ def pendulum_problem(**more: object) -> Problem:
 class DoubleIntegratorScenario(Scenario):
     """x'' = u with u = -stiffness x - damping x': the gains are fields, so that each pair takes another diagram."""
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-7))
+    simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1, accuracy=1e-7))
     stiffness: float = 0.5
     damping: float = 1.0
 

@@ -5,15 +5,19 @@ import contextlib
 import casadi
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import minimize_scalar
 
 from tests.optimization.studies import DAMPING, RATE, THETA, pendulum_problem
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Choice
 from vtbdrake.rollout import Quality, QualityError
-from vtbdrake.testbed import SimulatorFields
 
-FIXED = PendulumScenario(simulator=SimulatorFields("runge_kutta3", 0.005, 1e-3, use_error_control=False))
+FIXED = PendulumScenario(
+    simulator_config=SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=0.005, accuracy=1e-3, use_error_control=False
+    )
+)
 QUIET = {"ipopt.print_level": 0, "print_time": False, "ipopt.hessian_approximation": "limited-memory"}
 
 

@@ -4,6 +4,7 @@ from math import inf
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario
@@ -22,7 +23,7 @@ def _angle(theta):
 
 def _problem(**changes):
     arguments = dict(
-        scenario=PendulumScenario(simulator=vtb.SimulatorFields(accuracy=1e-6, max_step_size=0.05)),
+        scenario=PendulumScenario(simulator_config=SimulatorConfig(accuracy=1e-6, max_step_size=0.05)),
         parameters=[vtb.Parameter(OMEGA, 0.0, 8.0)],
         quality=vtb.Quality(_angle, THETA),
         horizon=3.0,
@@ -210,7 +211,11 @@ def test_what_to_record_may_be_one_address():
 
 
 def test_a_sweep_of_failures_has_no_best_point():
-    scenario = AcrobotScenario(simulator=vtb.SimulatorFields("explicit_euler", 0.05, use_error_control=False))
+    scenario = AcrobotScenario(
+        simulator_config=SimulatorConfig(
+            integration_scheme="explicit_euler", max_step_size=0.05, use_error_control=False
+        )
+    )
     problem = vtb.Problem(
         scenario=scenario,
         parameters=[vtb.Parameter("dps.gain[2]", 100.0, 1000.0)],

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import brentq
 from scipy.special import ellipj, ellipk
 
@@ -29,7 +30,6 @@ from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
 from vtbdrake.optimization.solvers import Solver
 from vtbdrake.optimization.solvers.catalogue import CATALOGUE
 from vtbdrake.rollout import Constraint, Quality, QualityError
-from vtbdrake.testbed import SimulatorFields
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -106,7 +106,7 @@ def test_fields_choices_and_integers_can_be_varied():
     problem = Problem(
         scenario=PendulumScenario(),
         parameters=[
-            Choice("scenario.simulator.integration_scheme", ["runge_kutta3", "implicit_euler"]),
+            Choice("scenario.simulator_config.integration_scheme", ["runge_kutta3", "implicit_euler"]),
             Parameter("scenario.stiffness", 0, 1, integer=True),
             Choice(DAMPING, [0.0, 0.3]),
         ],
@@ -602,14 +602,16 @@ def test_failed_simulations_are_outcomes_and_are_told():
 
 @pytest.mark.parametrize("solver", ["SNOPT", "LD_SLSQP"])
 def test_a_gradient_by_autodiff_leads_to_the_same_optimum_with_fewer_rollouts(solver):
-    fixed = SimulatorFields("runge_kutta3", 0.005, 1e-3, use_error_control=False)
+    fixed = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=0.005, accuracy=1e-3, use_error_control=False
+    )
     conditions = [{DAMPING: 0.0}, {DAMPING: 0.4}]
 
     def miss(theta, rate):
         return (theta - 0.3) ** 2 + 0.1 * (rate - 1.0) ** 2
 
     problem = pendulum_problem(
-        scenario=PendulumScenario(simulator=fixed),
+        scenario=PendulumScenario(simulator_config=fixed),
         quality=Quality(miss, [THETA, RATE], minimize=True, reading="end"),
         conditions=conditions,
         risk="mean",

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from drake import lcmt_image
 from pydrake.common.value import Value
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 from pydrake.systems.sensors import ImageGrey8U
@@ -16,7 +17,7 @@ from tests.control.scripted import PERIOD
 from vtbdrake.lcm.drake_messages import iiwa_command
 from vtbdrake.lcm.images import image_map
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.testbed import Interface, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 WIDTH, HEIGHT = 8, 6
 
@@ -54,7 +55,7 @@ def brightness(pixels: np.ndarray) -> float:
 class SeeingScenario(Scenario):
     """The camera sees nothing in simulation."""
 
-    simulator: SimulatorFields = field(default_factory=lambda: SimulatorFields("runge_kutta3", 0.1, 1e-6))
+    simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1, accuracy=1e-6))
 
     def interface(self) -> Interface:
         return Interface(

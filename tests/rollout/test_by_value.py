@@ -1,38 +1,56 @@
 """What a notebook or a script defines travels to workers: functions, scenarios, and systems derived from Drake's."""
 
-import re
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
 
-ROOT = Path(__file__).resolve().parents[2]
+ACROBOT = """
+from dataclasses import dataclass, field
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.framework import BasicVector, LeafSystem
+import vtbdrake as vtb
+from vtbdrake.components.sensors import ErrorModel, JointEncoders
+from vtbdrake.state import parameter
 
-CONTROLLER = """
-from pydrake.systems.framework import LeafSystem
-
-class MyController(LeafSystem):
-    def __init__(self, period):
+class Spring(LeafSystem):
+    def __init__(self):
         super().__init__()
-        self._joints = self.DeclareVectorInputPort("joint_state", 4)
-        torque = self.DeclareDiscreteState(1)
-        self.DeclareStateOutputPort("torque", torque)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        stiffness = self.DeclareNumericParameter(BasicVector([2.0]))
+        self.variables = (parameter("stiffness", stiffness, unit="N m/rad", bounds=(0.0, 100.0)),)    # dps.stiffness
+        self.angles = self.DeclareVectorInputPort("joint_position", 2)
+        self.DeclareVectorOutputPort("torque", 1, self.calc_torque)
 
-    def _update(self, context, discrete):
-        discrete.set_value(0, [-3.0 * self._joints.Eval(context)[2]])
+    def calc_torque(self, context, output):
+        output.SetFromVector(-context.get_numeric_parameter(0).value() * self.angles.Eval(context)[1])
+
+@dataclass
+class Acrobot(vtb.Scenario):
+    plant_config: MultibodyPlantConfig = field(default_factory=lambda: MultibodyPlantConfig(time_step=0.0))
+    period: float = 0.02
+    errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.001))
+
+    def interface(self):
+        return vtb.Interface(
+            sense=[vtb.Signal("joint_position", size=2, unit="rad", max_age=0.1)],
+            act=[vtb.Signal("torque", size=1, unit="N m", lower=-10, upper=10, idle=0.0)],
+        )
+
+    def make_dps(self):
+        return Spring()                       # one System, whose ports have the names of the signals
+
+    def add_world(self, builder):
+        plant, scene_graph = builder.add_plant(self.plant_config)
+        Parser(plant).AddModelsFromUrl("package://drake/examples/acrobot/Acrobot.urdf")
+        plant.Finalize()
+        joints = [plant.GetJointByName(name) for name in ("shoulder", "elbow")]
+        builder.add_sensor("joint_position", JointEncoders(plant, joints, period=self.period, errors=self.errors))
+        builder.sim_actuator("torque", plant.get_actuation_input_port())
 """
-
-
-def _readme_acrobot() -> str:
-    """The scenario class that README shows, without what it then does with it."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    (block,) = (block for block in blocks if "class Acrobot(" in block)
-    return block.partition("testbed = ")[0]
 
 
 STUDY = """
@@ -46,8 +64,8 @@ print([trial.value for trial in study.trials] == [trial.value for trial in alone
 """
 
 
-def test_readmes_acrobot_in_notebook_cells_is_studied_with_the_defaults(tmp_path):
-    cells = [nbformat.v4.new_code_cell(text) for text in (CONTROLLER, _readme_acrobot(), STUDY)]
+def test_a_scenario_of_notebook_cells_is_studied_with_the_defaults(tmp_path):
+    cells = [nbformat.v4.new_code_cell(text) for text in (ACROBOT, STUDY)]
     notebook = nbformat.v4.new_notebook(cells=cells)
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
     printed = "".join(output.get("text", "") for output in cells[-1].outputs if output.get("name") == "stdout")
@@ -86,7 +104,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("kind", ["processes", "pool", "dask"])
 def test_a_system_of_the_main_script_runs_in_workers(kind, tmp_path, request):
     script = tmp_path / "script.py"
-    script.write_text(CONTROLLER + _readme_acrobot() + textwrap.dedent(SCRIPT))
+    script.write_text(ACROBOT + textwrap.dedent(SCRIPT))
     more = [request.getfixturevalue("cluster").address] if kind == "dask" else []
     done = subprocess.run(
         [sys.executable, str(script), kind, *more], cwd=tmp_path, capture_output=True, text=True, timeout=120

@@ -2,21 +2,21 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 
 from tests.optimization.studies import DoubleIntegratorScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import Quality, RolloutRunner, RolloutTask
 from vtbdrake.rollout.derivative import DerivativeError, DerivativeRunner
-from vtbdrake.testbed import SimulatorFields
 
 THETA, RATE = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
 DAMPING, MASS = "sim.sys.Pendulum.theta.damping", "sim.sys.Pendulum.arm_point_mass.mass"
-FIXED = SimulatorFields("runge_kutta3", 0.005, 1e-3, use_error_control=False)
+FIXED = SimulatorConfig(max_step_size=0.005, accuracy=1e-3, use_error_control=False)
 POINT = {THETA: 0.7, RATE: -0.4, DAMPING: 0.2, "u.angle": 0.3}
 
 
 def task(quality, **scenario):
-    return RolloutTask(PendulumScenario(simulator=FIXED, **scenario), 1.0, quality, sample_period=0.05)
+    return RolloutTask(PendulumScenario(simulator_config=FIXED, **scenario), 1.0, quality, sample_period=0.05)
 
 
 def differences(stated, point, by, step=1e-4):
@@ -44,7 +44,7 @@ def test_derivatives_are_those_of_central_differences(reading, minimize):
 
 def test_the_derivative_of_free_motion_is_known():
     # x'' = 0 without gains: x(T) = x0 + v0 T, and (x(T)^2)' = 2 x(T) (1, T).
-    scenario = DoubleIntegratorScenario(simulator=FIXED, stiffness=0.0, damping=0.0)
+    scenario = DoubleIntegratorScenario(simulator_config=FIXED, stiffness=0.0, damping=0.0)
     x, v = "sim.sys.mass.continuous_state[0]", "sim.sys.mass.continuous_state[1]"
     stated = RolloutTask(scenario, 2.0, Quality(lambda y: y[0] ** 2, "sim.sys.mass.y0", reading="end"))
     value, gradient = DerivativeRunner(stated, scenario.build()).run({x: 1.0, v: -0.2}, [x, v])
@@ -54,12 +54,12 @@ def test_the_derivative_of_free_motion_is_known():
 
 def test_error_control_is_refused():
     stated = RolloutTask(PendulumScenario(), 1.0, Quality(abs, THETA))
-    with pytest.raises(DerivativeError, match="set simulator.use_error_control to false"):
+    with pytest.raises(DerivativeError, match="set simulator_config.use_error_control to false"):
         DerivativeRunner(stated, stated.scenario.build())
 
 
 def test_a_python_system_that_does_not_convert_is_named():
-    stated = RolloutTask(AcrobotScenario(simulator=FIXED), 1.0, Quality(abs, "time"))
+    stated = RolloutTask(AcrobotScenario(simulator_config=FIXED), 1.0, Quality(abs, "time"))
     with pytest.raises(DerivativeError, match="SampledFeedback"):
         DerivativeRunner(stated, stated.scenario.build())
 

@@ -59,7 +59,7 @@ def _results(executor, task, points):
 
 
 def test_a_field_gives_what_a_scenario_of_that_value_gives():
-    points = [{THETA: 0.5}, {THETA: 0.5, STIFFNESS: 2.0}, {STIFFNESS: 2.0, "scenario.simulator.accuracy": 1e-2}]
+    points = [{THETA: 0.5}, {THETA: 0.5, STIFFNESS: 2.0}, {STIFFNESS: 2.0, "scenario.simulator_config.accuracy": 1e-2}]
     with SerialExecutor() as executor:
         plain, stiff, coarse = _results(executor, _task(), points)
     expected = RolloutRunner(_task(CountedScenario(stiffness=2.0))).run({THETA: 0.5})

@@ -2,23 +2,26 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 
 from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import RolloutRunner, RolloutTask
-from vtbdrake.testbed import SimulatorFields
 
 # Name -> (scenario, an address of its state, seconds before the fork, seconds after it)
 CASES = {
     "CENIC, walking": (SpaceClimberScenario(), "sim.sys.climber.base.pose", 0.61, 0.6),
     "RK3, sampled": (
-        AcrobotScenario(simulator=SimulatorFields("runge_kutta3", 0.2, 1e-3), period=0.3),
+        AcrobotScenario(
+            simulator_config=SimulatorConfig(max_step_size=0.2, accuracy=1e-3),
+            period=0.3,
+        ),
         "sim.sys.Acrobot.elbow.position",
         1.13,
         3.0,
     ),
     "RK3, without samples": (
-        PendulumScenario(simulator=SimulatorFields("runge_kutta3", 0.5, 1e-4)),
+        PendulumScenario(simulator_config=SimulatorConfig(max_step_size=0.5, accuracy=1e-4)),
         "sim.sys.Pendulum.theta.position",
         1.13,
         3.0,

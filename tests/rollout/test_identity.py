@@ -40,7 +40,7 @@ def case(request):
     scenario, address, field, values = TESTBEDS[request.param]
     task = RolloutTask(scenario, 1.0, Quality(_angle, address), threshold=2.0, record=("plant.state",), keep_state=True)
     points = [{address: 0.1 + 0.5 * i} for i in range(5)]
-    points += [{address: 0.5, field: value, "scenario.simulator.accuracy": 1e-3} for value in values]
+    points += [{address: 0.5, field: value, "scenario.simulator_config.accuracy": 1e-3} for value in values]
     with SerialExecutor() as serial:
         expected = run_rollouts(serial, task, points, progress=False)
     assert {result.end for result in expected} == {"horizon", "threshold"}

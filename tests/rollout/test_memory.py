@@ -4,13 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, ThreadExecutor
-from vtbdrake.testbed import SimulatorFields
 
 THETA = "sim.sys.Pendulum.theta.position"
-COARSE = SimulatorFields("explicit_euler", max_step_size=0.01, use_error_control=False)
+COARSE = SimulatorConfig(integration_scheme="explicit_euler", max_step_size=0.01, use_error_control=False)
 TASK = RolloutTask(PendulumScenario(COARSE), 0.01, Quality(abs, THETA), sample_period=0.01)
 # Bytes: a tenth of what the results would take if they were kept.
 TOLERANCE = 1e6

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydrake.systems.analysis import SimulatorConfig
 
 from tests.testbeds import AcrobotScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutRunner, RolloutTask
 from vtbdrake.rollout.quality import best_sample, exceeds
-from vtbdrake.testbed import SimulatorFields
 
 PERIOD = 0.1
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -180,7 +180,7 @@ def test_samples_cost_no_steps_of_their_own_where_events_coincide(period, sample
 
 
 def test_a_rollout_takes_the_steps_of_a_simulation_that_stops_at_events():
-    scenario = AcrobotScenario(simulator=SimulatorFields("runge_kutta3", 0.02, use_error_control=False))
+    scenario = AcrobotScenario(simulator_config=SimulatorConfig(max_step_size=0.02, use_error_control=False))
     task = RolloutTask(scenario, 15.0, Quality(abs, SHOULDER), sample_period=0.1)
     runner = RolloutRunner(task)
     result = runner.run({SHOULDER: 0.5})

@@ -4,17 +4,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import LeafSystem
 from scipy.special import ellipk
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
 from vtbdrake.rollout import Quality, RolloutRunner, RolloutTask
-from vtbdrake.testbed import SimulatorFields
 
 THETA = "sim.sys.Pendulum.theta.position"
 DAMPING = "sim.sys.Pendulum.theta.damping"
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
-CENIC = SimulatorFields(integration_scheme="cenic", accuracy=1e-4, max_step_size=0.05)
+CENIC = SimulatorConfig(integration_scheme="cenic", accuracy=1e-4, max_step_size=0.05)
 
 
 def _angle(theta):
@@ -25,7 +25,7 @@ TASKS = {
     # Error control, and a DPS that does not sample: the steps are the integrator's own.
     "pendulum": (RolloutTask(PendulumScenario(stiffness=2.0), 2.0, Quality(_angle, THETA)), THETA),
     "acrobot": (RolloutTask(AcrobotScenario(), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
-    "cenic": (RolloutTask(AcrobotScenario(simulator=CENIC), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
+    "cenic": (RolloutTask(AcrobotScenario(simulator_config=CENIC), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
     "discrete": (RolloutTask(AcrobotScenario(time_step=0.005), 2.0, Quality(_angle, SHOULDER)), SHOULDER),
 }
 
@@ -71,8 +71,8 @@ def test_it_is_the_simulation_that_drake_would_do():
 
 
 def test_an_undamped_pendulum_has_the_period_of_theory():
-    accurate = SimulatorFields(accuracy=1e-9, max_step_size=0.05)
-    task = RolloutTask(PendulumScenario(simulator=accurate), 4.0, sample_period=0.005, record=(THETA,))
+    accurate = SimulatorConfig(accuracy=1e-9, max_step_size=0.05)
+    task = RolloutTask(PendulumScenario(simulator_config=accurate), 4.0, sample_period=0.005, record=(THETA,))
     runner = RolloutRunner(task)
     testbed = runner.testbed
     amplitude = 2.0
@@ -143,8 +143,10 @@ class Raising(SampledFeedback):
 
 @dataclass
 class BrokenScenario(AcrobotScenario):
-    simulator: SimulatorFields = field(
-        default_factory=lambda: SimulatorFields("explicit_euler", 0.01, use_error_control=False)
+    simulator_config: SimulatorConfig = field(
+        default_factory=lambda: SimulatorConfig(
+            integration_scheme="explicit_euler", max_step_size=0.01, use_error_control=False
+        )
     )
     kind: str = "explodes"
 

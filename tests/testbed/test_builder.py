@@ -8,6 +8,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
+from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import PoseRelay
 from vtbdrake.state import VariableError, discrete_state
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
@@ -190,7 +191,9 @@ def test_a_command_can_come_from_a_system():
     builder = VirtualTestbedBuilder(Interface([], [ACT], [Signal("y", size=2)]))
     builder.set_dps(_relay())
     builder.sim_actuator("u", builder.add("act", "u", PassThrough(2)).get_input_port())
-    builder.command("y", builder.builder.AddNamedSystem("plan", ConstantVectorSource([3.0, 4.0])).get_output_port())
+    builder.command(
+        "y", builder.diagram_builder.AddNamedSystem("plan", ConstantVectorSource([3.0, 4.0])).get_output_port()
+    )
     testbed = builder.build()
     assert testbed.read(testbed.default_context(), "dps.u").tolist() == [3.0, 4.0]
     assert "u.y" not in testbed.variables()
@@ -236,3 +239,18 @@ def test_a_belief_goes_from_dps_to_sim():
     testbed = builder.build()
     with pytest.raises(ValueError, match="does not declare"):
         testbed.start_from_belief(testbed.default_context())
+
+
+def test_a_sensor_is_added_and_connected_to_the_plant():
+    testbed = SpaceClimberScenario().build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(0.1)
+    plant = testbed.plant
+    joints = plant.GetPositions(plant.GetMyContextFromRoot(context))[7:]
+    np.testing.assert_allclose(testbed.read(context, "sim.sense.encoders.joint_encoders"), joints, atol=0.05)
+
+
+def test_a_sensor_without_a_plant_is_rejected():
+    builder = VirtualTestbedBuilder(Interface(sense=[Signal("y", size=2)], act=[]))
+    with pytest.raises(ValueError, match="call add_plant first"):
+        builder.add_sensor("y", PassThrough(2))

@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 
+from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError
-from vtbdrake.testbed import DpsAlone, ScenarioError, SimulatorFields, load_scenario
+from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
 
 NAME = "tests.testbeds:AcrobotScenario"
 # Ten lines that stand for ten thousand million entries.
@@ -17,17 +19,17 @@ LAUGHS = "  x0: &x0 1\n" + "".join(f"  x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 
 
 
 def test_a_scenario_survives_file_and_pickle(tmp_path):
-    scenario = AcrobotScenario(period=0.05, simulator=SimulatorFields(integration_scheme="cenic", accuracy=1e-3))
+    scenario = AcrobotScenario(period=0.05, simulator_config=SimulatorConfig(integration_scheme="cenic", accuracy=1e-3))
     scenario.save(tmp_path / "s.yaml")
     assert load_scenario(tmp_path / "s.yaml") == scenario
     assert pickle.loads(pickle.dumps(scenario)) == scenario
 
 
 def test_a_file_names_its_class_and_what_differs(tmp_path):
-    (tmp_path / "s.yaml").write_text(f"{NAME}:\n  period: 0.1\n  simulator:\n    accuracy: 1.0e-3\n")
+    (tmp_path / "s.yaml").write_text(f"{NAME}:\n  period: 0.1\n  simulator_config:\n    accuracy: 1.0e-3\n")
     scenario = load_scenario(tmp_path / "s.yaml")
     assert isinstance(scenario, AcrobotScenario)
-    assert (scenario.period, scenario.simulator.accuracy, scenario.time_step) == (0.1, 1e-3, 0.0)
+    assert (scenario.period, scenario.simulator_config.accuracy, scenario.time_step) == (0.1, 1e-3, 0.0)
     assert load_scenario(NAME) == AcrobotScenario()
 
 
@@ -36,16 +38,16 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
     [
         (f"{NAME}:\n  perod: 0.1\n", "line 2: AcrobotScenario has no field 'perod'; did you mean period"),
         (
-            f"{NAME}:\n  period: 0.1\n  simulator:\n    acuracy: 0.1\n",
-            "line 4: SimulatorFields has no field 'simulator.acuracy'; did you mean accuracy",
+            f"{NAME}:\n  period: 0.1\n  simulator_config:\n    acuracy: 0.1\n",
+            "line 4: SimulatorConfig has no field 'simulator_config.acuracy'; did you mean accuracy",
         ),
-        (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator, period, time_step"),
-        (f"{NAME}:\n  simulator: &a\n    <<: {{acuracy: 0.1}}\n", "'simulator.acuracy'"),
+        (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator_config, period, time_step"),
+        (f"{NAME}:\n  simulator_config: &a\n    <<: {{acuracy: 0.1}}\n", "'simulator_config.acuracy'"),
         (f"{NAME}:\n  period: 0.1\n  period: 0.2\n", "the key 'period' twice"),
         (f"{NAME}:\n  period: fast\n", "fast"),
         (f"{NAME}:\n  period: .nan\n", "period must be finite"),
-        (f"{NAME}:\n  simulator:\n    integration_scheme: magic\n", "is one of bogacki_shampine3, cenic"),
-        (f"{NAME}:\n  simulator:\n    accuracy: 0.0\n", "positive max_step_size and accuracy"),
+        (f"{NAME}:\n  simulator_config:\n    integration_scheme: magic\n", "is one of bogacki_shampine3, cenic"),
+        (f"{NAME}:\n  simulator_config:\n    accuracy: 0.0\n", "positive max_step_size and accuracy"),
         ("tests.testbeds:Nothing:\n  period: 0.1\n", "no scenario 'Nothing'; it has: .*AcrobotScenario"),
         ("nowhere.at.all:Nothing:\n  period: 0.1\n", "to import its module runs its code: .* nowhere.at.all:Nothing@"),
         ("a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n", "named package.module:Class"),
@@ -136,9 +138,8 @@ def test_what_is_spelt_right_at_every_level_is_read(tmp_path):
     [
         ({"period": "0.1"}, "AcrobotScenario.period takes a value of type float, not '0.1' of type str"),
         ({"period": [0.1]}, "AcrobotScenario.period takes a value of type float"),
-        ({"simulator": SimulatorFields(accuracy="fine")}, "simulator.accuracy takes a value of type float, not 'fine'"),
-        ({"simulator": SimulatorFields(use_error_control=1)}, "use_error_control takes a value of type bool, not 1"),
-        ({"simulator": SimulatorFields(integration_scheme=None)}, "integration_scheme is one of"),
+        ({"simulator_config": SimulatorConfig(integration_scheme="magic")}, "integration_scheme is one of"),
+        ({"simulator_config": SimulatorConfig(start_time=1.0)}, "start_time must be 0, not 1.0 s"),
     ],
 )
 def test_a_value_of_another_type_is_refused_when_the_testbed_is_built(values, message):
@@ -177,7 +178,7 @@ def test_values_that_are_no_mapping_are_refused():
 
 @pytest.mark.parametrize("at", [0.0, 0.1])
 def test_cenic_is_not_asked_for_a_step_of_no_length(at):
-    testbed = PendulumScenario(simulator=SimulatorFields("cenic", accuracy=1e-3)).build()
+    testbed = PendulumScenario(simulator_config=SimulatorConfig(integration_scheme="cenic", accuracy=1e-3)).build()
     simulator = testbed.simulator()
     if at:
         simulator.AdvanceTo(at)
@@ -214,8 +215,8 @@ def test_what_is_fixed_to_the_world_is_environment():
 
 def test_cenic_without_error_control_gives_fresh_poses_or_is_refused():
     """Drake 1.51 leaves the poses of its fixed steps one step behind; what is accepted must be right."""
-    fields = SimulatorFields("cenic", max_step_size=0.02, use_error_control=False)
-    scenario = AcrobotScenario(simulator=fields)
+    fields = SimulatorConfig(integration_scheme="cenic", max_step_size=0.02, use_error_control=False)
+    scenario = AcrobotScenario(simulator_config=fields)
     try:
         testbed = scenario.build()
     except ScenarioError as error:
@@ -228,3 +229,40 @@ def test_cenic_without_error_control_gives_fresh_poses_or_is_refused():
     shoulder = testbed.read(context, "sim.sys.Acrobot.shoulder.position")
     # The upper link is 1 m long.
     assert height == pytest.approx(-np.cos(shoulder), abs=1e-9)
+
+
+def test_a_scenario_with_drake_configs_pickles():
+    config = SimulatorConfig(integration_scheme="cenic", accuracy=1e-3)
+    scenario = SpaceClimberScenario(simulator_config=config, gravity=3.71)
+    copied = pickle.loads(pickle.dumps(scenario))
+    assert copied == scenario
+    assert copied.plant_config.contact_model == "point"
+
+
+def test_scenarios_that_differ_inside_a_config_are_unequal():
+    assert AcrobotScenario() == AcrobotScenario()
+    assert AcrobotScenario() != AcrobotScenario(simulator_config=SimulatorConfig(accuracy=1e-5))
+
+
+def test_a_scenario_shows_what_differs_from_its_defaults():
+    scenario = SpaceClimberScenario(gravity=3.71, simulator_config=SimulatorConfig(max_step_size=0.2))
+    assert repr(scenario) == "SpaceClimberScenario(simulator_config=SimulatorConfig(max_step_size=0.2), gravity=3.71)"
+
+
+def test_older_files_with_the_key_simulator_load(tmp_path):
+    (tmp_path / "s.yaml").write_text(f"{NAME}:\n  simulator:\n    accuracy: 1.0e-3\n")
+    assert load_scenario(tmp_path / "s.yaml").simulator_config.accuracy == 1e-3
+
+
+def test_the_pace_of_a_simulation_does_not_identify_it():
+    fields = {"accuracy": 1e-6, "max_step_size": 0.05, "target_realtime_rate": 1.0}
+    paced = AcrobotScenario(simulator_config=SimulatorConfig(**fields))
+    assert paced.record() == AcrobotScenario().record()
+    assert paced.record()["simulator.accuracy"] == 1e-6
+
+
+def test_one_of_several_scenarios_in_a_file_is_chosen_by_its_key(tmp_path):
+    (tmp_path / "s.yaml").write_text("Slow:\n  period: 0.1\nFast:\n  period: 0.01\n")
+    assert load_scenario(f"{NAME}@{tmp_path / 's.yaml'}#Fast").period == 0.01
+    with pytest.raises(ScenarioError, match="has no key 'Medium'; it has: Slow, Fast"):
+        load_scenario(f"{NAME}@{tmp_path / 's.yaml'}#Medium")

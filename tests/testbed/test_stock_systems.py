@@ -109,7 +109,7 @@ def _testbed(make, value=None):
     """A testbed with the system, which nobody has named, and something on each of its inputs."""
     parts = VirtualTestbedBuilder(Interface([], []))
     parts.set_dps(LeafSystem())
-    system = parts.builder.AddSystem(make())
+    system = parts.diagram_builder.AddSystem(make())
     for i in range(system.num_input_ports()):
         port = system.get_input_port(i)
         if port.get_data_type() == PortDataType.kVectorValued:
@@ -119,7 +119,7 @@ def _testbed(make, value=None):
             source = Source(value(0.0), value)
         else:
             source = ConstantValueSource(port.Allocate())
-        parts.builder.Connect(parts.builder.AddSystem(source).get_output_port(), port)
+        parts.diagram_builder.Connect(parts.diagram_builder.AddSystem(source).get_output_port(), port)
     return parts.build()
 
 
@@ -209,8 +209,8 @@ def test_cameras_that_are_sampled_by_a_composite_come_back():
         parts.set_dps(LeafSystem())
         _, scene_graph = parts.add_plant()
         sensor = RgbdSensor(SceneGraph.world_frame_id(), RigidTransform([0.0, 0.0, 1.0]), *_cameras())
-        camera = parts.builder.AddSystem(RgbdSensorDiscrete(sensor, PERIOD))
-        parts.builder.Connect(scene_graph.get_query_output_port(), camera.get_input_port())
+        camera = parts.diagram_builder.AddSystem(RgbdSensorDiscrete(sensor, PERIOD))
+        parts.diagram_builder.Connect(scene_graph.get_query_output_port(), camera.get_input_port())
         return parts.build()
 
     original, copy = build(), build()
@@ -254,13 +254,13 @@ def test_systems_without_names_are_called_by_their_class_in_order():
     def build():
         parts = VirtualTestbedBuilder(Interface([], []))
         parts.set_dps(LeafSystem())
-        parts.builder.AddNamedSystem("Integrator_2", Integrator(1))
+        parts.diagram_builder.AddNamedSystem("Integrator_2", Integrator(1))
         inner = DiagramBuilder()
         for size in (1, 2, 3):
             inner.AddSystem(Integrator(size))
-            parts.builder.AddSystem(Integrator(size))
+            parts.diagram_builder.AddSystem(Integrator(size))
         inner.AddSystem(Source(1, lambda t: [t]))
-        parts.builder.AddSystem(inner.Build())
+        parts.diagram_builder.AddSystem(inner.Build())
         return parts.build()
 
     shapes = {a: v.shape for a, v in build().variables().items() if "Integrator" in a}
@@ -292,7 +292,7 @@ def test_a_plants_friction_is_that_of_its_own_scene_graph():
     mental = DiagramBuilder()
     boxed(mental, 0.25)
     parts.set_dps(mental.Build())
-    boxed(parts.builder, 0.75)
+    boxed(parts.diagram_builder, 0.75)
     testbed = parts.build()
     context = testbed.default_context()
     frictions = {a: testbed.read(context, a) for a in testbed.variables() if a.endswith(".friction")}
@@ -309,7 +309,7 @@ def test_two_systems_of_one_name_are_refused_by_name():
     parts = VirtualTestbedBuilder(Interface([], []))
     parts.set_dps(LeafSystem())
     for _ in range(2):
-        AddMultibodyPlantSceneGraph(parts.builder, 0.0)[0].Finalize()
+        AddMultibodyPlantSceneGraph(parts.diagram_builder, 0.0)[0].Finalize()
     with pytest.raises(ValueError, match="two systems of the testbed are called plant: rename one of them"):
         parts.build()
 
@@ -317,10 +317,10 @@ def test_two_systems_of_one_name_are_refused_by_name():
 def test_two_systems_of_one_path_are_refused_by_path():
     parts = VirtualTestbedBuilder(Interface([], []))
     parts.set_dps(LeafSystem())
-    parts.builder.AddNamedSystem("a.b", Integrator(1))
+    parts.diagram_builder.AddNamedSystem("a.b", Integrator(1))
     inner = DiagramBuilder()
     inner.AddNamedSystem("b", Integrator(1))
-    parts.builder.AddNamedSystem("a", inner.Build())
+    parts.diagram_builder.AddNamedSystem("a", inner.Build())
     with pytest.raises(ValueError, match="two systems of the testbed have the path a.b"):
         parts.build()
 

@@ -37,7 +37,7 @@ class RelayScenario(Scenario):
         pose = Value(RigidTransform())
         builder.sim_sensor("seen", builder.add("sense", "camera<1>", ConstantValueSource(pose)).get_output_port())
         builder.sim_actuator("commanded", builder.add("act", "arm", PassThrough(pose)).get_input_port())
-        builder.builder.AddNamedSystem("logger", ConstantValueSource(pose))
+        builder.diagram_builder.AddNamedSystem("logger", ConstantValueSource(pose))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from vtbdrake.cli.recording import WRITERS
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.replay import DIFFERENT, replay
 from vtbdrake.testbed import DpsAlone
-from vtbdrake.testbed.scenario import class_name, scenario_class
+from vtbdrake.testbed.scenario import class_name
+from vtbdrake.testbed.scenario_file import scenario_class
 
 
 @click.command("replay")

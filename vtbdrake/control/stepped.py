@@ -51,6 +51,7 @@ class Stepped:
         self.steps = 0
         self.initialized = context is not None
         self._simulator = target.simulator(context, restored=context is not None)
+        self._simulator.set_target_realtime_rate(0.0)
         self._context = self._simulator.get_mutable_context()
         self.time = self.start_time = float(self._context.get_time())
         # Nobody reads it: to be held is what it is for.

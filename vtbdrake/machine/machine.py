@@ -89,6 +89,7 @@ class Machine:
         self.perturbed.update(config.values)
         world.write(self._context, self.perturbed)
         self._simulator = world.simulator(self._context)
+        self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
 
         self._lines = {

@@ -21,7 +21,7 @@ from vtbdrake.control.cycle import Change
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed, load_scenario
-from vtbdrake.testbed.scenario import is_imported
+from vtbdrake.testbed.scenario_file import is_imported
 
 VERSION = 3
 LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END = (

@@ -267,7 +267,7 @@ def _signed_crc(data: bytes) -> int:
 def _check_recordable(runtime: Runtime) -> None:
     """Raise a ValueError if a replay could not repeat what this loop does from now on."""
     context, bridge, diagram = runtime.context, runtime.bridge, runtime.target.diagram
-    if runtime.steps and context.num_continuous_states() and runtime.target.simulator_fields.use_error_control:
+    if runtime.steps and context.num_continuous_states() and runtime.target.simulator_config.use_error_control:
         raise ValueError(
             f"the integrator has a memory of its first {runtime.steps} steps, which a replay would not have: start to "
             "record before the first step, or switch error control off"

@@ -213,7 +213,9 @@ class _Replay:
         return self._target.default_context()
 
     def _new_simulator(self) -> Simulator:
-        return self._target.simulator(self._context, restored=self._log.header.initialized)
+        simulator = self._target.simulator(self._context, restored=self._log.header.initialized)
+        simulator.set_target_realtime_rate(0.0)
+        return simulator
 
     def _time(self, steps: int) -> float:
         return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)

@@ -51,12 +51,12 @@ class DerivativeRunner:
         self.task = task
         self.testbed = testbed
         self._quality: Quality = task.quality
-        fields = testbed.simulator_fields
+        fields = testbed.simulator_config
         discrete = testbed.plant is not None and testbed.plant.time_step() > 0.0
         if fields.use_error_control and not discrete:
             raise DerivativeError(
                 f"derivatives need fixed steps, but {fields.integration_scheme} controls its error: set "
-                "simulator.use_error_control to false and choose max_step_size, or use gradient='central'"
+                "simulator_config.use_error_control to false and choose max_step_size, or use gradient='central'"
             )
         try:
             self._diagram = testbed.diagram.ToAutoDiffXd()
@@ -82,7 +82,8 @@ class DerivativeRunner:
         context = self._start(parameters)
         directions = {address: self._direction(parameters, address) for address in by}
         simulator = Simulator_[AutoDiffXd](self._diagram, self._seeded(context, list(directions.values())))
-        ApplySimulatorConfig(self.testbed.simulator_fields.config(), simulator)
+        ApplySimulatorConfig(self.testbed.simulator_config, simulator)
+        simulator.set_target_realtime_rate(0.0)
         simulator.get_mutable_context().SetTime(AutoDiffXd(context.get_time()))
         t0 = context.get_time()
         samples, slopes, times = [], [], self.task.sample_times()

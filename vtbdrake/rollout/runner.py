@@ -61,7 +61,6 @@ class RolloutRunner:
         self._instants = task.instants(self._s0.get_time(), self.testbed.event_timings())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
-        self._config = self.testbed.simulator_fields.config()
         self._copier = self.testbed.copier_from(self.testbed)
         # Which hidden variables differ from s0: at first, those of a snapshot may.
         self._changed: set[str] | None = None
@@ -142,7 +141,8 @@ class RolloutRunner:
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
         # A new integrator: the step memory of a used one would be part of the trajectory. Its config sets the time.
-        ApplySimulatorConfig(self._config, self._simulator)
+        ApplySimulatorConfig(self.testbed.simulator_config, self._simulator)
+        self._simulator.set_target_realtime_rate(0.0)
         self._copier.copy(self._s0, self._context, hidden=self._changed)
         self._changed = {self._variables[a].carried_by for a in parameters} - {""}
         restored = self.task.start is not None

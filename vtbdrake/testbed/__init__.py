@@ -2,8 +2,8 @@
 
 from vtbdrake.testbed.abstract_switch import Command
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
-from vtbdrake.testbed.config import PlantFields, SimulatorFields
-from vtbdrake.testbed.scenario import Scenario, ScenarioError, load_scenario
+from vtbdrake.testbed.scenario import Scenario, ScenarioError
+from vtbdrake.testbed.scenario_file import load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.slow_part import SlowPart, slow_parts
 from vtbdrake.testbed.strip import DpsAlone
@@ -14,12 +14,10 @@ __all__ = [
     "Command",
     "DpsAlone",
     "Interface",
-    "PlantFields",
     "Scenario",
     "ScenarioError",
     "Signal",
     "SignalError",
-    "SimulatorFields",
     "SlowPart",
     "VirtualTestbed",
     "VirtualTestbedBuilder",

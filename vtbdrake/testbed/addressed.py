@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
+from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
@@ -15,7 +15,6 @@ from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variables import check_address, suggestion
-from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import BOARD
 
@@ -48,7 +47,7 @@ class AddressedDiagram:
     Attributes:
         diagram: the input and output ports of it carry the DPS's signals.
         interface: the DPS's signals.
-        simulator_fields: how it is to be integrated.
+        simulator_config: how it is to be integrated.
         scenario: what built it, or None.
 
     It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
@@ -59,13 +58,13 @@ class AddressedDiagram:
         *,
         diagram: Diagram,
         interface: Interface,
-        simulator: SimulatorFields,
+        simulator_config: SimulatorConfig,
         scenario: Scenario | None,
         variables: Variables,
     ) -> None:
         self.diagram = diagram
         self.interface = interface
-        self.simulator_fields = simulator
+        self.simulator_config = simulator_config
         self.scenario = scenario
         self._variables = variables
 
@@ -74,9 +73,9 @@ class AddressedDiagram:
     def default_context(self) -> Context:
         """A new context: s0 from defaults."""
         context = self.diagram.CreateDefaultContext()
-        if self.simulator_fields.use_error_control:
+        if self.simulator_config.use_error_control:
             # Drake looks here for how exactly an event that depends on the state (a foot that lands) is to be found.
-            context.SetAccuracy(self.simulator_fields.accuracy)
+            context.SetAccuracy(self.simulator_config.accuracy)
         return context
 
     def check_context(self, context: Context) -> None:
@@ -106,19 +105,20 @@ class AddressedDiagram:
         if context is None:
             context = self.default_context()
         self.check_context(context)
-        kind = _CenicSimulator if self.simulator_fields.integration_scheme == "cenic" else Simulator
+        kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
         simulator = kind(self.diagram, context)
         self._give_integrator(simulator)
+        simulator.set_target_realtime_rate(self.simulator_config.target_realtime_rate)
         if restored:
             simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return simulator
 
     def _give_integrator(self, simulator: Simulator) -> None:
-        """A new integrator, without memory of its last step, at the time of the context."""
-        time = simulator.get_context().get_time()
-        # It sets the time to that of a start.
-        ApplySimulatorConfig(self.simulator_fields.config(), simulator)
+        # The config would set the time and the pace, too.
+        time, pace = simulator.get_context().get_time(), simulator.get_target_realtime_rate()
+        ApplySimulatorConfig(self.simulator_config, simulator)
         simulator.get_mutable_context().SetTime(time)
+        simulator.set_target_realtime_rate(pace)
 
     def fork(self, simulator: Simulator) -> Snapshot:
         """Return s(t) of a running simulation so that what is simulated from it is exactly what follows.

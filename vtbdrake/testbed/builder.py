@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 from numpy.typing import ArrayLike
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
 from vtbdrake.state import Variable
@@ -13,14 +14,13 @@ from vtbdrake.state.abstract_state import abstract_state
 from vtbdrake.state.kinds import is_plant, is_scene_graph
 from vtbdrake.state.systems import class_name, leaves, name_systems
 from vtbdrake.testbed.belief import Belief
-from vtbdrake.testbed.config import PlantFields, SimulatorFields
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
-    from pydrake.geometry import Meshcat, SceneGraph
-    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.geometry import Meshcat, SceneGraph, SceneGraphConfig
+    from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 
     from vtbdrake.testbed.scenario import Scenario
 
@@ -46,23 +46,22 @@ _REFUSED = {
 class VirtualTestbedBuilder:
     """Adds the parts of Figure 4 one by one; `build` puts the switches between them.
 
-    ``builder`` is the DiagramBuilder of the testbed: add and connect the inner parts of the simulated world there,
-    or with `add`, which names a system by its role.
-
     Attributes:
+        diagram_builder: the DiagramBuilder of the testbed, for functions of Drake that take one.
+        plant, scene_graph: those of the simulated world; None until `add_plant` adds them.
         sensors, actuators: the ports of the simulated world, by signal.
         beliefs: what `believe` declares.
         extra_variables: those that `add_variable` lists.
     """
 
-    def __init__(self, interface: Interface, *, simulator: SimulatorFields | None = None) -> None:
+    def __init__(self, interface: Interface, *, simulator_config: SimulatorConfig | None = None) -> None:
         if not isinstance(interface, Interface):
             raise SignalError(
                 f"a testbed has an Interface(sense, act, commands), not {interface!r}: does interface() return it?"
             )
         self.interface = interface
-        self.simulator = simulator or SimulatorFields()
-        self.builder = DiagramBuilder()
+        self.simulator_config = simulator_config or SimulatorConfig()
+        self.diagram_builder = DiagramBuilder()
         self.plant: MultibodyPlant | None = None
         self.scene_graph: SceneGraph | None = None
         self._dps: System | None = None
@@ -74,20 +73,40 @@ class VirtualTestbedBuilder:
         self.extra_variables: list[Variable] = []
 
     def add(self, role: str, name: str, system: S) -> S:
-        """Adds a part of the simulated world as ``sim.<role>.<name>``; role is sense, sys, act or env."""
+        """Add a part of the simulated world under the name ``sim.<role>.<name>``, and return it.
+
+        Args:
+            role: ``sense``, ``sys``, ``act`` or ``env``.
+            name: unique within the role.
+            system: any System; a Diagram, too.
+        """
         if role not in ROLES:
             raise ValueError(f"the role of {name} is one of {', '.join(ROLES)}, not {role!r}")
         if not isinstance(system, System):
             raise ValueError(f"sim.{role}.{name} is a System, not {system!r}")
-        return self.builder.AddNamedSystem(f"sim.{role}.{name}", system)
+        return self.diagram_builder.AddNamedSystem(f"sim.{role}.{name}", system)
 
-    def add_plant(self, fields: PlantFields | None = None) -> tuple[MultibodyPlant, SceneGraph]:
-        """Adds the MultibodyPlant, a direct child named ``plant`` as CENIC wants it, and its SceneGraph."""
+    def connect(self, source: OutputPort, target: InputPort) -> None:
+        """Connect an output port of the simulated world to an input port, like `DiagramBuilder.Connect`."""
+        self.diagram_builder.Connect(source, target)
+
+    def add_plant(
+        self, config: MultibodyPlantConfig | None = None, scene_graph_config: SceneGraphConfig | None = None
+    ) -> tuple[MultibodyPlant, SceneGraph]:
+        """Add the MultibodyPlant, named ``plant``, and its SceneGraph, like Drake's `AddMultibodyPlant`.
+
+        Args:
+            config: Drake's defaults (a discrete plant) if left out; ``time_step=0`` makes it continuous.
+            scene_graph_config: Drake's defaults if left out.
+        """
         if self.plant is not None:
             raise ValueError("the testbed has a plant already: add what is to touch its bodies to that one")
-        from pydrake.multibody.plant import AddMultibodyPlant
+        from pydrake.geometry import SceneGraphConfig
+        from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 
-        self.plant, self.scene_graph = AddMultibodyPlant((fields or PlantFields()).config(), self.builder)
+        self.plant, self.scene_graph = AddMultibodyPlant(
+            config or MultibodyPlantConfig(), scene_graph_config or SceneGraphConfig(), self.diagram_builder
+        )
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
         return self.plant, self.scene_graph
@@ -101,20 +120,41 @@ class VirtualTestbedBuilder:
             raise ValueError(f"model instance {instance} belongs to sys or env, not to {role!r}")
         self._places[instance] = role
 
+    def add_sensor(self, signal: str, sensor: S, *, name: str = "") -> S:
+        """Add a simulated sensor, connect its inputs to the plant and offer its output as a sensor signal.
+
+        Args:
+            signal: the sensor signal of the interface.
+            sensor: a System with one output port, whose input ports have the names of output ports of the plant, such
+                as the sensors in `vtbdrake.components.sensors`.
+            name: the sensor is added as ``sim.sense.<name>``; by default, it has the name of the signal.
+
+        Raises:
+            ValueError: the testbed has no plant.
+        """
+        if self.plant is None:
+            raise ValueError(f"the sensor {name or signal} measures a plant: call add_plant first")
+        self.add("sense", name or signal, sensor)
+        for index in range(sensor.num_input_ports()):
+            port = sensor.get_input_port(index)
+            self.connect(self.plant.GetOutputPort(port.get_name()), port)
+        self.sim_sensor(signal, sensor.get_output_port())
+        return sensor
+
     def sim_sensor(self, name: str, port: OutputPort) -> None:
-        """The simulated sensor signal ``name`` comes from ``port``."""
+        """Offer ``port`` as the simulated sensor signal ``name``."""
         self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort).check_port(port, _owner(port))
         self.sensors[name] = port
 
     def sim_actuator(self, name: str, port: InputPort) -> None:
-        """The simulated actuator signal ``name`` goes to ``port``."""
+        """Lead the actuator signal ``name`` to ``port`` of the simulated world."""
         self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort).check_port(
             port, _owner(port)
         )
         self.actuators[name] = port
 
     def command(self, name: str, port: OutputPort) -> None:
-        """The command ``name`` comes from ``port``, instead of a constant that is the variable ``u.<name>``."""
+        """Take the command ``name`` from ``port``, instead of the variable ``u.<name>``."""
         self._claim(self.interface.commands, name, "command", self._commands, port, OutputPort).check_port(
             port, _owner(port)
         )
@@ -145,7 +185,7 @@ class VirtualTestbedBuilder:
         if self._dps is not None:
             raise SignalError("the testbed has a DPS already; put several parts into one Diagram")
         self._check_ports(dps)
-        self._dps = self.builder.AddNamedSystem("dps", dps)
+        self._dps = self.diagram_builder.AddNamedSystem("dps", dps)
         return dps
 
     def _check_ports(self, dps: System) -> None:
@@ -199,7 +239,7 @@ class VirtualTestbedBuilder:
         sense_position, act_position = MODES[mode]
         defaults = {s.name: s.vector(0.0 if s.default is None else s.default) for s in self.interface.commands}
         u = {name: value for name, value in defaults.items() if name not in self._commands}
-        switches = Switches(self.builder, self.interface, sense_position, act_position, self._dps, u)
+        switches = Switches(self.diagram_builder, self.interface, sense_position, act_position, self._dps, u)
         self._connect_switches(switches, self._dps)
         commands = tuple(switches.command_variables(self.interface.commands))
         for command in commands:
@@ -210,7 +250,7 @@ class VirtualTestbedBuilder:
             from pydrake.geometry import MeshcatVisualizer, MeshcatVisualizerParams
 
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
-            MeshcatVisualizer.AddToBuilder(self.builder, self.scene_graph, meshcat, parameters)
+            MeshcatVisualizer.AddToBuilder(self.diagram_builder, self.scene_graph, meshcat, parameters)
         diagram = self.build_diagram("vtb")
         return VirtualTestbed(
             diagram=diagram,
@@ -220,7 +260,7 @@ class VirtualTestbedBuilder:
             scene_graph=self.scene_graph,
             sense=switches.sense,
             act=switches.act,
-            simulator=self.simulator,
+            simulator_config=self.simulator_config,
             scenario=scenario,
             beliefs=tuple(self.beliefs),
             extra_variables=commands + tuple(self.extra_variables),
@@ -236,10 +276,10 @@ class VirtualTestbedBuilder:
         Raises:
             ValueError: two systems have one name, or copies of the state could not continue a system.
         """
-        names = [system.get_name() for system in self.builder.GetSystems()]
+        names = [system.get_name() for system in self.diagram_builder.GetSystems()]
         for twin in sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two systems of the testbed are called {twin}: rename one of them with set_name")
-        diagram = self.builder.Build()
+        diagram = self.diagram_builder.Build()
         diagram.set_name(name)
         name_systems(diagram)
         paths: set[str] = set()
@@ -269,7 +309,7 @@ class VirtualTestbedBuilder:
                     f"no simulated actuator takes {signal.name}: call sim_actuator({signal.name!r}, port)"
                 )
         if self.plant is None:
-            systems = {system.get_name(): system for system in self.builder.GetSystems()}
+            systems = {system.get_name(): system for system in self.diagram_builder.GetSystems()}
             plant, scene_graph = systems.get("plant"), systems.get("scene_graph")
             if plant is not None and is_plant(plant):
                 self.plant = plant
@@ -279,16 +319,16 @@ class VirtualTestbedBuilder:
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():
-            self.builder.Connect(sensor, switches.sim_sense[name])
-            self.builder.ExportInput(switches.real_sense[name], f"real.sense.{name}")
-            self.builder.Connect(switches.dps_sense[name], dps.GetInputPort(name))
+            self.connect(sensor, switches.sim_sense[name])
+            self.diagram_builder.ExportInput(switches.real_sense[name], f"real.sense.{name}")
+            self.connect(switches.dps_sense[name], dps.GetInputPort(name))
         for name, actuator in self.actuators.items():
-            self.builder.Connect(switches.sim_act[name], actuator)
-            self.builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
+            self.connect(switches.sim_act[name], actuator)
+            self.diagram_builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
         if self.actuators:
-            self.builder.ExportOutput(switches.active, "real.act.active")
+            self.diagram_builder.ExportOutput(switches.active, "real.act.active")
         for name, port in {**switches.commands, **self._commands}.items():
-            self.builder.Connect(port, dps.GetInputPort(name))
+            self.connect(port, dps.GetInputPort(name))
 
     def plant_roles(self) -> dict[str, str]:
         """The role of every model instance of the plant: ``sys`` or ``env``."""

@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import copy
-import difflib
-import importlib
+import copyreg
 import math
 import os
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
-from inspect import isabstract
-from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import yaml
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
-from pydrake.systems.analysis import GetIntegrationSchemes
+from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import System
 
 from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
-from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
 
@@ -35,9 +27,10 @@ if TYPE_CHECKING:
 # Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
 _DRAKE = version("drake")
 _CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
-
-_LARGEST_FILE = 1 << 22  # bytes
-_MOST_NODES = 100_000
+# Under which keys files hold these fields.
+FILE_KEYS = {"simulator_config": "simulator", "plant_config": "plant"}
+# Fields of SimulatorConfig that do not change a trajectory.
+_NO_IDENTITY = {"simulator.start_time", "simulator.target_realtime_rate", "simulator.publish_every_time_step"}
 
 
 class ScenarioError(ValueError):
@@ -46,101 +39,136 @@ class ScenarioError(ValueError):
 
 @dataclass
 class Scenario(ABC):
-    """A dataclass of plain types, with a default for every field, that builds a testbed.
+    """A dataclass, with a default for every field, that builds a testbed.
 
-    A subclass adds its fields and says what the interface of the DPS is, what the DPS is, and what the simulated
-    world is. What sits in the Context (masses, gains, poses) is a variable of the testbed; what needs another Diagram
-    (geometry, gravity, a time step) is a field.
+    A subclass adds fields and defines the interface of the DPS, the DPS, and the simulated world. What lies in the
+    Context (masses, gains, poses) is a variable of the testbed; what needs another Diagram (geometry, gravity, a time
+    step) is a field. Fields are plain types, dataclasses of them, and Drake's configs (`MultibodyPlantConfig`,
+    `CameraConfig`, ...), so that a scenario can be written as YAML and sent to other processes.
 
-    When a study varies a field, a testbed is built for each value. Python's garbage collector frees those that are not
-    used any more if every system in Python has ``__slots__ = NO_DICT``, and gives its output ports ``weakly(self,
-    Class._calc)`` instead of the bound method; see `vtbdrake.state.collectable`. The others stay until their process
-    ends: `ProcessExecutor` replaces a worker that has grown too much, while serial rollouts and threads keep them.
+    When a study varies a field, a testbed is built for each value. Python's garbage collector frees unused ones if
+    every system in Python has ``__slots__ = NO_DICT`` and computes its output ports by ``weakly(self, Class._calc)``;
+    see `vtbdrake.state`. Others stay until their process ends; `ProcessExecutor` replaces workers that have grown.
+
+    Attributes:
+        simulator_config: the integrator. ``target_realtime_rate`` and ``publish_every_time_step`` hold for
+            `VirtualTestbed.simulator`, not for rollouts and control loops.
     """
 
-    simulator: SimulatorFields = field(default_factory=SimulatorFields)
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        # Else, the dataclass decorator would replace them: Drake's configs have no equality.
+        for name in ("__eq__", "__repr__"):
+            if name not in cls.__dict__:
+                setattr(cls, name, getattr(cls, name))
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return dict(_flat(self)) == dict(_flat(other))
+
+    # It can change.
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        """Show the class and the fields that differ from their defaults."""
+        return _changed_fields(self)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        # Drake's configs do not pickle by themselves.
+        for kind in set(_drake_types(self.__dict__)):
+            copyreg.pickle(kind, _reduce_config)
+        return super().__reduce_ex__(protocol)
 
     @abstractmethod
     def interface(self) -> Interface:
-        """The DPS's signals."""
+        """Return the signals of the DPS."""
 
     @abstractmethod
     def make_dps(self) -> System:
-        """The data processing system; the same for the testbed, its mental copies and the robot."""
+        """Return a new data processing system; the same for the testbed, its mental copies and the robot."""
 
     @abstractmethod
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        """Adds the simulated sensors, system, actuators and environment."""
+        """Add the simulated sensors, system, actuators and environment."""
 
     def validate(self) -> None:
-        """Looks at the values as they are when the testbed is built.
+        """Check the fields; `build` and `load_scenario` do so. Subclasses add their own checks.
 
         Raises:
-            ScenarioError: a value is of another type than its field, a number is not finite, or the integration scheme
-                is unknown. Subclasses add their own.
+            ScenarioError: a value has another type than its field, a number is not finite, or the simulator_config
+                cannot be used.
         """
-        for name, owner, kinds in _scalar_fields(self):
-            value = getattr(owner, name.rpartition(".")[2])
+        name = type(self).__name__
+        for key, owner, kinds in _scalar_fields(self):
+            value = getattr(owner, key.rpartition(".")[2])
             if value is not None:  # A field that may be None has a type like float | None.
-                _scalar(value, kinds, f"{type(self).__name__}.{name}")
-        for name, value in _flat(asdict(self)):
+                _scalar(value, kinds, f"{name}.{key}")
+        for key, value in _flat(self):
             if isinstance(value, float) and not math.isfinite(value):
-                raise ScenarioError(f"{type(self).__name__}.{name} must be finite, not {value}")
+                raise ScenarioError(f"{name}.{key} must be finite, not {value}")
+        config = self.simulator_config
         known = GetIntegrationSchemes()
-        if self.simulator.integration_scheme not in known:
+        if config.integration_scheme not in known:
             raise ScenarioError(
-                f"{type(self).__name__}.simulator.integration_scheme is one of {', '.join(known)}, not "
-                f"{self.simulator.integration_scheme!r}"
+                f"{name}.simulator_config.integration_scheme is one of {', '.join(known)}, not "
+                f"{config.integration_scheme!r}"
             )
-        if (
-            self.simulator.integration_scheme == "cenic"
-            and not self.simulator.use_error_control
-            and not _CENIC_IS_FRESH
-        ):
+        if config.integration_scheme == "cenic" and not config.use_error_control and not _CENIC_IS_FRESH:
             raise ScenarioError(
-                f"{type(self).__name__}.simulator: CENIC without error control leaves poses one step behind in Drake "
+                f"{name}.simulator_config: CENIC without error control leaves poses one step behind in Drake "
                 f"{_DRAKE}; set use_error_control to true, or use Drake 1.58"
             )
-        if self.simulator.max_step_size <= 0 or self.simulator.accuracy <= 0:
+        if config.max_step_size <= 0 or config.accuracy <= 0:
             raise ScenarioError(
-                f"{type(self).__name__}.simulator takes a positive max_step_size and accuracy, not "
-                f"{self.simulator.max_step_size} s and {self.simulator.accuracy}"
+                f"{name}.simulator_config needs a positive max_step_size and accuracy, not {config.max_step_size} s "
+                f"and {config.accuracy}"
+            )
+        if config.start_time != 0.0:
+            raise ScenarioError(
+                f"{name}.simulator_config.start_time must be 0, not {config.start_time} s: a simulation starts at the "
+                "time of its Context, which you can set"
             )
 
     def build(self, *, mode: str = "sim", meshcat: Meshcat | None = None, prefix: str = "") -> VirtualTestbed:
-        """A new testbed.
+        """Build a new testbed.
 
         Args:
-            mode: where the switches stand at first: sim, shadow, real or twin.
+            mode: initial position of the switches: ``sim``, ``shadow``, ``real`` or ``twin``.
             meshcat: draws the simulated world while it runs, under ``prefix``.
 
         Raises:
-            ScenarioError: a field has a value that no testbed can be built with.
-            SignalError: the signals of DPS and world do not fit.
+            ScenarioError: a field has a value with which no testbed can be built.
+            SignalError: the signals of DPS and world do not match.
         """
         self.validate()
-        own = copy.deepcopy(self)  # A scenario that is changed afterwards is another one.
-        builder = VirtualTestbedBuilder(own.interface(), simulator=own.simulator)
+        own = copy.deepcopy(self)  # The caller may change this one afterwards.
+        builder = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)
         builder.set_dps(own.make_dps())
         own.add_world(builder)
         return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
 
     def name(self) -> str:
-        """``package.module:Class``."""
+        """Return ``package.module:Class``."""
         return class_name(type(self))
 
     def record(self) -> dict[str, Any]:
-        """What identifies it, as plain data: its name and all fields, nested ones by dotted names."""
-        return {"scenario": self.name(), **dict(_flat(asdict(self)))}
+        """Return what identifies the scenario, as plain data: its name and all fields, nested ones by dotted names."""
+        values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items()}
+        flat = {key: value for key, value in _flat(values) if key not in _NO_IDENTITY}
+        return {"scenario": self.name(), **flat}
 
     def with_fields(self, values: Mapping[str, Any]) -> Self:
-        """A copy in which some fields have other values; nested ones by dotted names (``simulator.accuracy``).
+        """Return a copy in which some fields have other values.
 
-        Fields that are a bool, int, float or str can be given; an int will do for a float, and numpy's scalars for
-        Python's.
+        Args:
+            values: by field, nested ones by dotted names (``simulator_config.accuracy``). Only fields that are a bool,
+                int, float or str can be set; an int will do for a float, and numpy's scalars for Python's.
 
         Raises:
-            ScenarioError: there is no such field, the value is of another type, or the scenario refuses it.
+            ScenarioError: there is no such field, the value has another type, or the scenario rejects it.
         """
         changed = copy.deepcopy(self)
         known = {name: (owner, kinds) for name, owner, kinds in _scalar_fields(changed)}
@@ -154,65 +182,10 @@ class Scenario(ABC):
         return changed
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a YAML file that `load_scenario` reads."""
-        _resolve_types(type(self))
-        Path(path).write_text(yaml_dump_typed(self, child_name=self.name()))
+        """Write a YAML file that `load_scenario` reads."""
+        from vtbdrake.testbed.scenario_file import save_scenario
 
-
-def load_scenario(source: str | os.PathLike[str]) -> Scenario:
-    """Return the scenario that ``source`` names.
-
-    Args:
-        source: ``package.module:Class``; ``package.module:Class@FILE``, where FILE is a YAML file with its fields; or
-            the file alone, if the class that it names is imported already. The file looks like ::
-
-                diagrams.space_climber:SpaceClimberScenario:
-                  gravity: 3.71
-
-            To import a module runs its code. So no module is imported because a file names it.
-
-    Raises:
-        ScenarioError: the class or file does not exist, a key of the file is unknown or occurs twice, or a value has
-            the wrong type or is refused by the scenario.
-    """
-    text = os.fspath(source)
-    name, at, file = text.partition("@")
-    if not (at and ":" in name):  # A file may have any name.
-        name, file = "", text
-    is_file = file.endswith((".yaml", ".yml"))
-    if name and not is_file:
-        raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
-    scenario = _load_yaml(Path(file), name) if is_file else scenario_class(text)()
-    scenario.validate()
-    return scenario
-
-
-def scenario_class(name: str) -> type[Scenario]:
-    """Return the scenario ``package.module:Class``; its module is imported, which runs its code.
-
-    Raises:
-        ScenarioError: there is no such, or its module cannot be imported.
-    """
-    module_name, _, class_name = name.partition(":")
-    if not module_name or not class_name:
-        raise ScenarioError(f"a scenario is named package.module:Class, or by a .yaml file, not {name!r}")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise ScenarioError(
-            f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
-        ) from error
-    except Exception as error:
-        raise ScenarioError(f"cannot import {module_name}, of the scenario {name}: {error!r}") from error
-    found = getattr(module, class_name, None)
-    if isinstance(found, type) and issubclass(found, Scenario) and isabstract(found):
-        raise ScenarioError(f"{name} is no whole scenario: it lacks {', '.join(sorted(found.__abstractmethods__))}")
-    if not (isinstance(found, type) and issubclass(found, Scenario)):
-        known = [
-            k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and not isabstract(v)
-        ]
-        raise ScenarioError(f"{module_name} has no scenario {class_name!r}; it has: {', '.join(known) or 'none'}")
-    return found
+        save_scenario(self, path)
 
 
 def class_name(scenario: type[Scenario]) -> str:
@@ -220,157 +193,82 @@ def class_name(scenario: type[Scenario]) -> str:
     return f"{scenario.__module__}:{scenario.__qualname__}"
 
 
-def is_imported(name: str) -> bool:
-    """Return whether the module of the scenario ``package.module:Class`` is imported in this process."""
-    return name.partition(":")[0] in sys.modules
+def field_types(owner: Any) -> dict[str, Any]:
+    """Return the types of the fields of a dataclass or of one of Drake's configs, by name; empty for anything else."""
+    items = fields(owner) if is_dataclass(owner) else getattr(owner, "__fields__", ())
+    return {item.name: item.type for item in items}
 
 
-def _load_yaml(path: Path, named: str) -> Scenario:
-    """
-    Args:
-        path: the file.
-        named: the scenario that the user says it is of; empty if that is left to the file.
-    """
-    if not path.exists():
-        raise ScenarioError(f"there is no scenario file {path}")
-    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
-        raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
-    try:
-        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path} is not YAML: {error}") from error
-    if not isinstance(document, yaml.MappingNode) or len(document.value) != 1:
-        raise ScenarioError(f"{path} must have one key, package.module:Class, with the scenario's fields below it")
-    _check_nodes(document, path)
-    name = document.value[0][0].value
-    if named and name not in (named, class_name(found := scenario_class(named))):
-        raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(found)}")
-    if not named and ":" in name and not is_imported(name):
-        raise ScenarioError(
-            f"{path} names the scenario {name}, and to import its module runs its code: if that is what you want, "
-            f"name it as {name}@{path}, or import it first"
-        )
-    try:
-        schema = scenario_class(named or name)
-        _resolve_types(schema)
-        _refuse_unknown(document.value[0][1], schema)
-        return yaml_load_typed(schema=schema, filename=path, child_name=name)
-    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
-        if isinstance(error, ScenarioError):
-            raise ScenarioError(f"{path}: {error}") from error
-        raise ScenarioError(f"{path} does not fit {name}: {error}") from error
-
-
-def _resolve_types(schema: type) -> None:
-    # Drake's reader wants the types of fields; `from __future__ import annotations` leaves their names.
-    hints = get_type_hints(schema)
-    for item in fields(schema):
-        item.type = hints[item.name]
-        for part in _parts(item.type):
-            if isinstance(part, type) and is_dataclass(part):
-                _resolve_types(part)
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """A type, and those that it is made of: of list[Rock] | None also list[Rock], Rock and None."""
-    yield hint
-    for argument in get_args(hint):
-        yield from _parts(argument)
-
-
-def _check_nodes(document: yaml.Node, path: Path) -> None:
-    """
-    Raises:
-        ScenarioError: a key occurs twice, or a few aliases stand for very much.
-    """
-    waiting, count = [document], 0
-    while waiting:
-        node = waiting.pop()
-        count += 1
-        if count > _MOST_NODES:
-            raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, those by aliases included")
-        if isinstance(node, yaml.MappingNode):
-            # Of two equal keys, YAML readers silently keep the last.
-            keys = [str(key.value) for key, _ in node.value]
-            if len(set(keys)) < len(keys):
-                twice = next(key for key in keys if keys.count(key) > 1)
-                raise ScenarioError(f"{path} has the key {twice!r} twice, near line {node.start_mark.line + 1}")
-            waiting += [value for _, value in node.value]
-        elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
-
-
-def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
-    """
-    Args:
-        node: what is given for a field.
-        hint: the type of that field.
-        name: its dotted name.
-
-    Raises:
-        ScenarioError: a key is no field of the dataclass that is expected there.
-    """
-    alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
-    inside = Union[inside] if inside else Any  # noqa: UP007
-    if isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _refuse_unknown(item, inside, name)
-        return
-    if not isinstance(node, yaml.MappingNode):
-        return
-    # Of several dataclasses, a tag names the one that is meant, and the first one needs no tag.
-    classes = [part for part in alternatives if isinstance(part, type) and is_dataclass(part)]
-    expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
-    known = {} if expected is None else {item.name: item.type for item in fields(expected)}
-    for key, value in node.value:
-        below = f"{name}.{key.value}".lstrip(".")
-        if expected is None:  # A dict, say.
-            _refuse_unknown(value, inside, below)
-        elif key.value == "<<":  # Keys that are taken over from elsewhere in the file.
-            for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-                _refuse_unknown(merged, expected, name)
-        elif key.value in known:
-            _refuse_unknown(value, known[key.value], below)
-        else:
-            near = difflib.get_close_matches(key.value, known, n=1, cutoff=0.5)
-            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known)}"
-            raise ScenarioError(
-                f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}; {hint_text}"
-            )
+def _values(owner: Any) -> dict[str, Any]:
+    return {name: getattr(owner, name) for name in field_types(owner)}
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield (dotted name, value) of everything inside."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, dict | list | tuple) and not value:
         yield name, None
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield from _flat(item, f"{name}.{key}".lstrip("."))
     elif isinstance(value, list | tuple):
         for i, item in enumerate(value):
             yield from _flat(item, f"{name}[{i}]")
+    elif isinstance(value, dict) or field_types(value):
+        for key, item in (value if isinstance(value, dict) else _values(value)).items():
+            yield from _flat(item, f"{name}.{key}".lstrip("."))
     else:
-        yield name, value
+        # One of Drake's configs without fields, such as Rotation.Identity.
+        yield name, type(value).__name__ if hasattr(value, "__fields__") else value
+
+
+def _changed_fields(owner: Any) -> str:
+    try:
+        default = type(owner)()
+    except TypeError:  # A field has no default.
+        default = None
+    shown = []
+    for name, value in _values(owner).items():
+        if default is None or dict(_flat(value)) != dict(_flat(getattr(default, name))):
+            shown.append(f"{name}={_changed_fields(value) if hasattr(value, '__fields__') else repr(value)}")
+    return f"{type(owner).__name__}({', '.join(shown)})"
+
+
+def _drake_types(value: Any) -> Iterator[type]:
+    """Yield the types of all of Drake's configs inside."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    elif hasattr(type(value), "__fields__") or is_dataclass(value):
+        if not is_dataclass(value):
+            yield type(value)
+        value = list(_values(value).values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _drake_types(item)
+
+
+def _reduce_config(config: Any) -> tuple[Any, ...]:
+    return _make_config, (type(config), _values(config))
+
+
+def _make_config(kind: type, values: Mapping[str, Any]) -> Any:
+    return kind(**values)
 
 
 _SCALARS: dict[str, type] = {"bool": bool, "int": int, "float": float, "str": str}
 
 
 def _scalar_fields(owner: Any, prefix: str = "") -> Iterator[tuple[str, Any, tuple[type, ...]]]:
-    """Dotted name, owner and types of every field of a plain type, of ``owner`` and of the dataclasses in it."""
-    for item in fields(owner):
-        value = getattr(owner, item.name)
-        if is_dataclass(value):
-            yield from _scalar_fields(value, f"{prefix}{item.name}.")
+    """Yield (dotted name, owner, types) of every field of a plain type, in ``owner`` and in what it holds."""
+    for name, declared in field_types(owner).items():
+        value = getattr(owner, name)
+        if field_types(value):
+            yield from _scalar_fields(value, f"{prefix}{name}.")
             continue
         # By their names: in another process, those of a class from a notebook cannot be looked up.
-        kind = item.type.__name__ if isinstance(item.type, type) else str(item.type)
+        kind = declared.__name__ if isinstance(declared, type) else str(declared)
         names = [part.strip() for part in kind.split("|")]
         kinds = tuple(_SCALARS[part] for part in names if part in _SCALARS)
         if kinds:
-            yield f"{prefix}{item.name}", owner, kinds
+            yield f"{prefix}{name}", owner, kinds
 
 
 def _scalar(value: Any, kinds: tuple[type, ...], name: str) -> Any:

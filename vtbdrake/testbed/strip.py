@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -15,7 +16,6 @@ from vtbdrake.state.copying import StateCopier
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
-from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import BOARD, COMMAND, REAL, Switches
 
@@ -39,7 +39,7 @@ class DpsAlone(AddressedDiagram):
         interface = scenario.interface()
         parts = VirtualTestbedBuilder(interface)
         dps = parts.set_dps(scenario.make_dps())
-        builder = parts.builder
+        builder = parts.diagram_builder
         u = {s.name: s.vector(0.0 if s.default is None else s.default) for s in interface.commands}
         board = Switches(builder, Interface((), ()), REAL, REAL, dps, u)
         for name, port in board.commands.items():
@@ -56,7 +56,7 @@ class DpsAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            simulator=_without_plant(scenario.simulator),
+            simulator_config=_without_plant(scenario.simulator_config),
             scenario=scenario,
             variables=collect(
                 diagram,
@@ -100,6 +100,9 @@ def _is_dps(path: str) -> bool:
     return path == "dps" or path.startswith("dps.")
 
 
-def _without_plant(fields: SimulatorFields) -> SimulatorFields:
+def _without_plant(config: SimulatorConfig) -> SimulatorConfig:
     # CENIC integrates a MultibodyPlant, and there is none.
-    return replace(fields, integration_scheme="runge_kutta3") if fields.integration_scheme == "cenic" else fields
+    own = copy.deepcopy(config)
+    if own.integration_scheme == "cenic":
+        own.integration_scheme = "runge_kutta3"
+    return own

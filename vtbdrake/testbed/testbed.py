@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, System
 
 from vtbdrake.state import Snapshot, SnapshotError, Variable, collect
@@ -13,7 +14,6 @@ from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.variable import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.belief import Belief
-from vtbdrake.testbed.config import SimulatorFields
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import ACT_POSITIONS, BOARD, REAL, SENSE_POSITIONS, SIM, T_ACT, T_SENSE, TWIN, Selector
 
@@ -59,7 +59,7 @@ class VirtualTestbed(AddressedDiagram):
         scene_graph: SceneGraph | None,
         sense: Mapping[str, Selector],
         act: Mapping[str, Selector],
-        simulator: SimulatorFields,
+        simulator_config: SimulatorConfig,
         scenario: Scenario | None,
         beliefs: tuple[Belief, ...],
         extra_variables: tuple[Variable, ...],
@@ -69,7 +69,7 @@ class VirtualTestbed(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            simulator=simulator,
+            simulator_config=simulator_config,
             scenario=scenario,
             variables=collect(
                 diagram,

@@ -39,20 +39,20 @@ class WorldAlone(AddressedDiagram):
         """
         scenario.validate()
         own = copy.deepcopy(scenario)
-        parts = VirtualTestbedBuilder(own.interface(), simulator=own.simulator)
+        parts = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)
         own.add_world(parts)
         parts.finish_world()
         for signal in parts.interface.sense:
-            parts.builder.ExportOutput(parts.sensors[signal.name], f"sense.{signal.name}")
+            parts.diagram_builder.ExportOutput(parts.sensors[signal.name], f"sense.{signal.name}")
         for signal in parts.interface.act:
-            parts.builder.ExportInput(parts.actuators[signal.name], f"act.{signal.name}")
+            parts.diagram_builder.ExportInput(parts.actuators[signal.name], f"act.{signal.name}")
         diagram = parts.build_diagram("world_alone")
         roles = parts.plant_roles()
         clock = Variable("time", X, (), "s", lambda context: context.get_time())
         super().__init__(
             diagram=diagram,
             interface=parts.interface,
-            simulator=own.simulator,
+            simulator_config=own.simulator_config,
             scenario=own,
             variables=collect(
                 diagram,

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Context
 
 from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import PRESS, SWING
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.testbed import PlantFields, ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
 
 T = 0.001
 SIGNALS = ("joint_position", "joint_velocity", "joint_torque_measured", "wrench")
@@ -45,7 +46,7 @@ def start(testbed: VirtualTestbed, motion: int) -> Context:
         ({"law": "magic"}, "law must be one of joint_impedance, cartesian_impedance, admittance"),
         ({"period": 0.0}, "period must be positive"),
         ({"wall_stiffness": -1.0}, "wall_stiffness must be positive"),
-        ({"plant": PlantFields()}, "time_step must be positive"),
+        ({"plant_config": MultibodyPlantConfig(time_step=0.0)}, "time_step must be positive"),
         ({"position_errors": ErrorModel(dropout=2.0)}, "position_errors: dropout must be"),
     ],
 )

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import linprog
 
 from diagrams.space_climber import SpaceClimberScenario
 from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
 from diagrams.space_climber.payload import MASS, locked_problem, payload_problem, static_limit, statics, tipped_over
-from vtbdrake.testbed import ScenarioError, SimulatorFields, load_scenario
+from vtbdrake.testbed import ScenarioError, load_scenario
 
 
 def test_f_is_that_of_the_paper() -> None:
@@ -63,7 +64,9 @@ def test_a_light_attachment_is_carried_and_a_heavy_one_tips_the_robot() -> None:
 def test_a_robot_that_falls_keeps_its_energy_until_it_lands() -> None:
     # CENIC is of first order: a body in free fall is g t h / 2 too low, h half a step.
     step = 0.002
-    testbed = SpaceClimberScenario(simulator=SimulatorFields("cenic", step, 1e-3)).build()
+    testbed = SpaceClimberScenario(
+        simulator_config=SimulatorConfig(integration_scheme="cenic", max_step_size=step, accuracy=1e-3)
+    ).build()
     context = testbed.default_context()
     testbed.write(context, {"u.walk": 0.0, "sim.sys.climber.base.pose": [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]})
     plant, own = testbed.plant, testbed.plant.GetMyContextFromRoot(context)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
@@ -16,7 +18,7 @@ from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.machine import Machine
 from vtbdrake.state import discrete_state
-from vtbdrake.testbed import Interface, PlantFields, Scenario, Signal, SimulatorFields, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.1
 PAYLOAD, MASS = "sim.sys.Pendulum.arm_com.mass", 0.5
@@ -55,7 +57,7 @@ class Rhythm(LeafSystem):
 class DrivenPendulum(Scenario):
     """Drake's pendulum; a ``time_step`` of 0 is a continuous one, ``sampled`` sensors are a period late."""
 
-    simulator: SimulatorFields = field(default_factory=SimulatorFields)
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     time_step: float = PERIOD
     sampled: bool = False
     believes: bool = True
@@ -82,16 +84,16 @@ class DrivenPendulum(Scenario):
         return Rhythm(PERIOD)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, _ = builder.add_plant(PlantFields(time_step=self.time_step, use_sampled_output_ports=False))
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step, use_sampled_output_ports=False))
         Parser(plant).AddModelsFromUrl(PENDULUM)
         plant.Finalize()
         split = builder.add("sense", "joint", Demultiplexer([1, 1]))
         shown = plant.get_state_output_port()
         if self.sampled:
             hold = builder.add("sense", "hold", ZeroOrderHold(PERIOD, 2))
-            builder.builder.Connect(shown, hold.get_input_port())
+            builder.connect(shown, hold.get_input_port())
             shown = hold.get_output_port()
-        builder.builder.Connect(shown, split.get_input_port())
+        builder.connect(shown, split.get_input_port())
         builder.sim_sensor("position", split.get_output_port(0))
         builder.sim_sensor("velocity", split.get_output_port(1))
         builder.sim_actuator("torque", plant.get_actuation_input_port())

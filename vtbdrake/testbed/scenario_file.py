@@ -1,0 +1,223 @@
+"""YAML files of scenarios, and scenarios by their names ``package.module:Class``."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from inspect import isabstract
+from pathlib import Path
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import yaml
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+
+from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name, field_types
+
+_LARGEST_FILE = 1 << 22  # bytes
+_MOST_NODES = 100_000
+
+
+def load_scenario(source: str | os.PathLike[str]) -> Scenario:
+    """Return the scenario that ``source`` names.
+
+    Importing a module runs its code. So no module is imported because a file names it.
+
+    Args:
+        source: one of
+
+            * ``package.module:Class``: the scenario with its defaults;
+            * ``package.module:Class@FILE``: with the fields of a YAML file;
+            * ``package.module:Class@FILE#KEY``: with those below one of several keys of the file, as files of Drake's
+              ``hardware_sim`` have them;
+            * the YAML file alone, if the class that it names is imported already. It looks like ::
+
+                  diagrams.space_climber:SpaceClimberScenario:
+                    gravity: 3.71
+
+    Raises:
+        ScenarioError: the class, file or key does not exist, a key of the file is unknown or occurs twice, or a value
+            has the wrong type or is rejected by the scenario.
+    """
+    text = os.fspath(source)
+    name, at, file = text.partition("@")
+    if not (at and ":" in name):  # A file may have any name.
+        name, file = "", text
+    file, _, key = file.partition("#") if not Path(file).exists() else (file, "", "")
+    is_file = file.endswith((".yaml", ".yml"))
+    if name and not is_file:
+        raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
+    scenario = _load_yaml(Path(file), name, key) if is_file else scenario_class(text)()
+    scenario.validate()
+    return scenario
+
+
+def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
+    """Write a YAML file that `load_scenario` reads."""
+    _resolve_types(type(scenario))
+    Path(path).write_text(yaml_dump_typed(scenario, child_name=scenario.name()))
+
+
+def scenario_class(name: str) -> type[Scenario]:
+    """Return the class ``package.module:Class``; its module is imported, which runs its code.
+
+    Raises:
+        ScenarioError: there is no such class, or its module cannot be imported.
+    """
+    module_name, _, class_ = name.partition(":")
+    if not module_name or not class_:
+        raise ScenarioError(f"a scenario is named package.module:Class, or by a .yaml file, not {name!r}")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ScenarioError(
+            f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
+        ) from error
+    except Exception as error:
+        raise ScenarioError(f"cannot import {module_name}, of the scenario {name}: {error!r}") from error
+    found = getattr(module, class_, None)
+    if isinstance(found, type) and issubclass(found, Scenario) and isabstract(found):
+        raise ScenarioError(f"{name} is abstract: it lacks the methods {', '.join(sorted(found.__abstractmethods__))}")
+    if not (isinstance(found, type) and issubclass(found, Scenario)):
+        known = [
+            k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and not isabstract(v)
+        ]
+        raise ScenarioError(f"{module_name} has no scenario {class_!r}; it has: {', '.join(known) or 'none'}")
+    return found
+
+
+def is_imported(name: str) -> bool:
+    """Return whether the module of the scenario ``package.module:Class`` is imported in this process."""
+    return name.partition(":")[0] in sys.modules
+
+
+def _load_yaml(path: Path, named: str, key: str) -> Scenario:
+    """Return the scenario of a file.
+
+    Args:
+        path: the file.
+        named: the class that the user has named; empty if only the file names it.
+        key: the top-level key of the scenario; empty if there is only one.
+    """
+    if not path.exists():
+        raise ScenarioError(f"there is no scenario file {path}")
+    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
+        raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
+    try:
+        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ScenarioError(f"{path} is not YAML: {error}") from error
+    if not isinstance(document, yaml.MappingNode) or (len(document.value) != 1 and not key):
+        raise ScenarioError(
+            f"{path} must have one key, package.module:Class, with the scenario's fields below it, or name the key "
+            f"as package.module:Class@{path}#KEY"
+        )
+    _check_nodes(document, path)
+    known = {str(node.value): content for node, content in document.value}
+    if key and key not in known:
+        raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(known) or 'none'}")
+    name = key or next(iter(known))
+    if named and ":" in name and name not in (named, class_name(found := scenario_class(named))):
+        raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(found)}")
+    if not named and ":" in name and not is_imported(name):
+        raise ScenarioError(
+            f"{path} names the scenario {name}, and to import its module runs its code: if that is what you want, "
+            f"name it as {name}@{path}, or import it first"
+        )
+    try:
+        schema = scenario_class(named or name)
+        _resolve_types(schema)
+        content = known[name]
+        _use_new_keys(content, schema)
+        _refuse_unknown(content, schema)
+        return yaml_load_typed(schema=schema, data=yaml.serialize(content))
+    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
+        if isinstance(error, ScenarioError):
+            raise ScenarioError(f"{path}: {error}") from error
+        raise ScenarioError(f"{path} does not fit {name}: {error}") from error
+
+
+def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
+    """Rename the keys of older files to those of the fields."""
+    known = field_types(schema)
+    renamed = {old: new for new, old in FILE_KEYS.items() if new in known and old not in known}
+    for key, _ in content.value if isinstance(content, yaml.MappingNode) else []:
+        key.value = renamed.get(key.value, key.value)
+
+
+def _resolve_types(schema: type) -> None:
+    # Drake's reader wants the types of fields; `from __future__ import annotations` leaves their names.
+    hints = get_type_hints(schema)
+    for item in fields(schema):
+        item.type = hints[item.name]
+        for part in _parts(item.type):
+            if isinstance(part, type) and is_dataclass(part):
+                _resolve_types(part)
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """Yield a type and those that it is made of: for list[Rock] | None also list[Rock], Rock and None."""
+    yield hint
+    for argument in get_args(hint):
+        yield from _parts(argument)
+
+
+def _check_nodes(document: yaml.Node, path: Path) -> None:
+    """Refuse keys that occur twice, and a few aliases that stand for very much."""
+    waiting, count = [document], 0
+    while waiting:
+        node = waiting.pop()
+        count += 1
+        if count > _MOST_NODES:
+            raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, those by aliases included")
+        if isinstance(node, yaml.MappingNode):
+            # Of two equal keys, YAML readers silently keep the last.
+            keys = [str(key.value) for key, _ in node.value]
+            if len(set(keys)) < len(keys):
+                twice = next(key for key in keys if keys.count(key) > 1)
+                raise ScenarioError(f"{path} has the key {twice!r} twice, near line {node.start_mark.line + 1}")
+            waiting += [value for _, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+
+
+def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
+    """Refuse keys that are no field of the class that is expected there.
+
+    Args:
+        node: the value given for a field.
+        hint: the type of that field.
+        name: its dotted name.
+    """
+    alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
+    inside = Union[inside] if inside else Any  # noqa: UP007
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_unknown(item, inside, name)
+        return
+    if not isinstance(node, yaml.MappingNode):
+        return
+    # Of several classes, a tag names the one that is meant, and the first one needs no tag.
+    classes = [part for part in alternatives if isinstance(part, type) and field_types(part)]
+    expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
+    known = field_types(expected)
+    for key, value in node.value:
+        below = f"{name}.{key.value}".lstrip(".")
+        if expected is None:  # A dict, say.
+            _refuse_unknown(value, inside, below)
+        elif key.value == "<<":  # Keys that are taken over from elsewhere in the file.
+            for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                _refuse_unknown(merged, expected, name)
+        elif key.value in known:
+            _refuse_unknown(value, known[key.value], below)
+        else:
+            near = difflib.get_close_matches(key.value, known, n=1, cutoff=0.5)
+            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known)}"
+            raise ScenarioError(
+                f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}; {hint_text}"
+            )
