@@ -8,14 +8,14 @@ from pydrake.multibody.tree import SpatialInertia
 
 
 def start_model(name: str, canonical_link: str, *, note: str) -> tuple[ET.Element, ET.Element]:
-    """The document and the model in it; ``note`` becomes a comment."""
+    """Return an SDF document and the model in it; ``note`` becomes a comment."""
     root = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
     root.append(ET.Comment(f" {note} "))
     return root, ET.SubElement(root, "model", name=name, canonical_link=canonical_link)
 
 
 def add_link(model: ET.Element, name: str, parent: tuple[str, str] | None, inertia: SpatialInertia) -> ET.Element:
-    """A link with the inertia M_LLo_L; ``parent`` is the link that its pose is relative to, and the pose."""
+    """Add a link with the inertia M_LLo_L; ``parent`` is the link that its pose is relative to, and the pose."""
     link = ET.SubElement(model, "link", name=name)
     if parent is not None:
         ET.SubElement(link, "pose", relative_to=parent[0]).text = parent[1]
@@ -41,7 +41,7 @@ def add_joint(
     speed: float,
     torque: float,
 ) -> ET.Element:
-    """A revolute joint; ``speed`` and ``torque`` are the largest of its drive."""
+    """Add a revolute joint; ``speed`` and ``torque`` are the limits of its drive."""
     joint = ET.SubElement(model, "joint", name=name, type="revolute")
     ET.SubElement(joint, "parent").text = parent
     ET.SubElement(joint, "child").text = child
@@ -54,20 +54,20 @@ def add_joint(
 
 
 def add_frame(model: ET.Element, name: str, attached_to: str, pose: str) -> None:
-    """A frame that is fixed to a link."""
+    """Add a frame that is fixed to a link."""
     frame = ET.SubElement(model, "frame", name=name, attached_to=attached_to)
     ET.SubElement(frame, "pose").text = pose
 
 
 def add_visual(link: ET.Element, name: str, shape: ET.Element, pose: str, color: str) -> None:
-    """A shape to be seen; ``color`` is red, green, blue and opacity."""
+    """Add a visual shape; ``color`` is red, green, blue and opacity."""
     visual = ET.SubElement(link, "visual", name=name)
     add_geometry(visual, shape, pose)
     ET.SubElement(ET.SubElement(visual, "material"), "diffuse").text = color
 
 
 def add_geometry(owner: ET.Element, shape: ET.Element, pose: str) -> None:
-    """The pose and shape of a visual or collision."""
+    """Add the pose and the shape of a visual or collision element."""
     ET.SubElement(owner, "pose").text = pose
     ET.SubElement(owner, "geometry").append(shape)
 
@@ -100,6 +100,6 @@ def text(value: float) -> str:
 
 
 def document(root: ET.Element) -> str:
-    """The file's text."""
+    """Return the text of the file."""
     ET.indent(root)
     return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'

@@ -32,7 +32,7 @@ class Crash:
 
 
 def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
-    """The names to run, in the order of the registry; all of them if ``only`` is empty.
+    """Return the names to run, in the order of the registry; all of them if ``only`` is empty.
 
     Raises:
         ValueError: a name is unknown.
@@ -44,7 +44,7 @@ def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
 
 
 def run(registry: Registry, name: str, *arguments: Any) -> Any:
-    """What the function called ``name`` returns, or a `Crash`, with its traceback on stderr: the others still run."""
+    """Return the result of the function ``name``, or a `Crash` whose traceback goes to stderr: the others still run."""
     try:
         return _function(registry[name])(*arguments)
     except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
@@ -61,7 +61,7 @@ def _function(entry: str | Callable[..., Any]) -> Callable[..., Any]:
 
 
 def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes a JSON list of objects, whole or not at all; null stands for what is not finite, so for an open end."""
+    """Write a JSON list of objects, completely or not at all; null stands for infinite and NaN, so for an open end."""
     with whole_file(path) as partial:
         partial.write_text(json.dumps([_plain(dict(row)) for row in rows], indent=2, allow_nan=False) + "\n")
 

@@ -13,6 +13,7 @@ OUT = Path("out")
 
 
 def main() -> None:
+    """Print the answer, and write the plot and the recording."""
     begin = time.perf_counter()
     print("How heavy may a component attached to the front of the SpaceClimber be before it is no longer stable?")
     problem = payload_problem()
