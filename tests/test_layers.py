@@ -28,10 +28,11 @@ BELOW: dict[str, set[str]] = {
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
-# Two modules, which need nothing of ours and not Drake: how other processes start, and how objects travel to them.
+# Two modules that need neither Drake nor the layers: how other processes start, and how objects travel to them.
 for _layers in BELOW.values():
-    _layers.update({"interpreter", "pickling"})
-BELOW["interpreter"] = BELOW["pickling"] = set()
+    _layers.update({"child_process", "pickling"})
+BELOW["pickling"] = set()
+BELOW["child_process"] = {"pickling"}
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

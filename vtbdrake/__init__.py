@@ -6,7 +6,7 @@ Names are loaded when they are first used, so that importing the package costs n
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import vtbdrake.interpreter as _interpreter  # noqa: F401  It notes where relative entries of sys.path point to.
+import vtbdrake.child_process as _child_process  # noqa: F401  It notes the directory to which sys.path refers.
 
 if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards

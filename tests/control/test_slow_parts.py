@@ -26,6 +26,7 @@ from vtbdrake.testbed import DpsAlone, SlowPart
 PATH = "dps.perception"
 TIMEOUT = 60.0  # s; for a computer that is busy with other things
 CONTINUITY = {"velocity": ("position", np.inf)}
+PATIENT = {"memory": np.array([0.3, 0.6]), "patience": 1e4}  # The worker is never replaced.
 
 
 class Loop:
@@ -121,7 +122,7 @@ def test_the_loop_does_what_a_simulation_does_bit_for_bit(latency):
 
 
 def test_a_replay_with_missed_and_late_results_is_exact(gate):
-    with loop(function=partial(gated, gate=str(gate))) as real:
+    with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
         real.run(45)
         assert real.counts.missed == 2 and real.counts.late == 0
         with opened(gate):
@@ -136,7 +137,7 @@ def test_a_replay_with_missed_and_late_results_is_exact(gate):
 
 
 def test_the_memory_of_a_late_result_is_the_next_calls(gate):
-    with loop(function=partial(gated, gate=str(gate))) as real:
+    with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
         real.run(30)
         with opened(gate):
             assert real.wait()
@@ -227,7 +228,7 @@ def test_an_exception_makes_results_missing_and_is_told_once(caplog):
 
 def test_a_copy_of_a_running_context_computes_by_itself(gate):
     function = partial(gated, gate=str(gate))
-    with loop(function=function) as real:
+    with loop(function=function, more=PATIENT) as real:
         real.run(25)
         target = DpsAlone(real.scenario)
         copy = target.default_context()

@@ -1,4 +1,4 @@
-"""The process beside the loop: frames arrive whole and in order, nothing waits for it, its end is noticed."""
+"""Worker processes beside the loop: frames, backlog, and how they end."""
 
 import os
 import select
@@ -12,31 +12,29 @@ from vtbdrake.control.worker_process import WorkerProcess
 TIMEOUT = 30.0
 
 
-def echo(channel):
+def echo(connection):
     while True:
-        channel.send(channel.receive())
+        connection.send(connection.receive())
 
 
-def sum_up(channel):
+def sum_up(connection):
     total = 0
     try:
         while True:
-            total += len(channel.receive())
+            total += len(connection.receive())
     except EOFError:
-        channel.send(str(total).encode())
+        connection.send(str(total).encode())
 
 
-def fall_asleep(channel):
+def fall_asleep(connection):
     signal.pause()
 
 
-def tell_scheduling(channel):
-    handler = signal.getsignal(signal.SIGINT)
-    processors = len(os.sched_getaffinity(0))
-    channel.send(f"{os.sched_getscheduler(0)} {processors} {handler == signal.SIG_IGN}".encode())
+def tell_scheduling(connection):
+    connection.send(f"{os.sched_getscheduler(0)} {len(os.sched_getaffinity(0))}".encode())
 
 
-def fail(channel, code):
+def fail(connection, code):
     os._exit(code)
 
 
@@ -51,7 +49,7 @@ def taken(worker, count):
     return frames
 
 
-def test_frames_come_back_whole_and_in_order():
+def test_frames_return_whole_and_in_order():
     random = np.random.default_rng(0)
     sent = [random.bytes(int(size)) for size in random.integers(0, 300_000, 60)]
     worker = WorkerProcess(echo, name="echo")
@@ -66,7 +64,7 @@ def test_frames_come_back_whole_and_in_order():
         assert worker.close() == 0
 
 
-def test_what_waits_is_sent_before_it_ends():
+def test_close_sends_what_waits():
     worker = WorkerProcess(sum_up, name="sum", backlog=1 << 26)
     for _ in range(100):
         assert worker.post(bytes(100_000))
@@ -74,7 +72,7 @@ def test_what_waits_is_sent_before_it_ends():
     assert worker.take() == [b"10000000"]
 
 
-def test_one_that_waits_to_say_something_hears_the_rest():
+def test_close_receives_what_a_blocked_worker_sends():
     worker = WorkerProcess(echo, name="echo", backlog=1 << 26)
     frames = [bytes([k]) * 100_000 for k in range(100)]
     for frame in frames:
@@ -83,27 +81,27 @@ def test_one_that_waits_to_say_something_hears_the_rest():
     assert worker.take() == frames
 
 
-def test_a_long_frame_goes_piece_by_piece():
+def test_long_frames_are_sent_in_pieces():
     worker = WorkerProcess(sum_up, name="sum")
     waiting = []
     worker.post(bytes(1 << 20))
-    while worker.waiting:
-        waiting.append(worker.waiting)
+    while worker.unsent:
+        waiting.append(worker.unsent)
         worker.flush()
     assert worker.close() == 0
     assert worker.take() == [b"1048576"]
     assert np.diff(waiting, prepend=1 << 20).min() >= -(1 << 18)
 
 
-def test_a_full_backlog_drops_and_counts_and_does_not_wait():
+def test_full_backlog_drops_frames_without_waiting():
     worker = WorkerProcess(fall_asleep, name="sleeper", backlog=1 << 20)
     accepted = [worker.post(bytes(1 << 16)) for _ in range(200)]
     worker.kill()
     assert worker.dropped == accepted.count(False) > 0
-    assert sum(accepted) <= 200 and worker.waiting <= 1 << 20
+    assert sum(accepted) <= 200 and worker.unsent <= 1 << 20
 
 
-def test_one_that_is_killed_is_noticed_and_frames_are_counted():
+def test_killed_worker_is_noticed_and_drops_are_counted():
     worker = WorkerProcess(echo, name="victim")
     worker.post(b"hello")
     assert taken(worker, 1) == [b"hello"]
@@ -114,35 +112,35 @@ def test_one_that_is_killed_is_noticed_and_frames_are_counted():
     assert worker.close() == -signal.SIGKILL
 
 
-def test_one_that_ends_is_told_to_who_only_listens(caplog):
+def test_end_of_the_worker_is_logged_once(caplog):
     worker = WorkerProcess(fail, 3, name="failure")
     select.select((worker,), (), (), TIMEOUT)
     assert worker.take() == worker.take() == [] and not worker.alive
-    assert caplog.text.count(f"failure (process {worker.pid}) is gone: ") == 1
+    assert caplog.text.count(f"failure (process {worker.pid}) is lost: ") == 1
     assert worker.close() == 3
 
 
-def test_one_that_is_closed_or_killed_is_no_news(caplog):
+def test_close_and_kill_are_not_logged(caplog):
     WorkerProcess(echo, name="echo").close()
     WorkerProcess(fall_asleep, name="sleeper").kill()
     assert not caplog.text
 
 
-def test_one_that_does_not_end_is_killed():
+def test_worker_that_does_not_end_is_killed():
     worker = WorkerProcess(fall_asleep, name="sleeper")
     assert worker.close(timeout=1.0) == -signal.SIGKILL
 
 
-def test_its_exit_code_is_told():
+def test_close_returns_the_exit_code():
     assert WorkerProcess(fail, 3, name="failure").close() == 3
 
 
-def test_it_has_ordinary_scheduling_all_processors_and_leaves_interrupts_to_the_main_process():
+def test_worker_has_ordinary_scheduling_and_all_processors():
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(processors)})
     try:
         worker = WorkerProcess(tell_scheduling, name="teller")
-        assert taken(worker, 1) == [f"{os.SCHED_OTHER} {len(processors)} True".encode()]
+        assert taken(worker, 1) == [f"{os.SCHED_OTHER} {len(processors)}".encode()]
         worker.close()
     finally:
         os.sched_setaffinity(0, processors)

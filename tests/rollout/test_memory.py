@@ -33,7 +33,7 @@ def _run(executor, count):
 def test_memory_stays_flat_over_ten_thousand_rollouts(make):
     with make() as executor:
         _run(executor, 1000)
-        processes = [os.getpid(), *(worker.process.pid for worker in getattr(executor, "_workers", []))]
+        processes = [os.getpid(), *(worker.child.pid for worker in getattr(executor, "_workers", []))]
         before = {process: _resident(process) for process in processes}
         _run(executor, 10_000)
         growth = {process: _resident(process) - before[process] for process in processes}

@@ -91,12 +91,10 @@ def test_after_an_error_in_the_quality_the_pool_serves_another_task(make):
 def test_a_worker_that_died_while_idle_costs_nothing(caplog):
     with ProcessExecutor(2) as executor:
         _assert_right(executor, ANGLE, POINTS)
-        dead = executor._workers[0].process
-        dead.kill()
-        dead.wait()
+        executor._workers[0].child.kill()
         _assert_right(executor, OTHER, POINTS)
         assert len(executor._workers) == 2
-        assert all(worker.process.poll() is None for worker in executor._workers)
+        assert all(worker.child.alive for worker in executor._workers)
     # No rollout was lost with it.
     assert caplog.text == ""
 
@@ -117,20 +115,22 @@ def test_a_worker_that_is_killed_while_it_starts_costs_nothing():
         _assert_right(executor, ANGLE, POINTS)
 
 
-def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch):
-    killed = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
-    monkeypatch.setattr("vtbdrake.rollout.worker_processes.command", lambda *_: [sys.executable, "-c", killed])
-    with ProcessExecutor(2) as executor, pytest.raises(WorkerError, match=r"does not start \(exit code -9\)"):
+def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch, tmp_path):
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\nkill -9 $$\n")
+    python.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(python))
+    with ProcessExecutor(2) as executor, pytest.raises(WorkerError, match=r"did not start \(exit code -9\)"):
         list(executor.run(ANGLE, POINTS))
 
 
 def test_a_closed_executor_has_no_processes_left():
     executor = ProcessExecutor(2)
     _assert_right(executor, ANGLE, POINTS[:2])
-    processes = [worker.process for worker in executor._workers]
-    assert len(processes) == 2
+    children = [worker.child for worker in executor._workers]
+    assert len(children) == 2
     executor.close()
-    assert all(process.poll() is not None for process in processes)
+    assert not any(child.alive for child in children)
 
 
 def test_an_error_in_one_thread_is_raised_when_the_others_have_stopped():
@@ -219,7 +219,7 @@ def test_workers_end_with_a_main_process_that_is_killed(tmp_path):
         executor = ProcessExecutor(1)
         task = RolloutTask(TreacherousScenario(fuse={str(fuse)!r}), 0.5, Quality(abs, {SHOULDER!r}))
         list(executor.run(task, [{{}}]))
-        print(executor._workers[0].process.pid, flush=True)
+        print(executor._workers[0].child.pid, flush=True)
         list(executor.run(task, [{{"dps.gain[0]": HANG}}]))
     """
     with subprocess.Popen([sys.executable, "-c", dedent(script)], stdout=subprocess.PIPE, text=True) as main:

@@ -215,7 +215,7 @@ class _Beside:
             if left <= 0.0 or not self._worker.alive:
                 return False
             line = [self._worker.fileno()]
-            select.select(line, line if self._worker.waiting else [], [], left)
+            select.select(line, line if self._worker.unsent else [], [], left)
             self._worker.flush()
             self._answers += self._worker.take()
         return True

@@ -45,7 +45,7 @@ def _pass_on(channel: FrameConnection, worker: WorkerProcess, patience: float) -
     deadline = inf
     while True:
         left = None if deadline == inf else max(0.0, deadline - time.monotonic())
-        full = [worker.fileno()] if worker.waiting else []
+        full = [worker.fileno()] if worker.unsent else []
         readable, _, _ = select.select([channel.fileno(), worker.fileno()], full, [], left)
         if channel.fileno() in readable:
             worker.post(channel.receive())

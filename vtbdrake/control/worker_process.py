@@ -1,164 +1,158 @@
-"""A process that works for the loop without holding it up: it writes files, computes what takes long, tells others."""
+"""A worker process: it does for the control loop what takes long or could wait, while the loop never waits for it."""
 
 from __future__ import annotations
 
 import logging
 import os
-import pickle
 import select
 import socket
 import struct
-import subprocess
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from vtbdrake.child_process import ChildProcess
 from vtbdrake.control.streams import Frames
-from vtbdrake.interpreter import command
-from vtbdrake.pickling import dumps
 
 _log = logging.getLogger(__name__)
 
 _LENGTH = struct.Struct("<Q")
 _CHUNK = 1 << 18
-_BUFFER = 1 << 20  # of the socket, in bytes; the system may grant less
+_BUFFER = 1 << 20  # bytes of a socket's send buffer; the system may grant less
 
 
 class FrameConnection:
-    """The companion's own end of the line; its calls wait."""
+    """The worker's end of the connection, which carries frames of bytes; its calls block."""
 
-    def __init__(self, line: socket.socket) -> None:
-        self._line = line
+    def __init__(self, connection: socket.socket) -> None:
+        self._socket = connection
         self._frames = Frames()
 
     def fileno(self) -> int:
-        """What becomes readable when frames arrive."""
-        return self._line.fileno()
+        """Return the descriptor that becomes readable when frames arrive."""
+        return self._socket.fileno()
 
     def receive(self, timeout: float | None = None) -> bytes:
-        """The next frame.
+        """Return the next frame.
+
+        Args:
+            timeout: time in seconds; None to wait forever.
 
         Raises:
-            EOFError: there are no more.
-            TimeoutError: none came within ``timeout`` seconds.
+            EOFError: the other end is closed, and all frames were returned.
+            TimeoutError: no frame arrived in time.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while (frame := self._frames.frame()) is None:
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
-            if not select.select((self._line,), (), (), left)[0]:
-                raise TimeoutError(f"no frame came within {timeout} s")
-            if not self._frames.receive(self._line.fileno(), _CHUNK):
-                raise EOFError("the loop's end of the line is closed")
+            if not select.select((self._socket,), (), (), left)[0]:
+                raise TimeoutError(f"no frame arrived within {timeout} s")
+            if not self._frames.receive(self._socket.fileno(), _CHUNK):
+                raise EOFError("the other end of the connection is closed")
         return frame
 
     def send(self, *parts: bytes) -> None:
-        """Sends one frame, of the parts' bytes one after another.
+        """Send one frame that consists of the parts.
 
         Raises:
             OSError: the other end is closed.
         """
-        self._line.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
+        self._socket.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
 
 class WorkerProcess:
-    """A process of its own at the other end of a socket: a fresh interpreter that runs ``function(channel,
-    *arguments)``.
+    """A child process that runs ``function(connection, *arguments)``, with a `FrameConnection`.
 
-    It ends with `close`, and with the process that started it, whose end of the line then closes. No call of it waits,
-    except for `close`; to start one takes some milliseconds. It has ordinary scheduling and leaves Ctrl-C to the main
-    process.
+    No call waits for the worker, except `drain` and `close`; to start one takes some milliseconds. It has ordinary
+    scheduling on all processors, whatever the loop has. `close` ends it, and so does the end of this process.
 
     Args:
-        function: of a `FrameConnection` and the arguments; travels by cloudpickle, with them.
-        name: what it is called in errors and logs.
-        backlog: bytes that may wait for it; frames beyond that are dropped.
+        function: a function of a `FrameConnection` and the arguments; it returns or raises EOFError when no more frames
+            come. It is sent by cloudpickle.
+        arguments: picklable values.
+        name: the name of the worker in errors and logs.
+        backlog: the number of bytes that may wait to be sent; frames beyond that are dropped.
 
     Attributes:
-        dropped: how many frames were not taken.
+        dropped: the number of frames that were dropped.
     """
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
-        self.name = name
         self.dropped = 0
         self._backlog = backlog
-        self._waiting: deque[memoryview] = deque()
-        self._waits = 0
+        self._unsent: deque[memoryview] = deque()
+        self._unsent_bytes = 0
         self._frames = Frames()
-        self._back: list[bytes] = []
-        self._gone = False
-        self._ending = False  # because we want it to
-        self._line, theirs = socket.socketpair()
-        with theirs:
-            for end in (self._line, theirs):
-                end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-            self._line.setblocking(False)
-            self._process = subprocess.Popen(
-                command("vtbdrake.control.worker_process", str(theirs.fileno())),
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-            )
-        self.post(dumps((function, arguments)))
+        self._received: list[bytes] = []
+        self._lost = False
+        self._closing = False
+        self._child = ChildProcess(_serve, function, arguments, name=name)
+        self._socket = self._child.connection
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+        self._socket.setblocking(False)
 
     @property
     def pid(self) -> int:
-        """Of its process."""
-        return self._process.pid
+        """The process id of the worker."""
+        return self._child.pid
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
-        return not self._gone and self._process.poll() is None
+        """True while the worker runs and can be reached."""
+        return not self._lost and self._child.alive
 
     @property
-    def waiting(self) -> int:
-        """Bytes that wait to be sent."""
-        return self._waits
+    def unsent(self) -> int:
+        """The number of bytes that wait to be sent."""
+        return self._unsent_bytes
 
     def post(self, *parts: bytes) -> bool:
-        """Sends one frame, of the parts' bytes one after another; whether it was taken.
+        """Send one frame that consists of the parts, without waiting.
 
-        What is too long to go at once is not copied: it waits as it is, and must not change.
+        A frame that is too long to be sent at once is not copied: its parts must not change until they are sent.
+
+        Returns:
+            False if the frame was dropped, because the backlog is full or the worker is lost.
         """
         size = sum(map(len, parts))
-        if self._gone or (self._waits and self._waits + size > self._backlog):
+        if self._lost or (self._unsent_bytes and self._unsent_bytes + size > self._backlog):
             self.dropped += 1
             return False
         pieces: list[bytes | memoryview] = [_LENGTH.pack(size), *parts]
         if size <= _CHUNK:
             pieces = [memoryview(b"".join(pieces))]
-            if not self._waiting:
+            if not self._unsent:
                 pieces = [pieces[0][self._push(pieces[0]) :]]
-        self._keep(pieces)
+        self._enqueue(pieces)
         self.flush()
-        self.dropped += self._gone
-        return not self._gone
+        self.dropped += self._lost
+        return not self._lost
 
-    def _keep(self, pieces: Iterable[bytes | memoryview]) -> None:
+    def _enqueue(self, pieces: Iterable[bytes | memoryview]) -> None:
         for piece in pieces:
             if len(piece):
-                self._waiting.append(memoryview(piece))
-                self._waits += len(piece)
+                self._unsent.append(memoryview(piece))
+                self._unsent_bytes += len(piece)
 
     def flush(self) -> None:
-        """Sends what waits, as far as there is room, but not so much that it takes long."""
+        """Send what waits as far as the socket has room, at most 256 KiB, so that it takes little time."""
         left = _CHUNK
-        while self._waiting and left > 0 and not self._gone:
-            first = self._waiting[0]
+        while self._unsent and left > 0 and not self._lost:
+            first = self._unsent[0]
             sent = self._push(first[:left])
-            self._waits -= sent
+            self._unsent_bytes -= sent
             left -= sent
             if sent == len(first):
-                self._waiting.popleft()
+                self._unsent.popleft()
             else:
-                self._waiting[0] = first[sent:]
+                self._unsent[0] = first[sent:]
                 if not sent:
                     return
 
     def _push(self, data: bytes | memoryview) -> int:
         try:
-            return self._line.send(data)
+            return self._socket.send(data)
         except BlockingIOError:
             return 0
         except OSError as error:
@@ -166,89 +160,77 @@ class WorkerProcess:
             return 0
 
     def _lose(self, reason: OSError | str) -> None:
-        if not self._gone:
-            self._gone = True
-            if not self._ending:
-                _log.error("%s (process %d) is gone: %s", self.name, self.pid, reason)
+        if not (self._lost or self._closing):
+            _log.error("%s (process %d) is lost: %s", self._child.name, self.pid, reason)
+        self._lost = True
 
     def take(self) -> list[bytes]:
-        """The frames that came back since it was asked last, in order."""
+        """Return the frames that the worker has sent since the last call, in order, without waiting."""
         self._receive()
-        found, self._back = self._back, []
+        found, self._received = self._received, []
         return found
 
     def _receive(self) -> None:
-        if self._line.fileno() < 0:
+        if self._socket.fileno() < 0:
             return
         size = _CHUNK
-        while size == _CHUNK:  # a smaller one was all that there was
+        while size == _CHUNK:  # A smaller one was all that there was.
             try:
-                size = self._frames.receive(self._line.fileno(), _CHUNK)
+                size = self._frames.receive(self._socket.fileno(), _CHUNK)
             except OSError as error:
                 self._lose(error)
                 return
             if not size:
-                self._lose("it has closed the line")
+                self._lose("it has closed the connection")
             while (frame := self._frames.frame()) is not None:
-                self._back.append(frame)
+                self._received.append(frame)
 
     def fileno(self) -> int:
-        """What becomes readable when frames come back."""
-        return self._line.fileno()
+        """Return the descriptor that becomes readable when frames arrive, or when the worker is lost."""
+        return self._socket.fileno()
 
     def drain(self, timeout: float = 10.0) -> None:
-        """Waits until all that waits is sent, for ``timeout`` seconds at most."""
+        """Wait until all frames are sent, for ``timeout`` seconds at most."""
         end = time.monotonic() + timeout
-        while self._waiting and self.alive and (left := end - time.monotonic()) > 0.0:
-            # Who waits for room to say something does not listen.
-            select.select((self._line,), (self._line,), (), left)
+        while self._unsent and self.alive and (left := end - time.monotonic()) > 0.0:
+            # A worker whose own frames are not taken waits for room, and reads nothing.
+            select.select((self._socket,), (self._socket,), (), left)
             self._receive()
             self.flush()
 
     def close(self, timeout: float = 10.0) -> int:
-        """Sends what waits, tells it the end, and waits for it; after ``timeout`` seconds it is killed.
+        """Send what waits, let the worker finish, and return its exit code (negative: ended by that signal).
 
-        Returns:
-            The exit code; negative if a signal ended it.
+        After ``timeout`` seconds it is killed. `take` still returns what it has sent.
         """
         end = time.monotonic() + timeout
         self.drain(timeout)
         try:
-            self._line.shutdown(socket.SHUT_WR)
+            self._socket.shutdown(socket.SHUT_WR)
         except OSError as error:
             self._lose(error)
-        self._ending = True
-        # What it still has to say is taken in, for else it would wait for room.
-        while not self._gone and (left := end - time.monotonic()) > 0.0:
-            select.select((self._line,), (), (), left)
+        self._closing = True
+        while not self._lost and (left := end - time.monotonic()) > 0.0:
+            select.select((self._socket,), (), (), left)
             self._receive()
-        try:
-            self._process.wait(max(0.0, end - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            _log.error("%s (process %d) does not end, and is killed", self.name, self.pid)
-        self.kill()
-        return int(self._process.returncode)
+        return self._child.close(max(0.0, end - time.monotonic()))
 
     def kill(self) -> None:
-        """Ends it at once; what came back before may still be taken."""
-        self._ending = True
-        self._process.kill()
-        self._process.wait()
-        if self._line.fileno() >= 0:
-            self._receive()
-            self._line.close()
-        self._gone = True
+        """End the worker at once; `take` still returns what it has sent."""
+        self._closing = True
+        self._child.kill()
+        self._receive()
+        self._lost = True
+        self._child.close()
 
 
-def main() -> None:
-    """The main program of a companion."""
+def _serve(connection: socket.socket, function: Callable[..., None], arguments: Sequence[Any]) -> None:
+    """Run the child process of a `WorkerProcess`."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    # The loop may be confined to processors of its own, where nothing else is to work.
+    # The loop may be confined to processors of its own, where nothing else should work.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    with socket.socket(fileno=int(sys.argv[1])) as line:
-        channel = FrameConnection(line)
-        try:
-            function, arguments = pickle.loads(channel.receive())
-            function(channel, *arguments)
-        except (EOFError, BrokenPipeError, ConnectionResetError):
-            return  # The loop's process has ended, or has closed the line.
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    try:
+        function(FrameConnection(connection), *arguments)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return  # The loop's process has closed the connection, or has ended.

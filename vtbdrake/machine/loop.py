@@ -8,6 +8,7 @@ import os
 import socket
 import threading
 import time
+from collections.abc import Callable
 from math import inf
 from typing import Any
 
@@ -103,7 +104,7 @@ class MachineLoop:
         """Gives the connection back."""
         self._link.close()
 
-    def run(self, *, lock_step: bool = False, cycles: float = inf) -> None:
+    def run(self, *, lock_step: bool = False, cycles: float = inf, ready: Callable[[], None] = lambda: None) -> None:
         """Tells the state at the beginning of each cycle. With the clock, the commands that have come by then act in
         it, as those of a robot on a fieldbus do: the answer to a state acts a period later. In lock-step, the answer
         acts in the cycle whose state it answers, as a testbed's DPS does in simulation.
@@ -111,6 +112,7 @@ class MachineLoop:
         Args:
             lock_step: a cycle begins when one message has arrived on every command channel, instead of with the clock.
             cycles: after how many it ends.
+            ready: called when the first state is told.
 
         Raises:
             RuntimeError: the simulation failed.
@@ -120,6 +122,7 @@ class MachineLoop:
         self._messages = self.machine.messages()
         begin = self._clock.now() - self.machine.time
         self._tell()
+        ready()
         while not self._stop.is_set() and self.machine.cycle < end:
             if lock_step:
                 self._await_commands()

@@ -6,21 +6,20 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, fields, replace
+from math import inf
 from typing import Any
 
 import numpy as np
 
+from vtbdrake.child_process import ChildProcess, StartError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
-from vtbdrake.interpreter import command
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import InjectedFault
 from vtbdrake.machine.machine import MachineStatus
+from vtbdrake.machine.serve import serve_child
 from vtbdrake.testbed import Scenario
 
 _START_TIMEOUT = 60.0
@@ -78,13 +77,12 @@ class MachineProcess:
         self.scenario = scenario
         self.url = url
         self.config = replace(config or MachineConfig(), **options)
-        self._run = {"url": url, "lock_step": lock_step, "cycles": cycles, "priority": priority}
-        self._process: subprocess.Popen[bytes] | None = None
-        self._control: socket.socket | None = None
+        self._run = {"lock_step": lock_step, "cycles": inf if cycles is None else cycles, "priority": priority}
+        self._child: ChildProcess | None = None
         self._paused = False
 
     def start(self) -> None:
-        """Returns when it has told its first state.
+        """Start the machine; when this returns, it has sent its first state.
 
         Raises:
             MachineError: it does not start.
@@ -92,39 +90,33 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        control, theirs = socket.socketpair()
-        self._control = control
+        self._child = ChildProcess(serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
         try:
-            with theirs, tempfile.TemporaryDirectory() as folder:
-                file = Path(folder) / "scenario.yaml"
-                self.scenario.save(file)
-                order = {"scenario": f"{self.scenario.name()}@{file}", "config": _plain(self.config), **self._run}
-                self._process = subprocess.Popen(
-                    command("vtbdrake.machine.serve", str(theirs.fileno()), json.dumps(order)),
-                    pass_fds=[theirs.fileno()],
-                    stdin=subprocess.DEVNULL,
-                )
-                theirs.close()
-                self._ask({"request": "status"}, timeout=_START_TIMEOUT)
-        except BaseException:
+            self._child.wait_until_ready(_START_TIMEOUT)
+        except BaseException as error:
             self.close()
+            if isinstance(error, StartError):
+                raise MachineError(str(error)) from error
             raise
+
+    def _running(self) -> ChildProcess:
+        if self._child is None:
+            raise MachineError("the machine does not run: start it, or use it in a with statement")
+        return self._child
 
     @property
     def pid(self) -> int:
-        """Of its process.
+        """The process id of the machine.
 
         Raises:
             MachineError: it has not been started.
         """
-        if self._process is None:
-            raise MachineError("the machine does not run: start it, or use it in a with statement")
-        return self._process.pid
+        return self._running().pid
 
     @property
     def alive(self) -> bool:
-        """Whether its process runs, or is paused."""
-        return self._process is not None and self._process.poll() is None
+        """True while its process exists, also while it is paused."""
+        return self._child is not None and self._child.alive
 
     def status(self) -> MachineStatus:
         """How it is now.
@@ -181,15 +173,13 @@ class MachineProcess:
         return self._status({"request": "normal"})
 
     def die(self) -> int:
-        """Has it end at once, without a farewell, and says with which exit code it did."""
+        """Let the machine end at once, without closing its connections, and return its exit code."""
         self._send({"request": "die"})
         return self.wait()
 
     def kill(self) -> int:
-        """Kills it from outside (SIGKILL)."""
-        assert self.pid and self._process is not None
-        self._process.kill()
-        return self.wait()
+        """Kill the machine from outside (SIGKILL), and return its exit code."""
+        return self._running().kill()
 
     def pause(self) -> None:
         """Stops it in the middle of what it does (SIGSTOP)."""
@@ -203,30 +193,23 @@ class MachineProcess:
         self._paused = False
 
     def wait(self, timeout: float = _ANSWER_TIMEOUT) -> int:
-        """Waits for its end and returns the exit code.
+        """Wait until the machine has ended, and return its exit code.
 
         Raises:
-            MachineError: it goes on.
+            MachineError: it is still running after ``timeout`` seconds.
         """
-        assert self.pid and self._process is not None
         try:
-            return self._process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            raise MachineError(f"the machine has not ended in {timeout} s") from None
+            return self._running().wait(timeout)
+        except TimeoutError as error:
+            raise MachineError(str(error)) from None
 
     def close(self) -> None:
-        """Ends it; it may be started again."""
-        if self._control is not None:
-            self._control.close()
-        if self._process is not None:
+        """End the machine; it can be started again."""
+        if self._child is not None:
             if self._paused:
-                self._process.kill()
-            try:
-                self._process.wait(_ANSWER_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        self._process = self._control = None
+                self._child.kill()
+            self._child.close(_ANSWER_TIMEOUT)
+        self._child = None
         self._paused = False
 
     def __enter__(self) -> MachineProcess:
@@ -243,20 +226,19 @@ class MachineProcess:
         return MachineStatus(**{item.name: answer[item.name] for item in fields(MachineStatus)})
 
     def _send(self, request: dict[str, Any]) -> socket.socket:
-        if self._control is None:
-            raise MachineError("the machine does not run: start it, or use it in a with statement")
-        self._control.sendall(json.dumps(request).encode() + b"\n")
-        return self._control
+        connection = self._running().connection
+        connection.sendall(json.dumps(request).encode() + b"\n")
+        return connection
 
-    def _ask(self, request: dict[str, Any], *, timeout: float = _ANSWER_TIMEOUT) -> dict[str, Any]:
+    def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         answer = b""
         try:
             control = self._send(request)
-            control.settimeout(timeout)
+            control.settimeout(_ANSWER_TIMEOUT)
             while not answer.endswith(b"\n"):
                 part = control.recv(65536)
                 if not part:
-                    raise ConnectionResetError("it has ended")
+                    raise ConnectionResetError("its process has ended")
                 answer += part
         except OSError as error:
             raise MachineError(f"the machine does not answer: {error}") from error
@@ -264,12 +246,6 @@ class MachineProcess:
         if "error" in told:
             raise MachineError(told["error"])
         return told
-
-
-def _plain(config: MachineConfig) -> dict[str, Any]:
-    plain = asdict(config)
-    plain["values"] = _lists(config.values)
-    return plain
 
 
 def _lists(values: Mapping[str, Any]) -> dict[str, Any]:

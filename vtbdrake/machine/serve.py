@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import signal
 import socket
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from math import inf
+from typing import Any
 
+from vtbdrake.child_process import StartError, report_ready
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.loop import MachineLoop
 from vtbdrake.machine.machine import Machine
-from vtbdrake.testbed import load_scenario
+from vtbdrake.testbed import Scenario
 
 _log = logging.getLogger(__name__)
-
-_FAILED = 1
 
 
 def serve(
@@ -37,7 +35,7 @@ def serve(
     """Runs a machine in the main thread of a process that does nothing else, until SIGTERM, or SIGINT if not ignored.
 
     Args:
-        ready: called when it is connected.
+        ready: called when it is connected and has told its first state.
 
     Raises:
         BridgeError: there is no bus at ``url``.
@@ -47,14 +45,13 @@ def serve(
     signal.signal(signal.SIGTERM, lambda *_: loop.stop())
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, lambda *_: loop.stop())
-    ready()
     # A simulated world that cannot keep up computes without a pause.
     real_time = RealTime(priority=priority, longest_step=None) if priority else nullcontext()
     try:
         with real_time:
             if isinstance(real_time, RealTime):
                 _log.info("%s", real_time)
-            loop.run(lock_step=lock_step, cycles=cycles)
+            loop.run(lock_step=lock_step, cycles=cycles, ready=ready)
     finally:
         loop.close()
     return loop
@@ -66,22 +63,17 @@ def epoch(*, lock_step: bool) -> int:
     return 0 if lock_step else time.time_ns() // 1000
 
 
-def main() -> None:
-    """The process of a `MachineProcess`."""
-    control = socket.socket(fileno=int(sys.argv[1]))
-    order = json.loads(sys.argv[2])
+def serve_child(
+    connection: socket.socket, scenario: Scenario, url: str, config: MachineConfig, options: Mapping[str, Any]
+) -> None:
+    """Run the child process of a `MachineProcess`.
+
+    Args:
+        options: arguments of `serve`.
+    """
     logging.basicConfig(format="machine: %(message)s")
     try:
-        scenario = load_scenario(order["scenario"])
-        machine = Machine(scenario, MachineConfig(**order["config"]), epoch=epoch(lock_step=order["lock_step"]))
-        serve(
-            machine,
-            order["url"],
-            lock_step=order["lock_step"],
-            cycles=inf if order["cycles"] is None else order["cycles"],
-            priority=order["priority"],
-            control=control,
-        )
+        machine = Machine(scenario, config, epoch=epoch(lock_step=options["lock_step"]))
+        serve(machine, url, control=connection, ready=lambda: report_ready(connection), **options)
     except (ValueError, BridgeError) as error:
-        control.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
-        raise SystemExit(_FAILED) from error
+        raise StartError(str(error)) from error

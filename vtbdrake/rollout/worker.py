@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import pickle
 import resource
-import select
-import sys
-import threading
+import socket
 from collections.abc import Callable
 from functools import cache, partial
 from math import inf
 from multiprocessing.connection import Connection
 from typing import Any
 
+from vtbdrake.child_process import report_ready
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.blob import unpack
 from vtbdrake.rollout.result import RolloutResult
@@ -104,17 +103,13 @@ def _pickled_error(index: int, error: BaseException) -> bytes:
     return reply
 
 
-def main() -> None:
-    """Run a worker: its arguments are the socket, how many testbeds it keeps, and the growth of `serve`."""
-    connection = Connection(int(sys.argv[1]))
-    threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
-    connection.send_bytes(b"ready")
-    serve(connection, Runners(Testbeds(kept=int(sys.argv[2]))), growth=float(sys.argv[3]))
+def main(connection: socket.socket, kept: int, growth: float) -> None:
+    """Run a worker process until it is killed.
 
-
-def _end_with(connection: Connection) -> None:
-    """End this process when the other end closes, also in the midst of a rollout that hangs."""
-    poll = select.poll()
-    poll.register(connection, 0)  # A hang-up is reported without being asked for.
-    poll.poll()
-    os._exit(1)
+    Args:
+        connection: the connection to its executor.
+        kept: the number of testbeds that it keeps.
+        growth: see `serve`.
+    """
+    report_ready(connection)
+    serve(Connection(connection.detach()), Runners(Testbeds(kept=kept)), growth=growth)

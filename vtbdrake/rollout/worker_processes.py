@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import pickle
-import socket
-import subprocess
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -13,14 +11,14 @@ from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from vtbdrake.interpreter import command
+from vtbdrake.child_process import ChildProcess, StartError
 from vtbdrake.rollout.arguments import as_number
 from vtbdrake.rollout.blob import Blob, Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.testbeds import KEPT, Testbeds, failed
-from vtbdrake.rollout.worker import BEGUN, GROWN
+from vtbdrake.rollout.worker import BEGUN, GROWN, main
 
 _log = logging.getLogger(__name__)
 
@@ -32,31 +30,26 @@ _SMALL = 1 << 16
 
 
 class _Worker:
-    """A fresh interpreter at the other end of a socket. It does not import the main module again."""
+    """A worker process and the rollouts that it was given."""
 
     def __init__(self, kept: int, growth: float) -> None:
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            self.process = subprocess.Popen(
-                command("vtbdrake.rollout.worker", str(theirs.fileno()), str(kept), str(growth)),
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-            )
-            self.connection = Connection(ours.detach())
-        self._ready = False
+        # At once, without grace: its rollout may hang.
+        self.child = ChildProcess(main, kept, growth, name="a worker process", grace=0.0)
+        self.connection: Connection | None = None  # None until the worker is ready.
         self._task: bytes | None = None
         # The rollout that it runs, and one that was given ahead.
         self.jobs: deque[int] = deque()
         self.deadline = inf
         self.brief = False
-        # Whether its memory has grown so much that another one is to take its place.
+        # True when its memory has grown so much that another worker should replace it.
         self.grown = False
 
     def give(self, task: bytes, index: int, message: bytes) -> None:
-        # Before anything is sent: a worker that was interrupted in here must not pass for an idle one.
+        # Before anything is sent: a worker that was interrupted here must not count as idle.
         self.jobs.append(index)
-        if not self._ready:
-            self._await_ready()
+        if self.connection is None:
+            self.child.wait_until_ready(None)
+            self.connection = Connection(self.child.connection.detach())
         if self._task != task:
             self.brief = False
             self.connection.send_bytes(b"T" + task)
@@ -64,30 +57,21 @@ class _Worker:
         self.connection.send_bytes(message)
 
     def begin(self, time_limit: float) -> None:
-        """It has its testbed and begins its rollout: from here the time counts."""
+        """Start the time limit: the worker has its testbed and begins its rollout."""
         self.deadline = time.monotonic() + time_limit
 
     def finish(self, index: int, outcome: Any) -> None:
-        """It goes on with what was given ahead."""
+        """Remove the rollout that is done; the worker goes on with the one that was given ahead."""
         assert index == self.jobs[0], "a worker answers to another rollout than its own"
         self.jobs.popleft()
         self.deadline = inf
         self.brief = isinstance(outcome, RolloutResult) and outcome.wall_time < _BRIEF
 
-    def _await_ready(self) -> None:
-        try:
-            self.connection.recv_bytes()
-        except (EOFError, OSError) as error:
-            code = self.process.wait()
-            raise WorkerError(
-                f"a worker process does not start (exit code {code}); the reason stands in its output above"
-            ) from error
-        self._ready = True
-
     def kill(self) -> None:
-        self.connection.close()
-        self.process.kill()
-        self.process.wait()
+        self.child.kill()
+        self.child.close()
+        if self.connection is not None:
+            self.connection.close()
 
 
 class ProcessExecutor(Executor):
@@ -212,21 +196,21 @@ class ProcessExecutor(Executor):
         waiting.popleft()
         try:
             worker.give(task, index, message)
-        except (OSError, WorkerError) as error:
+        except (OSError, StartError) as error:
             worker.jobs.pop()
             waiting.appendleft(index)
-            if isinstance(error, WorkerError):
+            if isinstance(error, StartError):
                 self._starts_lost += 1
-                # An exit code is its own doing, and so is a signal that gets all of them.
-                if worker.process.returncode >= 0 or self._starts_lost > self._count:
-                    raise
+                # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
+                if (worker.child.exit_code or 0) >= 0 or self._starts_lost > self._count:
+                    raise WorkerError(str(error)) from error
             return False
         self._starts_lost = 0
         return True
 
     def _replies(self) -> list[tuple[_Worker, int, Any]]:
         """What came in: worker, index, and a result, an exception to raise or, as a string, how the worker was lost."""
-        busy = {worker.connection: worker for worker in self._workers if worker.jobs}
+        busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
         if not busy:
             return []
         first = min(worker.deadline for worker in busy.values())
@@ -246,7 +230,7 @@ class ProcessExecutor(Executor):
                         worker.finish(*reply)
                         replies.append((worker, index, reply[1]))
                 except (EOFError, OSError):
-                    code = worker.process.wait()
+                    code = worker.child.wait()
                     replies.append((worker, index, f"its worker process died (exit code {code})"))
             elif time.monotonic() >= worker.deadline:
                 replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))

@@ -86,7 +86,7 @@ def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixtur
         assert not monitor.running
         assert monitor.dropped > 0
         assert "residuals" in caplog.text
-        assert "is gone" in caplog.text
+        assert "is lost" in caplog.text
 
 
 def test_process_that_is_stopped_leaves_windows_out() -> None:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import json
 import logging
 import os
 import queue
 import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
-from vtbdrake.interpreter import command
+from vtbdrake.child_process import ChildProcess, StartError, report_ready
 from vtbdrake.lcm.hub.config import HubConfig
 from vtbdrake.lcm.hub.server import HubServer, listen
 from vtbdrake.lcm.hub.statistics import HubStatistics
@@ -50,92 +47,77 @@ class Hub:
 
     def __init__(self, config: HubConfig | None = None, **fields: Any) -> None:
         self.config = replace(config or HubConfig(), **fields)
-        self._process: subprocess.Popen[bytes] | None = None
-        self._control: socket.socket | None = None
-        self._url: str | None = None
+        self._child: ChildProcess | None = None
+        self._url = ""
 
     def start(self) -> None:
-        """Returns when clients can connect.
+        """Start the hub; when this returns, clients can connect.
 
         Raises:
-            HubAddressError: it cannot listen at its address.
+            HubAddressError: the hub cannot listen at its address.
             HubError: its process does not start.
         """
-        control, theirs = socket.socketpair()
+        with contextlib.ExitStack() as stack:
+            listeners = [stack.enter_context(listener) for listener in listen(self.config)]
+            self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
+            self._child = ChildProcess(_serve_child, self.config, name="the hub", sockets=listeners)
         try:
-            with theirs, contextlib.ExitStack() as stack:
-                listeners = [stack.enter_context(listener) for listener in listen(self.config)]
-                filenos = [theirs.fileno(), *(listener.fileno() for listener in listeners)]
-                self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
-                self._process = subprocess.Popen(
-                    command("vtbdrake.lcm.hub.process", json.dumps(asdict(self.config)), *map(str, filenos)),
-                    pass_fds=filenos,
-                    stdin=subprocess.DEVNULL,
-                )
-            self._control = control
-            self._ask(_START_TIMEOUT)
-        except BaseException:
-            control.close()
+            self._child.wait_until_ready(_START_TIMEOUT)
+        except BaseException as error:
             self.close()
+            if isinstance(error, StartError):
+                raise HubError(str(error)) from error
             raise
+
+    def _running(self) -> ChildProcess:
+        if self._child is None:
+            raise HubError("the hub does not run: start it, or use it in a with statement")
+        return self._child
 
     @property
     def url(self) -> str:
-        """What clients are created with: ``tcpq://host:port``.
+        """The address for clients, ``tcpq://host:port``.
 
         Raises:
             HubError: the hub does not run.
         """
-        if self._url is None:
-            raise HubError("the hub does not run: start it, or use it in a with statement")
+        self._running()
         return self._url
 
     @property
     def pid(self) -> int:
-        """Of its process.
+        """The process id of the hub.
 
         Raises:
             HubError: the hub does not run.
         """
-        if self._process is None:
-            raise HubError("the hub does not run: start it, or use it in a with statement")
-        return self._process.pid
+        return self._running().pid
 
     def statistics(self) -> HubStatistics:
-        """Of this moment.
+        """Return the present statistics.
 
         Raises:
             HubError: the hub does not answer.
         """
-        return self._ask(_ANSWER_TIMEOUT)
-
-    def _ask(self, timeout: float) -> HubStatistics:
-        if self._control is None:
-            raise HubError("the hub does not run: start it, or use it in a with statement")
-        self._control.settimeout(timeout)
+        connection = self._running().connection
+        connection.settimeout(_ANSWER_TIMEOUT)
         answer = b""
         try:
-            self._control.sendall(b"?")
+            connection.sendall(b"?")
             while not answer.endswith(b"\n"):
-                part = self._control.recv(65536)
+                part = connection.recv(65536)
                 if not part:
-                    raise ConnectionResetError("it has ended")
+                    raise ConnectionResetError("its process has ended")
                 answer += part
         except OSError as error:
             raise HubError(f"the hub at {self._url} does not answer: {error}") from error
         return HubStatistics.from_json(answer)
 
     def close(self) -> None:
-        """Ends it; it may be started again."""
-        if self._control is not None:
-            self._control.close()
-        if self._process is not None:
-            try:
-                self._process.wait(_ANSWER_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        self._process = self._control = self._url = None
+        """End the hub; it can be started again."""
+        if self._child is not None:
+            self._child.close(_ANSWER_TIMEOUT)
+        self._child = None
 
     def __enter__(self) -> Hub:
         self.start()
@@ -145,8 +127,13 @@ class Hub:
         self.close()
 
 
-def serve(server: HubServer) -> None:
-    """Runs a hub in the main thread of a process that does nothing else, until SIGTERM (or SIGINT, if not ignored)."""
+def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
+    """Run a hub in the main thread of a process that does nothing else, until SIGTERM (or SIGINT, if not ignored).
+
+    Args:
+        server: the hub.
+        ready: called when processors and priority are set.
+    """
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, lambda *_: server.stop())
@@ -159,6 +146,7 @@ def serve(server: HubServer) -> None:
     gc.freeze()
     gc.disable()
     with _logging_elsewhere():
+        ready()
         server.serve_forever()
 
 
@@ -200,9 +188,8 @@ class _DroppingHandler(QueueHandler):
             self.queue.put_nowait(record)
 
 
-def main() -> None:
-    """The process of a `Hub`."""
-    control, *listeners = (socket.socket(fileno=int(fileno)) for fileno in sys.argv[2:])
+def _serve_child(connection: socket.socket, config: HubConfig, *listeners: socket.socket) -> None:
+    """Run the child process of a `Hub`."""
     logging.basicConfig(format="hub: %(message)s")
-    server = HubServer(HubConfig(**json.loads(sys.argv[1])), listeners=listeners, control=control)
-    serve(server)
+    server = HubServer(config, listeners=listeners, control=connection)
+    serve(server, ready=lambda: report_ready(connection))

@@ -1,0 +1,203 @@
+"""Child processes: new Python interpreters that run one function and end with the process that started them."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any
+
+_log = logging.getLogger(__name__)
+
+_BOOTSTRAP = """\
+import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+sys.path[:] = {path!r}
+from vtbdrake.child_process import _run
+_run({files!r}, {grace!r})
+"""
+
+
+def _current_directory() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # It was deleted; nothing can be imported from it.
+        return os.sep
+
+
+# Relative entries of sys.path (the "" of a notebook, or of `python -c`) refer to it.
+_FIRST_DIRECTORY = _current_directory()
+
+
+class StartError(RuntimeError):
+    """A child process that cannot do its work; raised in the child, and in its parent by `wait_until_ready`."""
+
+
+class ChildProcess:
+    """A Python interpreter that runs ``function(connection, *arguments, *sockets)``, supervised through a socket.
+
+    The child finds modules where this process finds them, and imports the same vtbdrake, even after a change of
+    ``sys.path`` or of the current directory. It does not run the main module again. It ignores Ctrl-C, which a terminal
+    sends to all processes: the parent decides what an interrupt means.
+
+    The child ends with its parent. When the parent's end of the connection closes, by `close` or because the parent has
+    ended, ``function`` should return; ``grace`` seconds later the child exits, even if ``function`` is still computing.
+    To restart a child, close it and create another one.
+
+    Args:
+        function: a function of the child's end of the connection and the arguments. It is sent by cloudpickle, so that
+            it may be defined in a notebook.
+        arguments: picklable values.
+        name: the name of the child in errors and logs, such as "the hub".
+        sockets: sockets that the child gets too, behind the arguments; they stay open here.
+        grace: time in seconds.
+
+    Attributes:
+        name: see above.
+        connection: this end of the connection. What is sent here is between the parent and ``function``.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., object],
+        *arguments: Any,
+        name: str,
+        sockets: Sequence[socket.socket] = (),
+        grace: float = 10.0,
+    ) -> None:
+        from vtbdrake.pickling import dumps  # Here, because `import vtbdrake` should stay quick.
+
+        self.name = name
+        self.connection, child_end = socket.socketpair()
+        # A file, because a socket takes only so much before the child reads from it.
+        with child_end, tempfile.TemporaryFile() as call:
+            call.write(dumps((function, arguments)))
+            call.seek(0)
+            files = [child_end.fileno(), call.fileno(), *(each.fileno() for each in sockets)]
+            program = _BOOTSTRAP.format(path=_search_path(), files=files, grace=grace)
+            self._process = subprocess.Popen([sys.executable, "-c", program], pass_fds=files, stdin=subprocess.DEVNULL)
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """The exit code: None while the child runs, the negative number of the signal if a signal ended it."""
+        return self._process.poll()
+
+    @property
+    def alive(self) -> bool:
+        """True while the process exists, running or stopped."""
+        return self.exit_code is None
+
+    def wait_until_ready(self, timeout: float | None = 60.0) -> None:
+        """Wait until the child has called `report_ready`.
+
+        Args:
+            timeout: time in seconds; None to wait forever.
+
+        Raises:
+            StartError: the child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
+        """
+        line = b""
+        self.connection.settimeout(timeout)
+        try:
+            while not line.endswith(b"\n"):
+                part = self.connection.recv(1)  # No more: what follows the line belongs to `function`.
+                if not part:
+                    raise ConnectionResetError("the child has closed its end")
+                line += part
+        except TimeoutError as error:
+            raise StartError(f"{self.name} (process {self.pid}) was not ready within {timeout:g} s") from error
+        except OSError as error:
+            raise StartError(
+                f"{self.name} did not start (exit code {self._process.wait()}): see its output above"
+            ) from error
+        self.connection.settimeout(None)
+        if line != b"\n":
+            raise StartError(line.decode().strip())
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until the child has ended, and return its exit code.
+
+        Raises:
+            TimeoutError: it is still running after ``timeout`` seconds.
+        """
+        try:
+            return self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError(f"{self.name} (process {self.pid}) has not ended within {timeout:g} s") from None
+
+    def close(self, timeout: float = 10.0) -> int:
+        """Close the connection, wait until the child has ended, and return its exit code.
+
+        After ``timeout`` seconds the child is killed.
+        """
+        self.connection.close()
+        try:
+            return self.wait(timeout)
+        except TimeoutError as error:
+            _log.error("%s and is killed", error)
+            return self.kill()
+
+    def kill(self) -> int:
+        """Kill the child (SIGKILL) and return its exit code. What it has sent can still be read from the connection."""
+        self._process.kill()
+        return self._process.wait()
+
+
+def report_ready(connection: socket.socket) -> None:
+    """Tell the parent that this child is ready; see `ChildProcess.wait_until_ready`.
+
+    Args:
+        connection: the child's end of the connection, on which nothing was sent before.
+    """
+    connection.sendall(b"\n")
+
+
+def _search_path() -> list[str]:
+    """Return sys.path with absolute entries only, so that the first vtbdrake in it is that of this process."""
+    directories = (_FIRST_DIRECTORY, _current_directory())
+    entries = [entry for entry in sys.path if isinstance(entry, str)]  # Imports ignore all others.
+    path = list(dict.fromkeys(os.path.join(directory, entry) for entry in entries for directory in directories))
+    package = Path(__file__).parent
+    found = PathFinder.find_spec(package.name, path)
+    if found is None or found.origin is None or not package.samefile(Path(found.origin).parent):
+        path.insert(0, str(package.parent))
+    return path
+
+
+def _run(files: Sequence[int], grace: float) -> None:
+    """Run the child: see `ChildProcess`."""
+    connection, call, *sockets = files
+    threading.Thread(target=_exit_after_hang_up, args=(os.dup(connection), grace), daemon=True).start()
+    with socket.socket(fileno=connection) as parent:
+        try:
+            with open(call, "rb") as file:
+                function, arguments = pickle.load(file)
+            function(parent, *arguments, *(socket.socket(fileno=descriptor) for descriptor in sockets))
+        except StartError as error:
+            with contextlib.suppress(OSError):
+                parent.sendall(" ".join(str(error).split()).encode() + b"\n")
+            raise SystemExit(1) from error
+
+
+def _exit_after_hang_up(connection: int, grace: float) -> None:
+    poll = select.poll()
+    poll.register(connection, 0)  # A hang-up is always reported.
+    poll.poll()
+    time.sleep(grace)
+    os._exit(1)
