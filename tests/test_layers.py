@@ -25,6 +25,7 @@ BELOW: dict[str, set[str]] = {
     "recording": {"state", "testbed", "control", "lcm"},
     "monitoring": {"state", "testbed", "control", "lcm"},
     "machine": {"state", "testbed", "control", "lcm"},
+    "deployment": {"state", "testbed", "control", "lcm", "recording", "monitoring"},
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
@@ -38,8 +39,12 @@ BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)
 TOP = {"visualization", "testing", "cli"}
 
-# Results that plot and show themselves delegate to `visualization`, which they import when they are asked to.
-MAY_DELEGATE = {"rollout", "optimization", "reasoning", "calibration"}
+# A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
+# `visualization`, a scenario is deployed by `deployment`.
+MAY_DELEGATE: dict[str, set[str]] = {
+    "testbed": {"deployment"},
+    **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
+}
 
 OUTSIDE = {"diagrams", "benchmarks", "tests"}
 
@@ -90,7 +95,7 @@ def violations(source: str, module: str, is_package: bool = False) -> list[str]:
         elif target not in BELOW:
             if layer not in TOP:
                 found.append(f"{module}:{line}: imports {name} from the root, which imports every layer")
-        elif target not in BELOW[layer] and not (lazy and target == "visualization" and layer in MAY_DELEGATE):
+        elif target not in BELOW[layer] and not (lazy and target in MAY_DELEGATE.get(layer, ())):
             found.append(f"{module}:{line}: {layer} must not import {target}")
     return found
 
@@ -120,6 +125,8 @@ def test_imports_of_compiled_modules_point_one_way() -> None:
         ("vtbdrake.state.a", "import vtbdrake.testbed"),
         ("vtbdrake.testbed.a", "from vtbdrake.rollout import Rollout"),
         ("vtbdrake.testbed.a", "from vtbdrake.components.sensors import Imu"),
+        ("vtbdrake.testbed.a", "from vtbdrake.deployment import deploy"),
+        ("vtbdrake.control.a", "def f():\n    from vtbdrake.deployment import deploy"),
         ("vtbdrake.rollout.a", "from vtbdrake import optimization"),
         ("vtbdrake.rollout.a", "from ..optimization import Problem"),
         ("vtbdrake.rollout.a", "from .. import cli"),
@@ -147,6 +154,7 @@ def test_import_against_the_layers_is_found(module: str, source: str) -> None:
     [
         ("vtbdrake.rollout.a", "from vtbdrake.testbed import Testbed\nfrom .b import c\nfrom . import d\nimport numpy"),
         ("vtbdrake.rollout.a", "def plot(self):\n    from vtbdrake.visualization import plot_rollout"),
+        ("vtbdrake.testbed.a", "def deploy(self):\n    from vtbdrake.deployment import deploy"),
         ("vtbdrake.optimization.a", "if TYPE_CHECKING:\n    from vtbdrake.visualization import Figure"),
         ("vtbdrake.calibration.a", "from ..rollout import Rollout"),
         ("vtbdrake.cli.a", "import vtbdrake as vtb\nfrom vtbdrake import reasoning, control"),

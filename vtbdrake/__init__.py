@@ -10,8 +10,9 @@ import vtbdrake.child_process as _child_process  # noqa: F401  It notes the dire
 
 if TYPE_CHECKING:
     from vtbdrake.control.guard import Guards
-    from vtbdrake.control.operation import Operation
+    from vtbdrake.control.realtime import RealTime
     from vtbdrake.control.runtime import Runtime
+    from vtbdrake.deployment import Deployment
     from vtbdrake.lcm.bridge import LcmBridge
     from vtbdrake.lcm.hub import Hub
     from vtbdrake.lcm.protocol import Protocol
@@ -42,6 +43,7 @@ __all__ = [
     "CVaR",
     "Choice",
     "Constraint",
+    "Deployment",
     "DpsAlone",
     "Guards",
     "Hub",
@@ -51,12 +53,12 @@ __all__ = [
     "LiveService",
     "LiveWatch",
     "MachineProcess",
-    "Operation",
     "Parameter",
     "Problem",
     "Protocol",
     "Quality",
     "Quantile",
+    "RealTime",
     "Recorder",
     "ResidualMonitor",
     "RolloutResult",
@@ -83,12 +85,13 @@ _HOMES = {
     "monitoring.live.live_watch": ("LiveWatch",),
     "monitoring.live.service": ("LiveService",),
     "machine": ("MachineProcess",),
-    "control.operation": ("Operation",),
+    "deployment": ("Deployment",),
     "lcm.protocol": ("Protocol",),
     "recording.log_reader": ("read_log",),
     "recording.recorder": ("Recorder",),
     "recording.replay": ("replay",),
     "monitoring.residuals": ("ResidualMonitor",),
+    "control.realtime": ("RealTime",),
     "control.runtime": ("Runtime",),
     "optimization": ("Boundary", "CVaR", "Choice", "Parameter", "Problem", "Quantile", "Study", "Sweep"),
     "rollout": ("Constraint", "Quality", "RolloutResult"),

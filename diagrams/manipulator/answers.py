@@ -129,8 +129,8 @@ class _Real:
         self.commands: list[NDArray[np.float64]] = []
         self._bridge = _bridge(scenario, hub)
         self._machine = MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED)
-        operation = scenario.operation().in_lock_step("wrench", wait=PATIENCE)
-        self.loop = operation.runtime(target, self._bridge, context=context, watchers=(self._take_down,))
+        deployment = scenario.deployment().in_lock_step("wrench", wait=PATIENCE)
+        self.loop = deployment.runtime(target, self._bridge, context=context, watchers=(self._take_down,))
 
     def __enter__(self) -> _Real:
         self._machine.start()

@@ -18,10 +18,10 @@ from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, 
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.cycle import Cycle
-from vtbdrake.control.operation import Operation
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
@@ -107,7 +107,7 @@ class Demo:
         return track, loop
 
     def _shadow(self, simulated: Runtime) -> Runtime:
-        loop = self._operation().runtime(self.testbed, self.bridge, context=simulated.context)
+        loop = self._deployment().runtime(self.testbed, self.bridge, context=simulated.context)
         self._switch(loop, "shadow")
         loop.run(seconds=1.0)
         command = loop.command("joint_torque")
@@ -118,14 +118,14 @@ class Demo:
     def _strip(self, shadowed: Runtime) -> Runtime:
         alone = DpsAlone(self.scenario)
         context = alone.continue_from(self.testbed, shadowed.context)
-        loop = self._operation().runtime(alone, self.bridge, context=context, watchers=(self.attendant,))
+        loop = self._deployment().runtime(alone, self.bridge, context=context, watchers=(self.attendant,))
         self._switch(loop, "real")
         return loop
 
-    def _operation(self) -> Operation:
+    def _deployment(self) -> Deployment:
         """A new one each time, for its fallback has a memory."""
-        operation = self.scenario.operation()
-        return replace(operation, guards={**operation.guards, "max_missed": MAX_MISSED})
+        deployment = self.scenario.deployment()
+        return replace(deployment, guards={**deployment.guards, "max_missed": MAX_MISSED})
 
     def _switch(self, loop: Runtime, mode: str) -> None:
         """Tried again where something was late just now."""

@@ -24,7 +24,7 @@ from vtbdrake.components.sensors import (
     JointTachometers,
     JointTorqueSensors,
 )
-from vtbdrake.control.operation import Operation
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.lcm.vectors import vector_map
@@ -129,51 +129,46 @@ class ManipulatorScenario(Scenario):
             commands=[Signal("motion", size=1, lower=0.0, upper=len(MOTIONS) - 1.0, default=HOME)],
         )
 
-    def protocol(self) -> Protocol:
-        """What the arm speaks: the iiwa messages and the wrench at its flange; on ARM_MOTION one chooses the motion."""
-        return Protocol(
-            sense=[
-                iiwa_status(
-                    {
-                        "joint_position": "joint_position_measured",
-                        "joint_velocity": "joint_velocity_estimated",
-                        "joint_torque_measured": "joint_torque_measured",
-                        "joint_torque_reported": "joint_torque_commanded",
-                    }
-                ),
-                vector_map(
-                    "WRENCH", lcmt_force_torque, {"wrench": ("tx", "ty", "tz", "fx", "fy", "fz")}, stamp="timestamp"
-                ),
-            ],
-            act=[iiwa_command(["joint_torque"])],
-            commands=[vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"})],
-            reported={"joint_torque": "joint_torque_reported"},
-        )
+    def deployment(self) -> Deployment:
+        """Return how the DPS runs on the arm: it answers each state at once; after a fault, the arm floats in place.
 
-    def operation(self) -> Operation:
-        """How the DPS is run on the arm: it answers each state as soon as it comes; after a fault, the arm floats in
-        place."""
-        guards = {"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE}
-        # The wrench is in the last message of the arm's cycle.
-        return Operation(period=self.period, guards=guards, continuity=CONTINUITY, pace="wrench")
-
-    def residuals(self) -> ResidualConfig:
-        """The machine's samples are compared with those of an arm whose sensors do nothing by chance."""
-        certain = {
-            name: replace(getattr(self, name), noise=0.0, drift=0.0, dropout=0.0)
-            for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
+        The arm speaks the messages of an iiwa and publishes the wrench at its flange; ARM_MOTION chooses the motion.
+        """
+        status = {
+            "joint_position": "joint_position_measured",
+            "joint_velocity": "joint_velocity_estimated",
+            "joint_torque_measured": "joint_torque_measured",
+            "joint_torque_reported": "joint_torque_commanded",
         }
-        return ResidualConfig(
-            scenario=replace(self, **certain),
+        wrench = {"wrench": ("tx", "ty", "tz", "fx", "fy", "fz")}
+        return Deployment(
+            protocol=Protocol(
+                sense=[iiwa_status(status), vector_map("WRENCH", lcmt_force_torque, wrench, stamp="timestamp")],
+                act=[iiwa_command(["joint_torque"])],
+                commands=[vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"})],
+                reported={"joint_torque": "joint_torque_reported"},
+            ),
             period=self.period,
-            tolerance={
-                "sense.joint_position": 1e-6,
-                "sense.joint_velocity": 1e-4,
-                "sense.joint_torque_measured": 0.02,
-                "sense.wrench": 0.02,
-                "act.joint_torque": 0.02,
-            },
+            guards={"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE},
+            continuity=CONTINUITY,
+            pace="wrench",  # It is in the last message of the arm's cycle.
+            residuals=ResidualConfig(
+                scenario=self._without_chance(),
+                period=self.period,
+                tolerance={
+                    "sense.joint_position": 1e-6,
+                    "sense.joint_velocity": 1e-4,
+                    "sense.joint_torque_measured": 0.02,
+                    "sense.wrench": 0.02,
+                    "act.joint_torque": 0.02,
+                },
+            ),
         )
+
+    def _without_chance(self) -> ManipulatorScenario:
+        """Return this scenario with sensors without random errors, as predictions need it."""
+        names = ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
+        return replace(self, **{n: replace(getattr(self, n), noise=0.0, drift=0.0, dropout=0.0) for n in names})
 
     def make_dps(self) -> Diagram:
         return make_dps(self.law, period=self.period, compile=self.compile)

@@ -1,16 +1,16 @@
-"""A scenario whose command has a limit of its rate, and that does not say from where it departs."""
+"""A scenario with a limited rate of its actuator command, and no measurement to start from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from tests.control.servo_machine import ServoMachineScenario
-from vtbdrake.control.operation import Operation
+from vtbdrake.deployment import Deployment
 
 
 @dataclass
 class CarelessScenario(ServoMachineScenario):
-    """As it says."""
+    """A servo machine whose deployment has no continuity."""
 
-    def operation(self) -> Operation:
-        return Operation()
+    def deployment(self) -> Deployment:
+        return Deployment(protocol=super().deployment().protocol)

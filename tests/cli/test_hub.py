@@ -113,7 +113,7 @@ def test_a_hub_without_a_scenario_needs_nothing_of_drake() -> None:
         (("--port", 0, "--max-memory", 1), "max_memory lies between"),
         (("--port", 0, "--max-clients", 0), "max-clients"),
         (("--port", 0, "nowhere.at_all:Scenario"), "cannot import nowhere.at_all"),
-        (("--port", 0, "tests.testbeds:PendulumScenario"), "does not say what its machine speaks"),
+        (("--port", 0, "tests.testbeds:PendulumScenario"), "has no protocol for its machine"),
         (("--port", 0, "--cpu", -1), "processors have the numbers"),
     ],
 )

@@ -69,7 +69,7 @@ def test_machine_dies_on_request(hub: Hub) -> None:
 @pytest.mark.parametrize(
     ("scenario", "options", "code", "message"),
     [
-        (ACROBOT, (), 2, "AcrobotScenario does not say what its machine speaks"),
+        (ACROBOT, (), 2, "AcrobotScenario has no protocol for its machine"),
         (ROBOT, ("--perturb", "2"), 2, "perturb is a relative change"),
         (ROBOT, ("--noise", "torque=1"), 2, "noise is added to vector sensor signals"),
         (ROBOT, ("--noise", "position=[1,2]"), 2, "one standard deviation"),

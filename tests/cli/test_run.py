@@ -24,10 +24,9 @@ from tests.control.scripted import PERIOD
 from tests.control.servo_machine import COMMAND, PATIENCE, ServoMachineScenario
 from tests.control.test_loop import Ear
 from vtbdrake.cli import main
-from vtbdrake.control.operation import operation_of
 from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.state import Snapshot
 
@@ -76,18 +75,17 @@ def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
     testbed = scenario.build()
     context = testbed.default_context()
     testbed.restore(context, snapshot)
-    bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
-    runtime = operation_of(scenario).runtime(testbed, bridge, context=context)
-    with MachineProcess(scenario, hub.url, lock_step=True):
-        bridge.open()
+    with (
+        MachineProcess(scenario, hub.url, lock_step=True),
+        scenario.deploy(hub.url, target=testbed, context=context) as runtime,
+    ):
         ear = Ear(hub.url)
-        while not all(reception.count for reception in bridge.sensed.values()):
-            assert bridge.poll(PATIENCE)
+        while not all(reception.count for reception in runtime.bridge.sensed.values()):
+            assert runtime.bridge.poll(PATIENCE)
         runtime.switch("real")
         runtime.cycle()
         runtime.run(cycles=CYCLES - 1)
         ear.listen(lambda: len(ear.torques) >= 2 * CYCLES)
-        bridge.close()
     return ear.torques[: 2 * CYCLES]
 
 
@@ -115,14 +113,14 @@ def test_it_commands_what_the_whole_testbed_would_and_carries_nothing_of_a_world
 def test_the_arm_is_run_without_its_plant() -> None:
     program = (
         "import sys; from diagrams.manipulator import ManipulatorScenario as S; import vtbdrake.cli.run;"
-        "from vtbdrake.testbed import DpsAlone; from vtbdrake.control.operation import operation_of;"
-        "operation_of(S()); DpsAlone(S()); print(*sys.modules)"
+        "from vtbdrake.testbed import DpsAlone; from vtbdrake.deployment import Deployment;"
+        "Deployment.of(S()); DpsAlone(S()); print(*sys.modules)"
     )
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     # Its DPS knows the links' inertias, and these bring pydrake.multibody.tree with them.
     useless = {"pydrake.multibody.plant", "pydrake.multibody.parsing", "scipy.optimize", *USELESS[2:]}
     assert useless & set(found.stdout.split()) == set()
-    assert operation_of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
+    assert Deployment.of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
@@ -205,7 +203,7 @@ def test_it_ends_when_the_time_is_up_and_writes_what_it_measured_and_recorded(hu
     assert told.period == PERIOD
     # One command in each cycle but those before the machine spoke, and the farewell.
     assert told.cycles + 1 >= len(ear.listen()) / 2 > 1
-    assert f"recorded to {tmp_path / 'log.lcm'}; 0 cycles lost" in output
+    assert f"recorded to {tmp_path / 'log.lcm'}; 0 cycles lost" in errors
     assert (tmp_path / "log.lcm").stat().st_size > 0
 
 
@@ -289,8 +287,8 @@ def another_snapshot(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("scenario", "options", "code", "message"),
     [
-        ("tests.testbeds:AcrobotScenario", (), 2, "does not say what its machine speaks"),
-        ("tests.cli.careless:CarelessScenario", (), 2, "CarelessScenario cannot be run on its machine: the actuator"),
+        ("tests.testbeds:AcrobotScenario", (), 2, "has no protocol for its machine"),
+        ("tests.cli.careless:CarelessScenario", (), 2, "CarelessScenario cannot run on its machine: the actuator"),
         (SERVO, ("--set", "dps.gian=1"), 2, "did you mean dps.gain"),
         (SERVO, ("--field", "rtae=1"), 2, "no field 'rtae'"),
         (SERVO, ("--field", "rate=fast"), 2, "takes a value of type float"),

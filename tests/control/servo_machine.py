@@ -8,7 +8,7 @@ from math import inf
 from drake import lcmt_scope
 
 from tests.control.scripted import PERIOD, ServoScenario
-from vtbdrake.control.operation import Operation
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.lcm.vectors import vector_map
@@ -28,15 +28,14 @@ class ServoMachineScenario(ServoScenario):
         interface = super().interface()
         return replace(interface, sense=[replace(signal, max_age=self.max_age) for signal in interface.sense])
 
-    def protocol(self) -> Protocol:
-        return Protocol(
+    def deployment(self) -> Deployment:
+        protocol = Protocol(
             sense=[iiwa_status({"position": "joint_position_measured", "speed": "joint_velocity_estimated"})],
             act=[iiwa_command({"velocity": "joint_torque"})],
             commands=[vector_map("TARGET", lcmt_scope, {"target": "value"})],
         )
-
-    def operation(self) -> Operation:
-        return Operation(
+        return Deployment(
+            protocol=protocol,
             period=PERIOD,
             guards={"max_missed": inf},
             continuity={"velocity": ("speed", 5.0)},

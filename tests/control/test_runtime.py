@@ -10,7 +10,6 @@ from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.operation import take_over
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import SwitchRefusedError
@@ -569,8 +568,8 @@ def test_a_time_that_is_no_number_is_not_waited_for():
     runtime, _, _ = make()
     with pytest.raises(ValueError, match="a number of seconds, not for nan"):
         runtime.run(seconds=np.nan)
-    with pytest.raises(ValueError, match="timeout=nan"):
-        take_over(runtime, timeout=np.nan)
+    with pytest.raises(ValueError, match="not nan"):
+        runtime.take_over(timeout=np.nan)
     assert runtime.cycles == 0
 
 

@@ -17,6 +17,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import Demultiplexer
 
 from tests.testbeds import ACROBOT
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
@@ -79,8 +80,9 @@ class RobotScenario(Scenario):
         builder.sim_sensor("velocity", split.get_output_port(1))
         builder.sim_actuator("torque", plant.get_actuation_input_port())
 
-    def protocol(self) -> Protocol:
-        return Protocol(sense=[iiwa_status(SENSE)], act=[iiwa_command({"torque": "joint_torque"})])
+    def deployment(self) -> Deployment:
+        protocol = Protocol(sense=[iiwa_status(SENSE)], act=[iiwa_command({"torque": "joint_torque"})])
+        return Deployment(protocol=protocol)
 
 
 def torque(value: float, utime: int) -> bytes:

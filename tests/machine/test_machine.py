@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from drake import lcmt_iiwa_status
 
 from tests.machine.robot import COMMAND, ELBOW, PERIOD, STATUS, RobotScenario, state, torque
 from tests.testbeds import AcrobotScenario
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.protocol import Protocol, ProtocolError
+from vtbdrake.lcm.protocol import Protocol, ProtocolError, protocol_of
 from vtbdrake.machine import (
     PERTURBED,
     Delay,
@@ -87,8 +88,8 @@ def test_the_newest_command_counts() -> None:
 def test_channel_with_a_period_of_its_own() -> None:
     @dataclass
     class Slow(RobotScenario):
-        def protocol(self) -> Protocol:
-            return Protocol(
+        def deployment(self) -> Deployment:
+            protocol = Protocol(
                 sense=[
                     iiwa_status({"position": "joint_position_measured"}, channel="FAST"),
                     iiwa_status({"velocity": "joint_velocity_estimated"}, channel="SLOW"),
@@ -96,6 +97,7 @@ def test_channel_with_a_period_of_its_own() -> None:
                 act=[iiwa_command({"torque": "joint_torque"})],
                 periods={"SLOW": 0.005},
             )
+            return Deployment(protocol=protocol)
 
     robot = Machine(Slow())
     told = {}
@@ -318,16 +320,19 @@ def test_fault_of_an_unknown_channel_is_refused() -> None:
 # -- what does not fit
 
 
+PROTOCOL = protocol_of(RobotScenario())
+
+
 def test_scenario_without_protocol_is_refused() -> None:
-    with pytest.raises(ProtocolError, match=r"AcrobotScenario does not say .* give it a method protocol\(\)"):
+    with pytest.raises(ProtocolError, match=r"AcrobotScenario has no protocol .* give it a method deployment\(\)"):
         Machine(AcrobotScenario())
 
 
 def test_protocol_that_lacks_a_signal_is_refused() -> None:
     @dataclass
     class Mute(RobotScenario):
-        def protocol(self) -> Protocol:
-            return Protocol(sense=super().protocol().sense, act=[])
+        def deployment(self) -> Deployment:
+            return Deployment(protocol=replace(PROTOCOL, act=[]))
 
     with pytest.raises(ProtocolError, match="actuator signal torque needs a map"):
         Machine(Mute())
@@ -336,11 +341,10 @@ def test_protocol_that_lacks_a_signal_is_refused() -> None:
 def test_period_of_an_unknown_channel_is_refused() -> None:
     @dataclass
     class Odd(RobotScenario):
-        def protocol(self) -> Protocol:
-            own = super().protocol()
-            return Protocol(sense=own.sense, act=own.act, periods={"IMU": 0.1})
+        def deployment(self) -> Deployment:
+            return Deployment(protocol=replace(PROTOCOL, periods={"IMU": 0.1}))
 
-    with pytest.raises(ProtocolError, match="not 0.1 s for 'IMU'"):
+    with pytest.raises(ProtocolError, match="not 'IMU' to 0.1 s"):
         Machine(Odd())
 
 

@@ -14,6 +14,7 @@ from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 from pydrake.systems.sensors import ImageGrey8U
 
 from tests.control.scripted import PERIOD
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command
 from vtbdrake.lcm.images import image_map
 from vtbdrake.lcm.protocol import Protocol
@@ -63,8 +64,9 @@ class SeeingScenario(Scenario):
             act=[Signal("velocity", size=1, unit="rad/s", idle=0.0)],
         )
 
-    def protocol(self) -> Protocol:
-        return Protocol(sense=[image_map("CAMERA", "image")], act=[iiwa_command({"velocity": "joint_position"})])
+    def deployment(self) -> Deployment:
+        act = [iiwa_command({"velocity": "joint_position"})]
+        return Deployment(protocol=Protocol(sense=[image_map("CAMERA", "image")], act=act))
 
     def make_dps(self) -> System:
         return Gaze()

@@ -7,7 +7,7 @@ import logging
 import queue
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
 
@@ -29,14 +29,12 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.text import number, write_whole
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.guard import Guards
-from vtbdrake.control.operation import operation_of, take_over
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.monitoring.live.service import LiveService
+from vtbdrake.deployment import Deployment
 from vtbdrake.state import Snapshot
-from vtbdrake.testbed import DpsAlone, Scenario
+from vtbdrake.testbed import Scenario
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +70,7 @@ MOST_FAULTS = 20
 )
 @click.option(
     "--take-over",
-    "succeed",
+    "claim",
     is_flag=True,
     help="Ask the hub for command channels whose owner has fallen silent: a frozen DPS, say.",
 )
@@ -105,7 +103,7 @@ def run_dps(
     pace: str | None,
     seconds: float | None,
     wait: float,
-    succeed: bool,
+    claim: bool,
     priority: int,
     lock_memory: bool,
     live: bool,
@@ -114,43 +112,31 @@ def run_dps(
 ) -> None:
     """Run the DPS of a scenario on its machine, without its simulated world, until Ctrl-C.
 
-    The scenario says by its method protocol() on which channels they speak, and by operation() what guards it. The DPS
-    commands as soon as all its sensor signals are fresh and plausible and the machine is ready. After a fault the
-    fallbacks command, until vtbdrake reset. In the end they go out once. The exit code is 1 if the machine was not
-    ready, or if the fallbacks commanded in the end.
+    The method deployment() of the scenario describes the channels and the guards. The DPS commands as soon as all its
+    sensor signals are fresh and plausible and the machine is ready. After a fault the fallbacks command, until vtbdrake
+    reset. At the end they command once. The exit code is 1 if the machine was not ready, or if the fallbacks were
+    commanding at the end.
 
     \b
     Example:
       vtbdrake run diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
     scenario = with_fields(scenario, fields)
-    operation = operation_of(scenario, period=period, pace=pace)
-    bridge = protocol_of(scenario).bridge(scenario.interface(), url)
-    alone = DpsAlone(scenario)
-    context = None
-    if snapshot is not None:
-        context = alone.default_context()
-        alone.restore(context, snapshot)
-    # Whoever ends the process by `kill` ends the loop as Ctrl-C does.
+    changes = {"period": period, "pace": pace}
+    deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
+    # SIGTERM ends the loop as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with operation.runtime(alone, bridge, context=context) as runtime, ExitStack() as stack:
-        alone.write(runtime.context, settings(values))
-        begin = runtime.clock.now()
-        try:
-            bridge.open()
-        except BridgeError as error:
-            raise FailedError(one_line(error)) from error
-        stack.callback(bridge.close)
-        if succeed:
-            bridge.take_over()
-        if live:
-            stack.enter_context(LiveService(runtime, url))
-        if record is not None:
-            _record(stack, runtime, record)
-        stack.enter_context(_patient_logs())
-        real_time = stack.enter_context(RealTime(priority=priority or None, lock_memory=lock_memory))
-        click.echo(real_time)
-        _run(runtime, wait=wait, seconds=seconds)
+    loop = scenario.deploy(
+        url, start=snapshot, values=settings(values), deployment=deployment, claim=claim, live=live, record=record
+    )
+    try:
+        with _logs_in_a_thread(), loop as runtime:
+            begin = runtime.clock.now()
+            with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
+                click.echo(real_time)
+                _run(runtime, wait=wait, seconds=seconds)
+    except (BridgeError, RunawayError) as error:
+        raise FailedError(one_line(error)) from error
     if statistics is not None:
         write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
     click.echo(runtime.statistics)
@@ -158,9 +144,10 @@ def run_dps(
 
 
 def _report_faults(guards: Guards, begin: float) -> None:
-    """
+    """Print the faults of the loop.
+
     Raises:
-        FailedError: the guards have latched, for more than the farewell.
+        FailedError: The fallbacks were commanding at the end.
     """
     faults = [fault for fault in guards.log if fault.kind != "told"]
     for fault in faults[:MOST_FAULTS]:
@@ -173,43 +160,32 @@ def _report_faults(guards: Guards, begin: float) -> None:
 
 
 def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
-    """
+    """Take over, and run until the time is up or Ctrl-C.
+
     Raises:
-        FailedError: the machine was not ready.
+        FailedError: The machine was not ready in time.
     """
     try:
-        take_over(runtime, timeout=wait, tell=lambda text: _log.info("waiting: %s", text))
+        runtime.take_over(timeout=wait)
         _log.info("the DPS commands; its time is %s s", number(runtime.time))
         runtime.run(seconds=seconds)
-        runtime.send_fallback("the time is up")
-    except RunawayError as error:
-        raise FailedError(one_line(error)) from error
     except SwitchRefusedError as error:
         raise FailedError(f"not switched to the machine {one_line(error)}") from error
     except KeyboardInterrupt:
-        # The runtime has said its farewell.
         _log.info("interrupted")
 
 
-def _record(stack: ExitStack, runtime: Runtime, path: Path) -> None:
-    from vtbdrake.recording.recorder import Recorder
-
-    recorder = Recorder(runtime, path)
-    # Told when it is closed, for then it is known.
-    stack.callback(lambda: click.echo(f"recorded to {path}; {recorder.lost} cycles lost"))
-    stack.enter_context(recorder)
-
-
 @contextmanager
-def _patient_logs() -> Iterator[None]:
-    """What is logged is written by another thread: a terminal that takes nothing must not hold up the loop."""
+def _logs_in_a_thread() -> Iterator[None]:
+    """Write log messages to stderr in another thread, because a blocked terminal must not delay the loop."""
     lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     listener = QueueListener(lines, handler)
     ours, root = QueueHandler(lines), logging.getLogger()
     root.addHandler(ours)
-    _log.setLevel(logging.INFO)
+    for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
+        logger.setLevel(logging.INFO)
     listener.start()
     try:
         yield

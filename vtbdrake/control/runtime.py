@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from functools import partial
 from math import floor, inf, isnan
 from typing import Any, Self
 
@@ -318,6 +319,42 @@ class Runtime(Stepped):
             SwitchRefusedError: something speaks against it; nothing has changed.
         """
         self.perform(self.prepare(mode, **sides))
+
+    def take_over(self, *, timeout: float = 60.0, report: Callable[[str], None] | None = None) -> None:
+        """Run cycles until nothing prevents a switch to real, and switch; `run` goes on from there.
+
+        Args:
+            timeout: The time after which to give up, in seconds.
+            report: Called with the reasons to wait, at first and then once per second; by default they are logged.
+
+        Raises:
+            SwitchRefusedError: Something still prevents the switch after ``timeout``.
+            ValueError: The timeout is not a number.
+        """
+        if isnan(timeout):
+            raise ValueError(f"timeout must be a number of seconds, not {timeout}")
+        report = report or partial(_log.info, "waiting: %s")
+        begin = self.clock.now()
+        reported = -inf
+
+        def taken() -> bool:
+            nonlocal reported
+            preparation = self.prepare("real")
+            if not preparation.reasons:
+                self.perform(preparation)
+                return True
+            waited = self.clock.now() - begin
+            if waited >= timeout:
+                raise SwitchRefusedError(f"after {waited:.1f} s: {'; '.join(preparation.reasons)}")
+            if waited >= reported + _TELL_EVERY:
+                reported = waited
+                report("; ".join(preparation.reasons))
+            return False
+
+        self.run(until=taken)
+        if self.pace is not None:
+            # At once: a machine in lock-step sends nothing new before it gets an actuator command.
+            self.cycle()
 
     def request(self, action: Callable[[], Any]) -> Future[Any]:
         """Has ``action`` (a `switch`, a `write`) done at the beginning of the next cycle; from any thread.

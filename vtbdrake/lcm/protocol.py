@@ -12,20 +12,21 @@ from vtbdrake.testbed import Interface, Scenario
 
 
 class ProtocolError(ValueError):
-    """A scenario that does not say what its machine speaks, or says it in a way that does not fit its signals."""
+    """The protocol of a machine is missing, or does not fit the signals of its scenario."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
     """The LCM protocol of a machine; controller and machine make their ends of it from the same maps.
 
-    A scenario has one if it has a method ``protocol``::
+    It is part of the deployment of a scenario::
 
-        def protocol(self) -> Protocol:
-            return Protocol(
+        def deployment(self) -> Deployment:
+            protocol = Protocol(
                 sense=[iiwa_status({"position": "joint_position_measured"})],
                 act=[iiwa_command({"torque": "joint_torque"})],
             )
+            return Deployment(protocol=protocol)
 
     Attributes:
         sense: what the machine publishes; each sensor signal in one map.
@@ -56,32 +57,26 @@ class Protocol:
 
 
 def protocol_of(scenario: Scenario) -> Protocol:
-    """What the machine of ``scenario`` speaks.
+    """Return the protocol of the machine of ``scenario``, checked against its signals.
 
     Raises:
-        ProtocolError: the scenario does not say, or what it says does not fit its signals.
+        ProtocolError: The deployment of the scenario has no protocol, or one that does not fit its signals.
     """
-    # The layer of scenarios knows nothing of LCM: so the method is optional, and looked for here.
-    method = getattr(scenario, "protocol", None)
-    if method is None:
+    name, protocol = type(scenario).__name__, scenario.deployment().protocol
+    if protocol is None:
         raise ProtocolError(
-            f"{type(scenario).__name__} does not say what its machine speaks: give it a method protocol() that returns "
-            "a vtbdrake.lcm.protocol.Protocol"
-        )
-    protocol = method()
-    if not isinstance(protocol, Protocol):
-        raise ProtocolError(
-            f"{type(scenario).__name__}.protocol() returns a vtbdrake.lcm.protocol.Protocol, not {protocol!r}"
+            f"{name} has no protocol for its machine: give it a method deployment() that returns "
+            "Deployment(protocol=Protocol(...))"
         )
     try:
         protocol.bridge(scenario.interface(), "memq://")
     except ValueError as error:
-        raise ProtocolError(f"{type(scenario).__name__}.protocol(): {error}") from error
+        raise ProtocolError(f"the protocol of {name} does not fit its signals: {error}") from error
     channels = [map.channel for map in protocol.sense]
     for channel, period in protocol.periods.items():
         if channel not in channels or not period > 0.0:
             raise ProtocolError(
-                f"{type(scenario).__name__}.protocol(): periods gives a positive time for channels of sense "
-                f"({', '.join(channels)}), not {period!r} s for {channel!r}"
+                f"periods in the protocol of {name} must map channels of sense ({', '.join(channels)}) to positive "
+                f"times, not {channel!r} to {period!r} s"
             )
     return protocol

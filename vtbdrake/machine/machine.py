@@ -62,7 +62,7 @@ class Machine:
     where it is told to `refuse_late`, commands have to come in time.
 
     Args:
-        scenario: whose world it is, and whose method ``protocol`` says what it speaks (see `Protocol`).
+        scenario: whose world it is, and whose deployment has the protocol that it speaks (see `Protocol`).
         config: see there.
         epoch: what its messages tell as the time of cycle 0, in microseconds.
 

@@ -8,6 +8,7 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Self
@@ -23,6 +24,8 @@ from vtbdrake.testbed.testbed import VirtualTestbed
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
+
+    from vtbdrake.deployment import Deployment, Runtime
 
 # Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
 _DRAKE = version("drake")
@@ -149,6 +152,48 @@ class Scenario(ABC):
         builder.set_dps(own.make_dps())
         own.add_world(builder)
         return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
+
+    def deployment(self) -> Deployment:
+        """Return how the DPS runs on its machine; the default has no protocol. Each call returns a new one."""
+        from vtbdrake.deployment import Deployment
+
+        return Deployment()
+
+    def deploy(
+        self, url: str, *, record: str | os.PathLike[str] | None = None, **options: Any
+    ) -> AbstractContextManager[Runtime]:
+        """Connect the DPS to its machine, for the time of a ``with`` block::
+
+            with scenario.deploy("tcpq://127.0.0.1:7700", record="arm.lcm") as runtime:
+                runtime.take_over()
+                runtime.run(seconds=5.0)
+
+        The DPS runs without its simulated world, and commands from `Runtime.take_over` on. At the end of the block, the
+        fallbacks command once, and the connection is closed.
+
+        Args:
+            url: The URL of the LCM bus.
+            record: A new file in which the loop is recorded, for `vtbdrake.replay`.
+            options: Further keyword arguments:
+
+                * ``target`` (VirtualTestbed or DpsAlone): what runs, for instance the whole testbed; a new DPS alone
+                  by default.
+                * ``context`` (Context): the state of the target to continue from.
+                * ``start`` (Snapshot): a snapshot to continue from.
+                * ``values`` (mapping of address to value): variables to set before the first cycle.
+                * ``deployment`` (Deployment): replaces that of the scenario.
+                * ``live`` (bool): serve ``vtbdrake get``, ``set``, ``watch`` and ``reset``; False by default.
+                * ``claim`` (bool): ask the hub for protected channels whose owner has fallen silent; False by default.
+                * ``clock``, ``watchers``, ``statistics``: see `Runtime`.
+
+        Raises:
+            DeploymentError: The DPS cannot run safely on its machine.
+            ProtocolError: The deployment has no protocol, or it does not fit the signals.
+            BridgeError: There is no bus at this URL.
+        """
+        from vtbdrake.deployment import deploy
+
+        return deploy(self, url, record=record, **options)
 
     def name(self) -> str:
         """Return ``package.module:Class``."""

@@ -17,8 +17,8 @@ from diagrams.manipulator.laws import LAWS
 from diagrams.manipulator.motions import CIRCLE, HOME
 from tests.control.scripted import ScriptedBridge
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.operation import operation_of
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.state import Snapshot
@@ -43,7 +43,7 @@ def commands(scenario: ManipulatorScenario, snapshot: Snapshot, *, alone: bool, 
     target = DpsAlone(scenario) if alone else scenario.build()
     context = target.default_context()
     target.restore(context, snapshot)
-    runtime: Runtime = operation_of(scenario).runtime(target, bridge, context=context, clock=clock)
+    runtime: Runtime = Deployment.of(scenario).runtime(target, bridge, context=context, clock=clock)
     bridge.poll()
     runtime.switch("real")
     runtime.run(cycles=cycles)
@@ -139,7 +139,7 @@ def test_first_command_after_a_restart_of_the_hub_departs_from_the_torque_that_t
         port = int(first.url.rpartition(":")[2])
         bridge = protocol_of(scenario).bridge(scenario.interface(), first.url)
         bridge.open()
-        runtime: Runtime = operation_of(scenario).runtime(DpsAlone(scenario), bridge)
+        runtime: Runtime = Deployment.of(scenario).runtime(DpsAlone(scenario), bridge)
         arm, limit = FakeArm(first.url), time.monotonic() + PATIENCE
         while runtime.prepare("real").reasons:
             arm.tell(carried)

@@ -34,7 +34,7 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
     """By the DPS alone, as it was recorded, and in the whole testbed; against a machine with other parameters."""
     scenario = ManipulatorScenario(law=law)
     bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
-    runtime = scenario.operation().in_lock_step("wrench", wait=PATIENCE).runtime(DpsAlone(scenario), bridge)
+    runtime = scenario.deployment().in_lock_step("wrench", wait=PATIENCE).runtime(DpsAlone(scenario), bridge)
     path = tmp_path / "run.lcm"
     with (
         Recorder(runtime, path, digest_period=0.02),

@@ -62,7 +62,7 @@ def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:
 )
 def test_perfect_model_leaves_nothing_whatever_the_latencies(scenario: ManipulatorScenario) -> None:
     together = together_with(scenario)
-    both = monitors(together, config=replace(scenario.residuals(), settle=1), learn=True)
+    both = monitors(together, config=replace(scenario.deployment().residuals, settle=1), learn=True)
     together.run(150)
     for monitor in both.values():
         assert len(monitor.history) == 13
@@ -76,7 +76,7 @@ def nominal_and_heavy(request: pytest.FixtureRequest) -> Iterator[dict[str, Mapp
     found = {}
     for name, mass in (("nominal", MASS), ("heavy", 1.05 * MASS)):
         together = together_with(scenario, **{TOOL: mass})
-        found[name] = monitors(together, config=replace(scenario.residuals(), tolerance=DEVIATION))
+        found[name] = monitors(together, config=replace(scenario.deployment().residuals, tolerance=DEVIATION))
         together.run(600)
     yield found
 
@@ -105,7 +105,7 @@ def test_nominal_arm_raises_no_alarm(nominal_and_heavy: dict[str, Mapping[str, R
 def test_sensor_that_drifts_is_named() -> None:
     scenario = noisy()
     together = together_with(scenario)
-    both = monitors(together, config=replace(scenario.residuals(), tolerance=DEVIATION))
+    both = monitors(together, config=replace(scenario.deployment().residuals, tolerance=DEVIATION))
     machine = together.line.machine
     for k in range(500):
         bias = np.array([0.0, 0.0, 0.0, 0.0, 0.5e-3 * k, 0.0])  # half a newton per second

@@ -121,9 +121,9 @@ class GuardedArm:
 
     def __init__(self) -> None:
         interface = SCENARIO.interface()
-        operation = SCENARIO.operation()
-        self.guards = Guards(interface, T, **operation.guards)
-        self.guards.departures = {name: sensor for name, (sensor, _) in operation.continuity.items()}
+        deployment = SCENARIO.deployment()
+        self.guards = Guards(interface, T, **deployment.guards)
+        self.guards.departures = {name: sensor for name, (sensor, _) in deployment.continuity.items()}
         self.context = WORLD.default_context()
         self.simulator = WORLD.simulator(self.context)
         self.simulator.Initialize()

@@ -13,6 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
 from tests.testbeds import PENDULUM
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
@@ -68,17 +69,18 @@ class DrivenPendulum(Scenario):
             act=[Signal("torque", size=1, unit="N m", lower=-10.0, upper=10.0, idle=0.0)],
         )
 
-    def protocol(self) -> Protocol:
+    def deployment(self) -> Deployment:
         sense = {
             "position": "joint_position_measured",
             "velocity": "joint_velocity_estimated",
             "torque_reported": "joint_torque_commanded",
         }
-        return Protocol(
+        protocol = Protocol(
             sense=[iiwa_status(sense)],
             act=[iiwa_command({"torque": "joint_torque"})],
             reported={"torque": "torque_reported"},
         )
+        return Deployment(protocol=protocol)
 
     def make_dps(self) -> System:
         return Rhythm(PERIOD)

@@ -15,7 +15,8 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Syst
 from tests.control.scripted import ServoScenario
 from tests.monitoring.residuals.line import Ear, Line, Together, loop
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
-from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor, residuals_of
+from vtbdrake.deployment import Deployment
+from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
 from vtbdrake.state import parameter
 from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
 
@@ -280,16 +281,12 @@ def test_impossible_config_is_refused(fields: dict[str, object], message: str) -
         ResidualConfig(**fields)  # type: ignore[arg-type]
 
 
-def test_scenario_may_say_what_its_residuals_are_made_with() -> None:
+def test_config_is_that_of_the_deployment() -> None:
     class Own(DrivenPendulum):
-        def residuals(self) -> ResidualConfig:
-            return CONFIG
+        def deployment(self) -> Deployment:
+            return replace(super().deployment(), residuals=CONFIG)
 
-    class Wrong(DrivenPendulum):
-        def residuals(self) -> dict[str, float]:
-            return {}
-
-    assert residuals_of(Own()) is CONFIG
-    assert residuals_of(SCENARIO) == ResidualConfig()
-    with pytest.raises(ValueError, match=r"Wrong.residuals\(\) returns a ResidualConfig"):
-        residuals_of(Wrong())
+    own = Own()
+    monitor = ResidualMonitor(loop(DpsAlone(own), Ear(own), PERIOD), "twin", aside=False)
+    monitor.close()
+    assert monitor.config is CONFIG

@@ -4,7 +4,7 @@ from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
 from vtbdrake.monitoring.residuals.calibration import Calibration, CalibrationError, calibrate
 from vtbdrake.monitoring.residuals.check import Report, ResidualCheck
 from vtbdrake.monitoring.residuals.comparison import Comparison, ResidualLayout, Window
-from vtbdrake.monitoring.residuals.config import ResidualConfig, residuals_of
+from vtbdrake.monitoring.residuals.config import ResidualConfig
 from vtbdrake.monitoring.residuals.cusum import Cusum, run_length, threshold_for
 from vtbdrake.monitoring.residuals.monitor import ResidualError, ResidualMonitor
 from vtbdrake.monitoring.residuals.predictor import Predictor
@@ -28,7 +28,6 @@ __all__ = [
     "Sampler",
     "Window",
     "calibrate",
-    "residuals_of",
     "run_length",
     "threshold_for",
 ]

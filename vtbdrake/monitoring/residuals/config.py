@@ -20,7 +20,7 @@ MODES = (SHADOW, TWIN)
 class ResidualConfig:
     """What the prediction of a machine needs to know beside its scenario, and what is an alarm.
 
-    A scenario that has its own has a method ``residuals`` that returns it.
+    A scenario has its own in `Scenario.deployment`.
 
     Attributes:
         scenario: of the predicted world; None is that of the loop's target. It has the latencies of the sensors, and
@@ -66,21 +66,6 @@ class ResidualConfig:
     def window(self) -> float:
         """The length of a prediction, in seconds."""
         return self.horizon * self.period
-
-
-def residuals_of(scenario: Scenario) -> ResidualConfig:
-    """What ``scenario`` says of its residuals, or the defaults.
-
-    Raises:
-        ValueError: its method ``residuals`` returns something else.
-    """
-    method = getattr(scenario, "residuals", None)
-    if method is None:
-        return ResidualConfig()
-    config = method()
-    if not isinstance(config, ResidualConfig):
-        raise ValueError(f"{type(scenario).__name__}.residuals() returns a ResidualConfig, not {config!r}")
-    return config
 
 
 def check_mode(mode: str) -> None:

@@ -17,7 +17,7 @@ from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
 from vtbdrake.monitoring.residuals.calibration import Calibration, calibrate
 from vtbdrake.monitoring.residuals.check import Report, ResidualCheck, serve
 from vtbdrake.monitoring.residuals.comparison import Comparison, ResidualLayout, Window
-from vtbdrake.monitoring.residuals.config import SHADOW, ResidualConfig, check_mode, residuals_of
+from vtbdrake.monitoring.residuals.config import SHADOW, ResidualConfig, check_mode
 from vtbdrake.monitoring.residuals.predictor import Predictor
 from vtbdrake.monitoring.residuals.rows import Array, RowLayout, Sampler
 from vtbdrake.testbed import Interface
@@ -77,7 +77,7 @@ class ResidualMonitor:
     ) -> None:
         check_mode(mode)
         own = runtime.target.scenario
-        self.config = config = config or (residuals_of(own) if own is not None else ResidualConfig())
+        self.config = config = config or (own.deployment().residuals if own is not None else ResidualConfig())
         scenario = config.scenario or own
         if scenario is None:
             raise ValueError(

@@ -1,0 +1,204 @@
+"""How a scenario describes its deployment, what is refused, and the call that starts it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.control.servo_machine import COMMAND, ServoMachineScenario
+from tests.control.test_loop import Ear
+from vtbdrake.control.bridge import Bridge, BridgeError
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.fallback import Hold
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.deployment import Deployment, DeploymentError
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import ProtocolError
+from vtbdrake.machine import MachineProcess
+from vtbdrake.recording.replay import replay
+from vtbdrake.testbed import DpsAlone
+
+CONTINUITY = {"velocity": ("speed", 5.0)}
+FAR = {"u.target": [0.1, -0.05], "dps.gain": 0.01}
+
+
+@dataclass
+class Given(ServoScenario):
+    """A scenario with the deployment that a test gives it."""
+
+    def deployment(self) -> Any:
+        return self.given
+
+    given: Any = None
+
+
+class Machine:
+    """A runtime and a machine that stands still, after some seconds of silence."""
+
+    def __init__(self, deployment: Deployment, *, silent_until: float = 0.0) -> None:
+        scenario = ServoScenario()
+        self.clock = SimulatedClock()
+
+        def sensors(t: float) -> dict[str, Any]:
+            return {"position": [0.05, 0.0], "speed": [0.3, 0.0]} if t >= silent_until else {}
+
+        self.bridge = ScriptedBridge(scenario.interface(), self.clock, sensors)
+        self.runtime: Runtime = deployment.runtime(DpsAlone(scenario), self.bridge, clock=self.clock)
+        self.lines: list[str] = []
+
+    def take_over(self, *, timeout: float = 10.0) -> None:
+        self.runtime.take_over(timeout=timeout, report=self.lines.append)
+
+
+def test_default_deployment_is_enough_without_limits() -> None:
+    deployment = Deployment.of(ServoScenario(rate=0.0))
+    assert (deployment.period, deployment.continuity, deployment.pace) == (1e-3, {}, "")
+
+
+def test_limited_rate_without_continuity_is_refused() -> None:
+    with pytest.raises(DeploymentError) as error:
+        Deployment.of(ServoScenario(rate=2.0))
+    assert "continuity={'velocity': (sensor signal, largest difference)}" in str(error.value)
+    assert "its method deployment() describes how it runs" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("deployment", "reason"),
+    [
+        ({"period": 1e-3}, "must return a vtbdrake.Deployment, not {'period': 0.001}"),
+        (Deployment(continuity={"velocity": ("velocity", 1.0)}), "not from 'velocity' to 'velocity'"),
+        (Deployment(continuity={"speed": ("speed", 1.0)}), "not from 'speed' to 'speed'"),
+        (Deployment(continuity=CONTINUITY, guards={"fallback": {"torque": Hold()}}), "fallback is given for torque"),
+    ],
+)
+def test_deployment_that_does_not_fit_the_signals_is_refused(deployment: Any, reason: str) -> None:
+    scenario = Given()
+    scenario.given = deployment
+    with pytest.raises(DeploymentError) as error:
+        Deployment.of(scenario)
+    assert reason in str(error.value)
+
+
+def test_signals_without_max_age_are_refused_outside_of_lock_step() -> None:
+    interface = ServoScenario().interface()
+    ageless = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
+    deployment = Deployment(continuity=CONTINUITY)
+    with pytest.raises(ValueError, match=r"no sensor signal has a max_age, .* \(position, speed\)"):
+        deployment.check(ageless)
+    deployment.check(interface)
+    deployment.in_lock_step("speed").check(ageless)
+
+
+def test_fields_of_a_deployment_can_be_replaced() -> None:
+    deployment = Deployment.of(ServoMachineScenario(), period=0.002, pace="speed")
+    assert (deployment.period, deployment.pace) == (0.002, "speed")
+    assert deployment.continuity == ServoMachineScenario().deployment().continuity
+
+
+def test_fallback_is_that_of_the_deployment() -> None:
+    machine = Machine(Deployment(continuity=CONTINUITY, guards={"fallback": {"velocity": Hold()}}))
+    machine.take_over()
+    machine.runtime.run(cycles=20)
+    last = machine.bridge.sent[-1][1]["velocity"]
+    machine.runtime.send_fallback("because")
+    assert np.array_equal(machine.bridge.sent[-1][1]["velocity"], last)
+    assert np.any(last != 0.0)
+
+
+def test_take_over_starts_from_the_first_measurement() -> None:
+    machine = Machine(Deployment(continuity=CONTINUITY), silent_until=0.5)
+    machine.take_over()
+    assert machine.clock.now() == pytest.approx(0.5, abs=2 * PERIOD)
+    machine.runtime.run(cycles=1)
+    [(_, first)] = machine.bridge.sent
+    # The rate limit allows this much in a cycle; the DPS wants less.
+    assert first["velocity"] == pytest.approx([0.3 - 2.0 * PERIOD, 0.0])
+    assert "position" in machine.lines[0]
+
+
+def test_take_over_waits_until_the_machine_is_ready() -> None:
+    def ready(bridge: Bridge) -> str | None:
+        return None if bridge.sensed["position"].count > 2500 else "its brakes are on"
+
+    machine = Machine(Deployment(continuity=CONTINUITY, ready=ready))
+    machine.take_over()
+    assert machine.clock.now() == pytest.approx(2.5, abs=2 * PERIOD)
+    # At first, and then once per second.
+    assert machine.lines == ["the machine is not ready: its brakes are on"] * 3
+
+
+def test_take_over_gives_up_after_its_timeout() -> None:
+    machine = Machine(Deployment(continuity=CONTINUITY, ready=lambda bridge: "its brakes are on"))
+    with pytest.raises(SwitchRefusedError, match=r"after 1\.5 s: the machine is not ready: its brakes are on"):
+        machine.take_over(timeout=1.5)
+    assert machine.bridge.sent == []
+
+
+def test_deployed_dps_commands_is_recorded_and_ends_with_the_fallback(tmp_path: Path) -> None:
+    scenario = ServoMachineScenario(rate=0.0)
+    with Hub(port=0, protect=[COMMAND]) as hub, MachineProcess(scenario, hub.url):
+        ear = Ear(hub.url)
+        with scenario.deploy(hub.url, record=tmp_path / "servo.lcm", values=FAR) as runtime:
+            runtime.take_over()
+            runtime.run(cycles=50)
+            assert not runtime.guards.latched
+        heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
+        assert not runtime.bridge.connected
+    # No velocity at the end, once; before that the DPS is on its way.
+    assert len(heard) > 40
+    assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+    report = replay(tmp_path / "servo.lcm")
+    assert report.identical and report.cycles == runtime.cycles
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_error_in_the_block_sends_the_fallback_once(error: type[BaseException]) -> None:
+    scenario = ServoMachineScenario(rate=0.0)
+    with Hub(port=0) as hub, MachineProcess(scenario, hub.url):
+        ear = Ear(hub.url)
+
+        def fail() -> bool:
+            raise error
+
+        with pytest.raises(error), scenario.deploy(hub.url, values=FAR) as runtime:
+            runtime.take_over()
+            runtime.run(cycles=10)
+            runtime.run(until=fail)
+        heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
+    assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+
+
+def test_block_without_take_over_commands_nothing() -> None:
+    scenario = ServoMachineScenario()
+    with Hub(port=0) as hub, MachineProcess(scenario, hub.url):
+        ear = Ear(hub.url)
+        with scenario.deploy(hub.url) as runtime:
+            runtime.run(cycles=10)
+        assert ear.listen() == []
+
+
+def test_whole_testbed_is_deployed_from_a_snapshot() -> None:
+    scenario = ServoMachineScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {"dps.gain": 3.0})
+    snapshot, by_the_clock = testbed.snapshot(context), Deployment.of(scenario, pace="")
+    options: dict[str, Any] = {"target": testbed, "deployment": by_the_clock, "clock": SimulatedClock()}
+    with scenario.deploy("memq://", start=snapshot, **options) as runtime:
+        runtime.run(cycles=50)
+        assert testbed.read(runtime.context, "dps.gain") == 3.0
+        assert runtime.time == pytest.approx(50 * PERIOD)
+
+
+def test_missing_bus_and_missing_protocol_are_errors() -> None:
+    with pytest.raises(BridgeError, match="no LCM bus"), ServoMachineScenario().deploy("tcpq://127.0.0.1:1"):
+        pass
+    with pytest.raises(ProtocolError, match="ServoScenario has no protocol"), ServoScenario(rate=0.0).deploy("memq://"):
+        pass

@@ -1,0 +1,194 @@
+"""How the DPS of a scenario runs on its machine, and the call that starts it."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from math import inf
+from typing import Any, Self
+
+from pydrake.systems.framework import Context
+
+from vtbdrake.control.bridge import Bridge
+from vtbdrake.control.guard import Guards
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import check_continuity
+from vtbdrake.lcm.protocol import Protocol, protocol_of
+from vtbdrake.monitoring.residuals import ResidualConfig
+from vtbdrake.state import Snapshot
+from vtbdrake.testbed import DpsAlone, Interface, Scenario, VirtualTestbed
+
+__all__ = ["Deployment", "DeploymentError", "Runtime", "deploy"]
+
+_log = logging.getLogger(__name__)
+
+
+class DeploymentError(ValueError):
+    """A deployment is missing, unsafe, or does not fit the signals of its scenario."""
+
+
+def _ready(bridge: Bridge) -> str | None:
+    return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deployment:
+    """How a DPS runs on its machine: what they exchange, what guards the machine, what begins a cycle.
+
+    A scenario describes its own by overriding `Scenario.deployment`::
+
+        def deployment(self) -> Deployment:
+            return Deployment(
+                protocol=Protocol(
+                    sense=[iiwa_status({"position": "joint_position_measured"})],
+                    act=[iiwa_command({"torque": "joint_torque"})],
+                ),
+                guards={"fallback": {"torque": Hold()}},
+                continuity={"torque": ("torque_measured", 5.0)},
+            )
+
+    Attributes:
+        protocol: The LCM channels and messages of the machine. None if it has none.
+        period: The period of a cycle, in seconds.
+        guards: Options of `Guards`, such as ``fallback`` and ``max_missed``.
+        continuity: Actuator signal -> (sensor signal, largest difference): where actuator commands start from, see
+            `Runtime`. Required for each actuator signal whose rate or acceleration is limited.
+        ready: Returns why the machine behind a bridge must not be commanded yet, or None.
+        pace: The sensor signal whose messages begin the cycles. If empty, the clock does.
+        patience: The number of periods without such a message after which the clock begins a cycle.
+        check_age: False accepts sensor values of any age, for a machine whose time stops between two messages.
+        residuals: How measurements are compared with predictions.
+    """
+
+    protocol: Protocol | None = None
+    period: float = 1e-3
+    guards: Mapping[str, Any] = field(default_factory=dict)
+    continuity: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    ready: Callable[[Bridge], str | None] = _ready
+    pace: str = ""
+    patience: float = 3.0
+    check_age: bool = True
+    residuals: ResidualConfig = field(default_factory=ResidualConfig)
+
+    @classmethod
+    def of(cls, scenario: Scenario, **changes: Any) -> Self:
+        """Return the checked deployment of ``scenario``; ``changes`` replace some of its fields.
+
+        Raises:
+            DeploymentError: The DPS cannot run safely like this.
+        """
+        deployment, name = scenario.deployment(), type(scenario).__name__
+        if not isinstance(deployment, cls):
+            raise DeploymentError(f"{name}.deployment() must return a vtbdrake.Deployment, not {deployment!r}")
+        deployment = replace(deployment, **changes)
+        try:
+            deployment.check(scenario.interface())
+        except ValueError as error:
+            raise DeploymentError(
+                f"{name} cannot run on its machine: {error}; its method deployment() describes how it runs"
+            ) from error
+        return deployment
+
+    def check(self, interface: Interface) -> None:
+        """Check that the DPS with this interface can run safely.
+
+        Raises:
+            ValueError: The deployment does not fit the signals, a limited actuator signal has no continuity, or a
+                silent machine would not be noticed.
+        """
+        guards = self._guards(interface)
+        if self.check_age and interface.sense and all(signal.max_age == inf for signal in interface.sense):
+            raise ValueError(
+                "no sensor signal has a max_age, so a silent machine would not be noticed: give one to the signals "
+                f"that arrive regularly ({', '.join(signal.name for signal in interface.sense)})"
+            )
+        check_continuity(interface, self.continuity)
+        for name in (signal.name for signal in interface.act):
+            if guards.needs_start(name) and name not in self.continuity:
+                raise ValueError(
+                    f"the actuator signal {name} has a limited rate or acceleration, but no measurement to start from: "
+                    f"give continuity={{{name!r}: (sensor signal, largest difference)}}"
+                )
+
+    def _guards(self, interface: Interface) -> Guards:
+        if not self.check_age:
+            interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
+        return Guards(interface, self.period, **self.guards)
+
+    def in_lock_step(self, signal: str, *, wait: float = 60.0) -> Self:
+        """Return this deployment for a machine in lock-step, which waits for an actuator command in each cycle.
+
+        Args:
+            signal: A sensor signal in the last message of the machine's cycle. Each of its messages begins a cycle of
+                the loop, however late it is.
+            wait: The time without a message after which a cycle begins anyway, in seconds.
+        """
+        return replace(self, pace=signal, patience=wait / self.period, check_age=False)
+
+    def runtime(
+        self, target: DpsAlone | VirtualTestbed, bridge: Bridge, *, context: Context | None = None, **options: Any
+    ) -> Runtime:
+        """Return a loop that runs ``target`` in this way; ``options`` are further options of `Runtime`."""
+        return Runtime(
+            target,
+            bridge,
+            context=context,
+            period=self.period,
+            guards=self._guards(target.interface),
+            continuity=self.continuity,
+            ready=lambda: self.ready(bridge),
+            pace=self.pace or None,
+            patience=self.patience,
+            **options,
+        )
+
+
+@contextmanager
+def deploy(
+    scenario: Scenario,
+    url: str,
+    *,
+    target: DpsAlone | VirtualTestbed | None = None,
+    context: Context | None = None,
+    start: Snapshot | None = None,
+    values: Mapping[str, Any] | None = None,
+    deployment: Deployment | None = None,
+    claim: bool = False,
+    live: bool = False,
+    record: str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> Iterator[Runtime]:
+    """Connect the DPS of a scenario to its machine; see `Scenario.deploy`."""
+    deployment = deployment or Deployment.of(scenario)
+    interface = scenario.interface()
+    deployment.check(interface)
+    bridge = protocol_of(scenario).bridge(interface, url)
+    target = target or DpsAlone(scenario)
+    context = context or target.default_context()
+    if start is not None:
+        target.restore(context, start)
+    target.write(context, values or {})
+    with deployment.runtime(target, bridge, context=context, **options) as runtime, ExitStack() as stack:
+        bridge.open()
+        stack.callback(bridge.close)
+        if claim:
+            bridge.take_over()
+        if live:
+            from vtbdrake.monitoring.live.service import LiveService
+
+            stack.enter_context(LiveService(runtime, url))
+        if record is not None:
+            from vtbdrake.recording.recorder import Recorder
+
+            recorder = stack.enter_context(Recorder(runtime, record))
+        try:
+            yield runtime
+        finally:
+            # After Ctrl-C or an error in `Runtime.run`, the loop has done so already.
+            if not any(fault.kind == "told" for fault in runtime.guards.latched):
+                runtime.send_fallback("the deployment ended")
+    if record is not None:
+        _log.info("recorded to %s; %d cycles lost", record, recorder.lost)
