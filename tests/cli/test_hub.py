@@ -42,8 +42,8 @@ def test_it_prints_its_url_relays_and_ends_cleanly(number: signal.Signals) -> No
         stdout, stderr = program.communicate(timeout=30)
     assert received == [b"command", b"handled"]
     assert program.returncode == 0
-    assert stdout == "2 messages relayed, 1 refused, 0 lost by slow clients\n"
-    assert "COMMAND: refused" in stderr
+    assert stdout == "2 messages relayed, 1 rejected, 0 dropped for slow clients\n"
+    assert "COMMAND: publication by" in stderr
     assert "Traceback" not in stderr
 
 
@@ -52,7 +52,7 @@ def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
         port = server.getsockname()[1]
         program = run("hub", "--port", port)
     assert (program.returncode, program.stdout) == (2, "")
-    assert program.stderr.startswith(f"Error: port {port} of 127.0.0.1 is in use")
+    assert program.stderr.startswith(f"Error: the hub cannot listen on 127.0.0.1:{port} (Address already in use)")
     assert program.stderr.count("\n") == 1
 
 
@@ -89,7 +89,7 @@ def test_what_is_protected_by_default(arguments: tuple[str, ...], channels: set[
         assert protected(url) == channels
         program.send_signal(signal.SIGINT)
         _, stderr = program.communicate(timeout=30)
-    assert ("no command channel is protected: name the SCENARIO" in stderr) == warns
+    assert ("no channel of actuator commands is protected: give a SCENARIO" in stderr) == warns
     for channel in channels:
         assert channel in stderr
 
@@ -103,18 +103,18 @@ def test_a_hub_without_a_scenario_needs_nothing_of_drake() -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--port", 70000), "port lies between 0 and 65535, it cannot be 70000"),
-        (("--port", 0, "--max-message", 64), "max_queue lies between"),
+        (("--port", 70000), "port must be between 0 and 65535, not 70000"),
+        (("--port", 0, "--max-message", 64), "max_queue must be between"),
         (("--port", 0, "--max-message", 0), "max-message"),
         (("--port", 0, "--max-queue", "inf"), "'inf' is not a valid integer"),
-        (("--port", 0, "--protect", "VTB_HUB"), "'VTB_HUB' is the hub's own"),
-        (("--port", 0, "--lease", 0), "lease is a positive time"),
-        (("--port", 0, "--user", "no such user"), "there is no user 'no such user'"),
-        (("--port", 0, "--max-memory", 1), "max_memory lies between"),
+        (("--port", 0, "--protect", "VTB_HUB"), "cannot protect 'VTB_HUB'"),
+        (("--port", 0, "--lease", 0), "lease must be a positive time"),
+        (("--port", 0, "--user", "no such user"), "no user 'no such user'"),
+        (("--port", 0, "--max-memory", 1), "max_memory must be between"),
         (("--port", 0, "--max-clients", 0), "max-clients"),
         (("--port", 0, "nowhere.at_all:Scenario"), "cannot import nowhere.at_all"),
         (("--port", 0, "tests.testbeds:PendulumScenario"), "has no protocol for its machine"),
-        (("--port", 0, "--cpu", -1), "processors have the numbers"),
+        (("--port", 0, "--cpu", -1), "cpus must be processor numbers"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[object, ...], named: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
-from vtbdrake.lcm.hub.config import MEBIBYTE
+from vtbdrake.lcm.hub.server import MEBIBYTE
 from vtbdrake.monitoring.live.messages import RESET, SET
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _SIZE = click.IntRange(min=1)
 def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None) -> Any:
     if name is None:
         return None
-    # A hub without a scenario needs nothing of Drake.
+    # Without a scenario, the hub starts without Drake.
     from vtbdrake.testbed import load_scenario
 
     return load_scenario(name)
@@ -36,32 +36,32 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.host,
     show_default=True,
     metavar="ADDRESS",
-    help="Where to listen; beyond loopback, whoever reaches the address is a client.",
+    help="Address to listen on; beyond loopback, every machine that reaches it can connect.",
 )
-@click.option("--port", type=int, default=_DEFAULT.port, show_default=True, metavar="N", help="0 for any that is free.")
+@click.option("--port", type=int, default=_DEFAULT.port, show_default=True, metavar="N", help="0: any free port.")
 @click.option(
     "--protect",
     multiple=True,
     metavar="CHANNEL",
-    help="Let one client publish on this channel, too, the first that does; another takes it over on request only, by "
-    "a message on VTB_HUB_TAKE/CHANNEL, when the owner has paused. May be repeated.",
+    help="Let only one client publish on this channel: the first one, until another requests it on "
+    "VTB_HUB_TAKE/CHANNEL while the owner pauses. May be repeated.",
 )
-@click.option("--unprotected", is_flag=True, help="Protect nothing by default, only what --protect names.")
+@click.option("--unprotected", is_flag=True, help="Protect only the channels given by --protect.")
 @click.option(
     "--user",
     "users",
     multiple=True,
     metavar="NAME",
-    help="Let this user of the machine connect, too, by name or number. May be repeated.",
+    help="Name or id of a user that may connect, too. May be repeated.",
 )
-@click.option("--all-users", is_flag=True, help="Let every user of the machine connect.")
+@click.option("--all-users", is_flag=True, help="Let every user of this machine connect.")
 @click.option(
     "--lease",
     type=float,
     default=_DEFAULT.lease,
     show_default=True,
     metavar="S",
-    help="Seconds after its last message during which an owner cannot be succeeded.",
+    help="Seconds after the owner's last message during which no other client can take over.",
 )
 @click.option(
     "--max-message",
@@ -69,7 +69,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.max_message // MEBIBYTE,
     show_default=True,
     metavar="MIB",
-    help="The largest message.",
+    help="Largest message.",
 )
 @click.option(
     "--max-queue",
@@ -77,7 +77,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.max_queue // MEBIBYTE,
     show_default=True,
     metavar="MIB",
-    help="The largest backlog of a client; it loses its oldest messages beyond that.",
+    help="Largest backlog of a client; beyond it, the oldest messages are dropped.",
 )
 @click.option(
     "--max-memory",
@@ -85,7 +85,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.max_memory // MEBIBYTE,
     show_default=True,
     metavar="MIB",
-    help="The largest sum of all backlogs and incomplete messages; beyond that, the client with most is disconnected.",
+    help="Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
 )
 @click.option(
     "--max-clients",
@@ -93,7 +93,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.max_clients,
     show_default=True,
     metavar="N",
-    help="The most clients at a time.",
+    help="Maximum number of clients at a time.",
 )
 @click.option(
     "--patience",
@@ -101,7 +101,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.patience,
     show_default=True,
     metavar="S",
-    help="Disconnect a client that has not read, or not completed a message, for so many seconds.",
+    help="Seconds after which a client is disconnected that does not read, or does not complete a message.",
 )
 @click.option(
     "--priority",
@@ -109,7 +109,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     default=_DEFAULT.priority,
     show_default=True,
     metavar="N",
-    help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it.",
+    help="Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",
 )
 @click.option(
     "--cpu",
@@ -117,7 +117,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     type=int,
     multiple=True,
     metavar="N",
-    help="A processor to run on, where the system grants it; may be given several times.",
+    help="Processor to run on, if the system grants it. May be repeated.",
 )
 def run_hub(
     scenario: Scenario | None,
@@ -136,12 +136,13 @@ def run_hub(
     priority: int,
     cpus: tuple[int, ...],
 ) -> None:
-    """Relay LCM messages over TCP, where multicast does not work, until Ctrl-C.
+    """Relay LCM messages over TCP until Ctrl-C, for networks without multicast.
 
-    On the command channels of a SCENARIO, one client at a time may publish; on VTB_SET and VTB_RESET, too. LCM has no
-    authentication: on loopback only this user and root may connect, beyond it whoever reaches the address.
+    Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on VTB_SET and on
+    VTB_RESET. LCM has no authentication: on loopback only this user and root may connect, beyond it every machine that
+    reaches the address.
 
-    Prints the URL that clients connect to. Its statistics are published on VTB_HUB, as JSON.
+    Prints the URL for clients, and publishes statistics as JSON on VTB_HUB.
 
     \b
     Example:
@@ -149,8 +150,8 @@ def run_hub(
       vtbdrake hub --protect IIWA_COMMAND
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
-    known = () if scenario is None else _command_channels(scenario)
-    defaults = () if unprotected else (*known, SET, RESET)
+    channels = () if scenario is None else _command_channels(scenario)
+    defaults = () if unprotected else (*channels, SET, RESET)
     config = HubConfig(
         host=host,
         port=port,
@@ -167,18 +168,17 @@ def run_hub(
         cpus=cpus,
     )
     server = HubServer(config)
-    if not known and not protect and not unprotected:
+    if not channels and not protect and not unprotected:
         _log.warning(
-            "no command channel is protected: name the SCENARIO whose commands it relays, or --protect CHANNEL; or say "
-            "--unprotected"
+            "no channel of actuator commands is protected: give a SCENARIO, --protect CHANNEL, or --unprotected"
         )
-    _log.info("protected: %s", ", ".join(config.protect) or "nothing")
+    _log.info("protected channels: %s", ", ".join(config.protect) or "none")
     click.echo(server.url)
     serve(server)
     statistics = server.statistics()
     click.echo(
-        f"{statistics.messages} messages relayed, {statistics.refused} refused, "
-        f"{statistics.dropped} lost by slow clients"
+        f"{statistics.messages} messages relayed, {statistics.refused} rejected, "
+        f"{statistics.dropped} dropped for slow clients"
     )
 
 

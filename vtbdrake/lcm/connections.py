@@ -209,7 +209,7 @@ class TcpqConnection(Connection):
                     channel, handler = handlers[come[0]]
                     handler(channel, come[1])
         except TcpqError as error:
-            raise ConnectionError(f"the hub {error}") from None
+            raise ConnectionError(f"the hub violates the protocol: {error}") from None
         return count
 
     def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from tests.lcm.hub.clients import Client, ClientProcess, wait_until
 from vtbdrake.lcm.hub import Hub, HubConfig, client_name
 from vtbdrake.lcm.hub.clients import ClientConnection
-from vtbdrake.lcm.hub.protection import ProtectedChannel
+from vtbdrake.lcm.hub.routing import ProtectedChannel
 
 
 @pytest.fixture
@@ -188,20 +188,20 @@ class TestLease:
     def test_each_publication_renews_the_lease(self, connections) -> None:
         owner, other = connections
         channel = ProtectedChannel("C", lease=1.0)
-        assert channel.admit(owner, 0.0)
-        assert channel.admit(owner, 0.9)
+        assert channel.publish(owner, 0.0)
+        assert channel.publish(owner, 0.9)
         assert not channel.take(other, 1.9)
         assert not channel.statistics(1.9).lease_over
         assert channel.statistics(1.91).lease_over
         assert channel.take(other, 1.91)
-        assert not channel.admit(owner, 1.92)
+        assert not channel.publish(owner, 1.92)
 
     def test_a_time_that_is_excused_does_not_count(self, connections) -> None:
         owner, other = connections
         channel = ProtectedChannel("C", lease=1.0)
-        channel.excuse(5.0)
-        assert channel.admit(owner, 0.0)
-        channel.excuse(5.0)
+        channel.extend(5.0)
+        assert channel.publish(owner, 0.0)
+        channel.extend(5.0)
         assert not channel.take(other, 6.0)
         assert channel.take(other, 6.1)
 
@@ -216,19 +216,19 @@ class TestLease:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"protect": "COMMAND"}, "takes a sequence of channels, such as ['COMMAND']"),
-        ({"protect": ["VTB_HUB"]}, "'VTB_HUB' is the hub's own"),
-        ({"protect": ["VTB_HUB_TAKE/A"]}, "is the hub's own"),
-        ({"protect": [""]}, "has a name of 1 to 242 bytes"),
-        ({"protect": ["Ä" * 122]}, "has a name of 1 to 242 bytes"),
-        ({"lease": 0.0}, "lease is a positive time in seconds, it cannot be 0.0"),
-        ({"patience": float("nan")}, "patience is a positive time"),
-        ({"port": 65536}, "port lies between 0 and 65535"),
-        ({"max_queue": 1000}, "max_queue lies between"),
-        ({"max_message": 0}, "max_message lies between 1 and"),
-        ({"max_clients": 0}, "max_clients lies between 1 and inf"),
-        ({"priority": 100}, "priority lies between 0 and 99"),
-        ({"cpus": [-1]}, "processors have the numbers"),
+        ({"protect": "COMMAND"}, "must be a sequence of channels, such as ['COMMAND']"),
+        ({"protect": ["VTB_HUB"]}, "cannot protect 'VTB_HUB', one of the hub's own channels"),
+        ({"protect": ["VTB_HUB_TAKE/A"]}, "one of the hub's own channels"),
+        ({"protect": [""]}, "must have 1 to 242 bytes"),
+        ({"protect": ["Ä" * 122]}, "must have 1 to 242 bytes"),
+        ({"lease": 0.0}, "lease must be a positive time in seconds, not 0.0"),
+        ({"patience": float("nan")}, "patience must be a positive time"),
+        ({"port": 65536}, "port must be between 0 and 65535"),
+        ({"max_queue": 1000}, "max_queue must be between"),
+        ({"max_message": 0}, "max_message must be between 1 and"),
+        ({"max_clients": 0}, "max_clients must be between 1 and inf"),
+        ({"priority": 100}, "priority must be between 0 and 99"),
+        ({"cpus": [-1]}, "cpus must be processor numbers"),
     ],
 )
 def test_config_out_of_range(fields, message: str) -> None:

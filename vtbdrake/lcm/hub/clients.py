@@ -1,4 +1,4 @@
-"""The hub's end of the connection to one client."""
+"""The hub's side of a connection to a client."""
 
 from __future__ import annotations
 
@@ -7,37 +7,24 @@ from collections import deque
 
 from vtbdrake.lcm.hub.reader import TcpqReader
 from vtbdrake.lcm.hub.subscriptions import Subscriptions
-from vtbdrake.lcm.hub.tcpq import TcpqError, address_name
+from vtbdrake.lcm.hub.tcpq import address_name
 
-# A slice of a large message: while it is copied to the kernel, or from there, all others wait (some 50 us).
+# Most bytes that are sent or received at once: copying them takes some 50 us, during which all other clients wait.
 SLICE = 256 * 1024
 
-# Seconds after which the kernel asks whether the other machine is still there, between two such questions, and how
-# often it asks.
+# Seconds until the kernel probes a silent peer, seconds between probes, and probes until the connection is lost.
 _KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 3}
 
 
 class ClientConnection:
-    """A client: its socket, its subscriptions, and the queue of what it has not read yet.
+    """A connected client: its socket, its subscriptions and its backlog, the messages that it has not read yet.
 
     Args:
-        sock: connected; the connection owns it.
-        max_message, max_queue: in bytes.
-        now: the time, on the hub's clock, in seconds.
-        user: whose the client is; None if nobody knows.
-
-    Attributes:
-        name: of the client; see `address_name`.
-        user: as above.
-        reader: of what comes from it.
-        subscriptions: its subscriptions.
-        published: whether it has published anything.
-        connected: when it connected.
-        progressed: when it connected, when its queue began, or when it last took something off it.
-        begun: when the message began to come that is not complete yet; None if there is none.
-        watched: whether the hub waits for it to take more.
-        queued: bytes that wait for it.
-        closed: whether the hub has closed it.
+        sock: connected socket, which the connection owns from now on.
+        max_message: largest data of a message, in bytes.
+        max_queue: largest backlog, in bytes.
+        now: time on the hub's clock, in seconds.
+        user: user id of the client; None if unknown.
     """
 
     def __init__(self, sock: socket.socket, *, max_message: int, max_queue: int, now: float, user: int | None) -> None:
@@ -47,18 +34,19 @@ class ClientConnection:
         self.user = user
         self.reader = TcpqReader(max_message=max_message)
         self.subscriptions = Subscriptions()
-        self.published = False
-        self.connected = self.progressed = now
-        self.begun: float | None = None
-        self.watched = False
-        self.queued = 0
+        self.published = False  # whether it has published anything
+        self.connected_at = now
+        self.progressed_at = now  # when it connected, its backlog began, or it last read some of its backlog
+        self.incomplete_since: float | None = None  # when an incomplete message began to arrive
+        self.awaits_room = False  # whether the hub waits until the socket accepts more
+        self.queued = 0  # bytes of the backlog
         self.closed = False
         self._max_queue = max_queue
         self._queue: deque[bytes | bytearray] = deque()
-        self._offset = 0  # of the first message of the queue: so much of it is sent
-        self._by_tcp = sock.family == socket.AF_INET
+        self._offset = 0  # bytes of the first queued message that have been sent
+        self._is_tcp = sock.family == socket.AF_INET
         sock.setblocking(False)
-        if self._by_tcp:
+        if self._is_tcp:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             for option, value in _KEEP_ALIVE.items():
@@ -66,49 +54,60 @@ class ClientConnection:
 
     @property
     def idle(self) -> bool:
-        """Whether it has never asked for anything, nor said anything."""
+        """Whether the client has never published and has no subscriptions."""
         return not self.published and not self.subscriptions
 
     @property
-    def held(self) -> int:
-        """Return how many bytes are kept for it: what waits for it, and what it has begun to send."""
+    def memory(self) -> int:
+        """Number of bytes that the hub keeps for the client: its backlog and its incomplete message."""
         return self.queued + self.reader.held
 
     def acknowledge(self) -> None:
-        """Acknowledges at once what was read: liblcm writes a message in five pieces, and leaves Nagle's algorithm on,
-        which holds back the second piece until the first is acknowledged (by default 40 ms later).
-        The kernel forgets the option, so it takes one call for every piece read."""
-        if self._by_tcp:
+        """Acknowledge what was received at once.
+
+        liblcm writes a message in five pieces with Nagle's algorithm, which holds back the second piece until the
+        first is acknowledged (40 ms later by default). The kernel resets the option, so every piece needs a call.
+        """
+        if self._is_tcp:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def send(self, messages: list[bytes | bytearray], now: float) -> int:
-        """Sends messages, or queues what of them cannot be sent at once; says how many messages that drops.
+        """Send messages, and queue what cannot be sent at once.
+
+        Returns:
+            Number of messages that were dropped because the backlog exceeded ``max_queue``.
 
         Raises:
-            OSError: the connection is lost.
+            OSError: The connection is lost.
         """
-        begun = 0
+        sent = 0
         if not self._queue:
             data = messages[0] if len(messages) == 1 else b"".join(messages)
-            begun = self._send(data)
-            if begun == len(data):
+            sent = self._send(data)
+            if sent == len(data):
                 return 0
-            done = 0
-            while begun >= len(messages[done]):
-                begun -= len(messages[done])
-                done += 1
-            messages = messages[done:]
-            self.progressed = now
-            self._offset = begun
+            complete = 0
+            while sent >= len(messages[complete]):
+                sent -= len(messages[complete])
+                complete += 1
+            messages = messages[complete:]
+            self.progressed_at = now
+            self._offset = sent
         self._queue.extend(messages)
-        self.queued += sum(map(len, messages)) - begun
-        return self._drop()
+        self.queued += sum(map(len, messages)) - sent
+        oldest = 1 if self._offset else 0  # a message that is partly sent must be completed
+        dropped = 0
+        while self.queued > self._max_queue and len(self._queue) > oldest:
+            self.queued -= len(self._queue[oldest])
+            del self._queue[oldest]
+            dropped += 1
+        return dropped
 
     def flush(self, now: float) -> None:
-        """Sends a slice of what is queued.
+        """Send a slice of the backlog.
 
         Raises:
-            OSError: the connection is lost.
+            OSError: The connection is lost.
         """
         room = SLICE
         while self._queue and room > 0:
@@ -117,7 +116,7 @@ class ClientConnection:
             if not sent:
                 return
             room -= sent
-            self.progressed = now
+            self.progressed_at = now
             self.queued -= sent
             self._offset += sent
             if self._offset == len(first):
@@ -130,32 +129,9 @@ class ClientConnection:
         except BlockingIOError:
             return 0
 
-    def _drop(self) -> int:
-        oldest = 1 if self._offset else 0  # what has begun must end
-        dropped = 0
-        while self.queued > self._max_queue and len(self._queue) > oldest:
-            self.queued -= len(self._queue[oldest])
-            del self._queue[oldest]
-            dropped += 1
-        return dropped
-
     def close(self) -> None:
+        """Close the socket and discard the backlog."""
         self.closed = True
         self._queue.clear()
         self.queued = 0
         self.socket.close()
-
-
-def text(channel: bytes) -> str:
-    """A channel or pattern as text, as liblcm's clients in Python and Java need it.
-
-    Raises:
-        TcpqError: it is none.
-    """
-    try:
-        name = channel.decode()
-    except UnicodeDecodeError:
-        raise TcpqError("malformed", f"names a channel {channel!r}, which is not UTF-8") from None
-    if "\0" in name:
-        raise TcpqError("malformed", f"names a channel {channel!r}, with a null character")
-    return name

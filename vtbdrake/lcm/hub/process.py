@@ -15,9 +15,8 @@ from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
 from vtbdrake.child_process import ChildProcess, StartError, report_ready
-from vtbdrake.lcm.hub.config import HubConfig
-from vtbdrake.lcm.hub.server import HubServer, listen
-from vtbdrake.lcm.hub.statistics import HubStatistics
+from vtbdrake.lcm.hub.routing import HubStatistics
+from vtbdrake.lcm.hub.server import HubConfig, HubServer, listen
 from vtbdrake.lcm.hub.tcpq import address_name
 
 _log = logging.getLogger(__name__)

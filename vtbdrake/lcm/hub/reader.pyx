@@ -1,4 +1,4 @@
-"""What comes from a client of tcpq (see `tcpq`), cut into its records; compiled."""
+"""Splits a byte stream into tcpq records (see `tcpq`); compiled."""
 
 from cpython.bytearray cimport PyByteArray_AS_STRING, PyByteArray_FromStringAndSize, PyByteArray_Resize
 from cpython.bytes cimport PyBytes_FromStringAndSize
@@ -13,19 +13,19 @@ cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
 cdef uint32_t _PUBLISH = PUBLISH
 cdef uint32_t _UNSUBSCRIBE = UNSUBSCRIBE
 
-# What is larger is not copied once more when it is complete: that would take long.
+# Larger records are received in place: copying them when they are complete would take long.
 cdef Py_ssize_t _LARGE = 1 << 18
 
 
 def publish_record(bytes channel, bytes data):
-    """The record that publishes ``data``.
+    """Return the record that publishes ``data`` on a channel.
 
     Raises:
-        ValueError: it is too long for its length to be told.
+        ValueError: The channel or the data has 4 GiB or more.
     """
     cdef Py_ssize_t length = len(channel), size = len(data)
     if length > UINT32_MAX or size > UINT32_MAX:
-        raise ValueError(f"tcpq carries channels and data of less than 4 GiB, not {length} and {size} bytes")
+        raise ValueError(f"channel and data must have less than 4 GiB each, not {length} and {size} bytes")
     record = PyBytes_FromStringAndSize(NULL, 12 + length + size)
     cdef char* at = record
     put_uint32(at, _PUBLISH)
@@ -37,22 +37,22 @@ def publish_record(bytes channel, bytes data):
 
 
 cdef class TcpqReader(Stream):
-    """Cuts what comes from one client into tcpq's records.
+    """Splits what one client sends into tcpq records.
 
     Args:
-        max_message: the largest data of a publication, in bytes.
-        greeted: whether the client has greeted; else its greeting is the first record.
+        max_message: largest data of a publication, in bytes.
+        greeted: whether the client has greeted already; otherwise its greeting is the first record.
 
     Attributes:
-        greeted: the same, by now.
+        greeted: whether the client has greeted.
     """
 
     cdef readonly bint greeted
     cdef Py_ssize_t max_message
-    # Of the record that begins, as far as it is known.
+    # Type, length of the channel and size of the next record, as far as they are known.
     cdef uint32_t kind
     cdef Py_ssize_t length, size
-    # That record, if it is a large one: it grows where it stays; and how much of it has come.
+    # That record, if it is large, and how many of its bytes have arrived.
     cdef bytearray large
     cdef Py_ssize_t filled
 
@@ -62,23 +62,24 @@ cdef class TcpqReader(Stream):
 
     @property
     def partial(self):
-        """Whether a record has begun, and is not taken off."""
+        """Whether a record, complete or not, is in the buffer."""
         return self.large is not None or self.end > self.begin
 
     @property
     def held(self):
-        """How many bytes have come that are not taken off."""
+        """Number of bytes in the buffer."""
         return self.end - self.begin + (self.filled if self.large is not None else 0)
 
     def next_record(self):
-        """The next record: its type, its channel or pattern, and the record as it came; None if it is not there yet.
+        """Remove the next record and return its type, its channel or pattern, and all its bytes.
 
-        A large one is a bytearray, which is nobody else's.
+        Returns:
+            None if the record is incomplete. The bytes of a large record are a bytearray that the caller owns.
 
         Raises:
-            TcpqError: the client is of no use any more.
+            TcpqError: The client violates the protocol.
         """
-        if not self._whole():
+        if not self._is_complete():
             return None
         cdef const char* at
         if self.large is not None:
@@ -93,13 +94,16 @@ cdef class TcpqReader(Stream):
         return self.kind, PyBytes_FromStringAndSize(at + 8, self.length), whole
 
     def next_publication(self):
-        """The next publication: channel and data; other records are left out. None if it is not there yet.
+        """Remove the next publication and return its channel and data; other records are skipped.
+
+        Returns:
+            None if the publication is incomplete.
 
         Raises:
-            TcpqError: as `record`.
+            TcpqError: The sender violates the protocol.
         """
         cdef const char* at
-        while self._whole():
+        while self._is_complete():
             large = self.large
             if large is not None:
                 at = PyByteArray_AS_STRING(large)
@@ -114,8 +118,8 @@ cdef class TcpqReader(Stream):
                 )
         return None
 
-    cdef bint _whole(self) except -1:
-        """Whether the next record is there; then its type (0 for a greeting), length and size are known."""
+    cdef bint _is_complete(self) except -1:
+        """Return whether the next record is complete; then its type (0 for a greeting), length and size are known."""
         cdef const char* at = self.buffer + self.begin
         cdef Py_ssize_t have = self.end - self.begin
         if self.large is not None:
@@ -125,27 +129,23 @@ cdef class TcpqReader(Stream):
         self.kind, self.length = get_uint32(at), get_uint32(at + 4)
         if not self.greeted:
             if self.kind != MAGIC_CLIENT:
-                raise TcpqError("greeting", f"begins with {self.kind:#010x}, a tcpq client with {MAGIC_CLIENT:#010x}")
+                raise TcpqError("greeting", f"greeting must be {MAGIC_CLIENT:#010x}, not {self.kind:#010x}")
             if self.length != VERSION:
-                raise TcpqError(
-                    "greeting", f"speaks version {self.length:#06x} of tcpq, the hub {VERSION:#06x}"
-                )
+                raise TcpqError("greeting", f"version of tcpq must be {VERSION:#06x}, not {self.length:#06x}")
             self.greeted = True
             self.kind, self.length, self.size = 0, 0, 8
             return True
         if not _PUBLISH <= self.kind <= _UNSUBSCRIBE:
-            raise TcpqError("malformed", f"sends a record of type {self.kind}, there are 1, 2 and 3")
+            raise TcpqError("malformed", f"record type must be 1, 2 or 3, not {self.kind}")
         if not 0 < self.length <= _MAX_CHANNEL:
-            raise TcpqError("malformed", f"sends a channel of {self.length} bytes, it has 1 to {MAX_CHANNEL}")
+            raise TcpqError("malformed", f"channel must have 1 to {MAX_CHANNEL} bytes, not {self.length}")
         self.size = 8 + self.length
         if self.kind == _PUBLISH:
             if have < 12 + self.length:
                 return False
             size = get_uint32(at + 8 + self.length)
             if size > self.max_message:
-                raise TcpqError(
-                    "too large", f"sends a message of {size} bytes, the largest allowed has {self.max_message}"
-                )
+                raise TcpqError("too large", f"message of {size} bytes exceeds max_message={self.max_message}")
             self.size = 12 + self.length + <Py_ssize_t>size
         if have < self.size and self.size > _LARGE:
             self.large, self.filled = PyByteArray_FromStringAndSize(at, have), have
@@ -162,7 +162,7 @@ cdef class TcpqReader(Stream):
         if self.large is None or self.filled == self.size:
             return Stream._came(self, size)
         cdef Py_ssize_t beyond = self.filled + size - self.size
-        if beyond > 0:  # It belongs to the next one.
+        if beyond > 0:  # bytes of the next record
             memcpy(Stream._space(self, beyond), PyByteArray_AS_STRING(self.large) + self.size, beyond)
             Stream._came(self, beyond)
         self.filled += size - max(beyond, 0)

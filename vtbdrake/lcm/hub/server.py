@@ -1,33 +1,131 @@
-"""The hub itself: one thread that waits for all its clients, and for none of them."""
+"""The hub itself: its configuration and its event loop, one thread that serves all clients and waits for none."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
+import logging
 import os
+import pwd
 import select
 import socket
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from math import inf
 
 from vtbdrake.lcm.hub import tcpq
-from vtbdrake.lcm.hub.admission import FULL, Admission
 from vtbdrake.lcm.hub.clients import SLICE, ClientConnection
-from vtbdrake.lcm.hub.config import MEBIBYTE, HubConfig
-from vtbdrake.lcm.hub.log_rate import limited_logger
-from vtbdrake.lcm.hub.relay import Relay
-from vtbdrake.lcm.hub.statistics import HubStatistics
-from vtbdrake.lcm.hub.tcpq import LOOPBACK, listen_shortcut
+from vtbdrake.lcm.hub.routing import HubStatistics, Router
+from vtbdrake.lcm.hub.tcpq import LOOPBACK, MAX_CHANNEL, STATUS_CHANNEL, TAKE_PREFIX, TcpqError
 
-_log = limited_logger(__name__)
+MEBIBYTE = 1024 * 1024
 
-_READS = 8  # liblcm writes a message in five pieces
-_TURN = 64  # what the records of one client may cost, see `Relay.handle`, before it is another's turn
-_LEAST_RATE = MEBIBYTE  # bytes a second that come of a message once `HubConfig.patience` is over
-_MEMORY_CHECK = MEBIBYTE  # bytes that come between two looks at how much is held for all clients
-_NEWS_PERIOD = 0.01
+_READS = 8  # receive calls per turn; liblcm writes a message in five pieces
+_TURN = 64  # cost of the records of one client, see `Router.handle`, before the next client is served
+_MIN_RATE = MEBIBYTE  # bytes per second of an incomplete message that a client must send after `HubConfig.patience`
+_MEMORY_CHECK = MEBIBYTE  # received bytes between two checks of the memory of all clients
+_STATUS_CHANGED_PERIOD = 0.01
 _ACCEPT_PAUSE = 1.0
+
+
+class RateLimitFilter(logging.Filter):
+    """Passes only a few log messages of each kind per period, because clients can cause thousands per second.
+
+    Messages of one kind have the same level and the same text before their arguments are filled in. The first one of
+    the next period says how many were suppressed.
+    """
+
+    BURST = 5  # messages of a kind that pass per period
+    PERIOD = 10.0  # s
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._windows: dict[tuple[int, str], tuple[float, int]] = {}  # by kind: end of the period, number of messages
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a message passes."""
+        now = time.monotonic()
+        kind = (record.levelno, str(record.msg))
+        end, count = self._windows.get(kind, (now, 0))
+        if now < end:
+            self._windows[kind] = (end, count + 1)
+            return count < self.BURST
+        self._windows[kind] = (now + self.PERIOD, 1)
+        if count > self.BURST:
+            record.msg = f"{record.getMessage()} ({count - self.BURST} more messages like this one were suppressed)"
+            record.args = None
+        return True
+
+
+_log = logging.getLogger(__package__)  # shared by the modules of the server
+_log.addFilter(RateLimitFilter())
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubConfig:
+    """Address, protected channels and limits of a hub.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    host: str = "127.0.0.1"  # IPv4 address or name to listen on
+    port: int = 7700  # LCM's default; 0: any free port
+    protect: Sequence[str] = ()  # channels with one publisher at a time (names, no patterns)
+    lease: float = 0.5  # s after the owner's last publication during which no other client can take over
+    max_message: int = 16 * MEBIBYTE  # largest data of a message, in bytes
+    max_queue: int = 32 * MEBIBYTE  # largest backlog of a client, in bytes
+    max_memory: int = 512 * MEBIBYTE  # largest sum of all backlogs and incomplete messages, in bytes
+    max_clients: int = 128  # of another user at most a quarter, of all others three quarters
+    users: Sequence[str | int] = ()  # names or ids of users that may connect besides the hub's own and root
+    all_users: bool = False  # whether every user of this machine may connect
+    # s after which a client is disconnected that does not greet, does not read its backlog, or does not complete a
+    # message (for which it has another second for each MiB of it)
+    patience: float = 5.0
+    status_period: float = 1.0  # s between messages on the status channel
+    priority: int = 0  # of SCHED_FIFO, 1 to 99, if the system grants it; 0: ordinary scheduling
+    cpus: Sequence[int] = ()  # processors to run on, if the system grants them; empty: any
+
+    def __post_init__(self) -> None:
+        for name, example in (("protect", "channels"), ("users", "users"), ("cpus", "processors")):
+            value = getattr(self, name)
+            if isinstance(value, str):
+                raise ValueError(f"{name} must be a sequence of {example}, such as [{value!r}], not a string")
+            object.__setattr__(self, name, tuple(map(_user_id, value)) if name == "users" else tuple(value))
+        longest = MAX_CHANNEL - len(TAKE_PREFIX)
+        for channel in self.protect:
+            if channel == STATUS_CHANNEL or channel.startswith(TAKE_PREFIX):
+                raise ValueError(f"cannot protect {channel!r}, one of the hub's own channels")
+            if not 0 < len(channel.encode()) <= longest:
+                raise ValueError(f"the name of a protected channel must have 1 to {longest} bytes, not {channel!r}")
+        if any(not isinstance(cpu, int) or cpu < 0 for cpu in self.cpus):
+            raise ValueError(f"cpus must be processor numbers 0, 1, ..., not {self.cpus!r}")
+        ranges: dict[str, tuple[float, float]] = {
+            "port": (0, 65535),
+            "max_message": (1, 256 * MEBIBYTE),  # LCM_MAX_MESSAGE_SIZE
+            "max_queue": (self.max_message + 12 + MAX_CHANNEL, inf),
+            "max_memory": (self.max_queue, inf),
+            "max_clients": (1, inf),
+            "priority": (0, 99),
+        }
+        for name, (lower, upper) in ranges.items():
+            value = getattr(self, name)
+            if not lower <= value <= upper:
+                raise ValueError(f"{name} must be between {lower:g} and {upper:g}, not {value!r}")
+        for name in ("lease", "patience", "status_period"):
+            value = getattr(self, name)
+            if not 0.0 < value < inf:
+                raise ValueError(f"{name} must be a positive time in seconds, not {value!r}")
+
+
+def _user_id(user: str | int) -> int:
+    if isinstance(user, str) and not user.isdecimal():
+        try:
+            return pwd.getpwnam(user).pw_uid
+        except KeyError:
+            raise ValueError(f"no user {user!r} on this machine; give a user name or id") from None
+    return int(user)
 
 
 class HubAddressError(ValueError):
@@ -35,52 +133,51 @@ class HubAddressError(ValueError):
 
 
 def listen(config: HubConfig) -> list[socket.socket]:
-    """Sockets that listen where the hub is told to: by TCP, and the shortcut if there is one.
+    """Return sockets that listen at the address of the config: TCP, and on loopback the shortcut.
 
     Raises:
-        HubAddressError: it cannot listen there.
+        HubAddressError: The hub cannot listen there.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listeners = [sock]
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((config.host, config.port))
-        # The shortcut opens first: who seeks the hub and finds no shortcut yet must not stay with TCP.
-        shortcut = listen_shortcut(*sock.getsockname())
+        # The shortcut opens first: a client that does not find it uses TCP from then on.
+        shortcut = tcpq.listen_shortcut(*sock.getsockname())
         if shortcut is not None:
             listeners.append(shortcut)
         sock.listen()
     except OSError as error:
         for listener in listeners:
             listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise HubAddressError(
-                f"port {config.port} of {config.host} is in use, perhaps by another hub: end that one, or choose "
-                "another port (0 for any that is free)"
-            ) from error
         raise HubAddressError(
-            f"the hub cannot listen on port {config.port} of {config.host!r} ({error.strerror}): choose an IPv4 "
-            "address of this machine, and a port that you may use"
+            f"the hub cannot listen on {config.host}:{config.port} ({error.strerror}); choose an IPv4 address of this "
+            "machine, and a free port (0: any) that you may use"
         ) from error
     if not sock.getsockname()[0].startswith(LOOPBACK):
-        _log.warning("listens on %s, not on loopback: whoever reaches that address is a client", config.host)
+        _log.warning("listening on %s, beyond loopback: every machine that reaches it can connect", config.host)
     return listeners
 
 
 class HubServer:
     """A hub that runs in the thread that calls `serve_forever`.
 
-    ``lcm.LCM(url)`` holds Python's interpreter lock until the hub has answered. So clients of the same process need a
-    hub in another: `Hub`.
+    ``lcm.LCM(url)`` holds Python's global interpreter lock until the hub answers. So clients in the same process need a
+    hub in another process: `Hub`.
 
     Args:
         config: address, protected channels and limits.
-        listeners: what `listen` returned; the hub owns them. None: it listens itself.
-        control: a connected socket, which the hub owns: for every byte that comes in, the statistics go out as a line
-            of JSON; when its other end closes, the hub stops.
+        listeners: sockets returned by `listen`, which the hub owns from now on; by default it calls `listen`.
+        control: connected socket, which the hub owns from now on. For every byte received there, the hub sends its
+            statistics as a line of JSON; when the other end closes, the hub stops.
+
+    Attributes:
+        config: as above.
+        url: URL for clients, ``tcpq://host:port``.
 
     Raises:
-        HubAddressError: it cannot listen.
+        HubAddressError: The hub cannot listen at its address.
     """
 
     def __init__(
@@ -92,72 +189,69 @@ class HubServer:
     ) -> None:
         self.config = config
         self._listeners = listen(config) if listeners is None else listeners
-        self.url = f"tcpq://{tcpq.address_name(self._listeners[0].getsockname())}"
+        host_port = self._listeners[0].getsockname()
+        self.url = f"tcpq://{tcpq.address_name(host_port)}"
         self._control = control
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._epoll = select.epoll()
-        self._others: dict[int, Callable[[], None]] = {self._wake: self._stop}
+        self._callbacks: dict[int, Callable[[], None]] = {self._wake: self._stop}
         for listener in self._listeners:
             listener.setblocking(False)
-            self._others[listener.fileno()] = partial(self._accept, listener)
+            self._callbacks[listener.fileno()] = partial(self._accept, listener)
         if control is not None:
             control.setblocking(False)
-            self._others[control.fileno()] = self._answer
-        for fileno in self._others:
+            self._callbacks[control.fileno()] = self._answer
+        for fileno in self._callbacks:
             self._epoll.register(fileno, select.EPOLLIN)
 
         self._clients: dict[int, ClientConnection] = {}
-        self._waiting: dict[int, ClientConnection] = {}  # those of them that have sent more than a turn's records
-        self._unchecked = 0  # bytes that have come since the last look at the memory
-        self._admission = Admission(config, on_loopback=self._listeners[0].getsockname()[0].startswith(LOOPBACK))
-        self._relay = Relay(config)
+        self._unfinished: dict[int, ClientConnection] = {}  # clients that have sent more records than fit into a turn
+        self._unchecked = 0  # bytes received since the last check of the memory
+        self._on_loopback = host_port[0].startswith(LOOPBACK)
+        self._own_users = {0, os.geteuid()}
+        self._router = Router(config.protect, lease=config.lease)
         self._running = True
         self._now = time.monotonic()
-        # A quarter: how much of a time may pass unnoticed.
-        self._tick = min(config.status_period, config.patience / 4.0, config.lease / 4.0)
-        self._checked = self._reported = self._now
-        self._paused: float | None = None
+        self._check_period = min(config.status_period, config.patience / 4.0, config.lease / 4.0)
+        self._checked_at = self._reported_at = self._now
+        self._accept_paused_at: float | None = None
 
     def serve_forever(self) -> None:
-        """Relays until `stop`, then closes all connections."""
-        relay = self._relay
+        """Relay messages until `stop` is called, then close all sockets."""
         due = self._due()
         try:
             while self._running:
-                events = self._epoll.poll(0.0 if self._waiting else max(0.0, due - self._now))
+                events = self._epoll.poll(0.0 if self._unfinished else max(0.0, due - self._now))
                 self._now = time.monotonic()
                 if self._now > due:
-                    # The hub was held up. What its clients sent meanwhile has not been read.
-                    self._excuse(self._now - due)
-                for fileno, event in [*events, *((fileno, 0) for fileno in self._waiting)]:
+                    self._discount(self._now - due)
+                for fileno, event in [*events, *((fileno, 0) for fileno in self._unfinished)]:
                     client = self._clients.get(fileno)
                     if client is not None:
-                        self._attend(client, event)
-                        relay.deliver(self._now)
-                    elif fileno in self._others:  # or it is a client that another event has just disconnected
-                        self._others[fileno]()
-                    if relay.behind or relay.lost:
-                        self._follow_up()
+                        self._serve(client, event)
+                        self._send_outgoing()
+                    elif fileno in self._callbacks:  # else a client that was disconnected during an earlier event
+                        self._callbacks[fileno]()
                 if self._unchecked >= _MEMORY_CHECK:
                     self._check_memory()
-                if relay.news or self._now >= due:
-                    self._keep_house()
-                    self._follow_up()
+                if self._router.status_changed or self._now >= due:
+                    self._report()
+                    self._check_clients()
                     due = self._due()
         finally:
             self.close()
 
     def stop(self) -> None:
-        """Ends `serve_forever`; from any thread, or from a signal handler."""
+        """End `serve_forever`; may be called from any thread and from a signal handler."""
         if not self._epoll.closed:
             os.eventfd_write(self._wake, 1)
 
     def close(self) -> None:
-        """Closes all sockets."""
+        """Close all sockets."""
         for client in self._clients.values():
             client.close()
         self._clients.clear()
-        self._waiting.clear()
+        self._unfinished.clear()
         if not self._epoll.closed:
             self._epoll.close()
             for listener in self._listeners:
@@ -167,13 +261,15 @@ class HubServer:
                 self._control.close()
 
     def statistics(self) -> HubStatistics:
-        """Of this moment. To be asked in the thread of `serve_forever`, or when it has ended."""
-        return self._relay.statistics(self._now)
+        """Return the present statistics; call it in the thread of `serve_forever`, or after its end."""
+        return self._router.statistics(self._now)
+
+    def _status_period(self) -> float:
+        return _STATUS_CHANGED_PERIOD if self._router.status_changed else self.config.status_period
 
     def _due(self) -> float:
-        """When the next thing is to be done that no client asks for."""
-        status = _NEWS_PERIOD if self._relay.news else self.config.status_period
-        return min(self._checked + self._tick, self._reported + status)
+        """Return the time at which the hub must act without an event."""
+        return min(self._checked_at + self._check_period, self._reported_at + self._status_period())
 
     def _stop(self) -> None:
         self._running = False
@@ -181,11 +277,11 @@ class HubServer:
     def _answer(self) -> None:
         assert self._control is not None
         try:
-            asked = self._control.recv(64)
-            self._control.send((self.statistics().to_json() + b"\n") * len(asked))
+            request = self._control.recv(64)
+            self._control.send((self.statistics().to_json() + b"\n") * len(request))
         except OSError:
-            asked = b""
-        if not asked:
+            request = b""
+        if not request:
             self._running = False
 
     def _accept(self, listener: socket.socket) -> None:
@@ -194,64 +290,75 @@ class HubServer:
         except (BlockingIOError, ConnectionError):
             return
         except OSError as error:
-            # Such as: no more file descriptors. The connection stays at the door, and would wake the hub for ever.
-            _log.warning("no client is accepted for %g s: %s", _ACCEPT_PAUSE, error)
+            # Such as no free file descriptor: the pending connection would wake the hub again and again.
+            _log.warning("accepting no clients for %g s: %s", _ACCEPT_PAUSE, error)
             for listener in self._listeners:
                 self._epoll.unregister(listener.fileno())
-            self._paused = self._now
+            self._accept_paused_at = self._now
             return
-        user, reason, message = self._admission.decide(sock, self._clients.values())
-        if reason == FULL and self._make_room():
-            user, reason, message = self._admission.decide(sock, self._clients.values())
-        if reason:
-            _log.warning("a client is not let in: %s", message)
-            self._relay.turn_away(reason)
-            with contextlib.suppress(OSError):
-                sock.send(tcpq.rejection(message), socket.MSG_DONTWAIT)
-            sock.close()
-            return
+        limits = {"max_message": self.config.max_message, "max_queue": self.config.max_queue}
         try:
-            client = ClientConnection(
-                sock, max_message=self.config.max_message, max_queue=self.config.max_queue, now=self._now, user=user
-            )
-        except OSError:  # It is gone already.
+            client = ClientConnection(sock, **limits, now=self._now, user=self._admit(sock))
+        except TcpqError as rejected:
+            _log.warning("connection rejected: %s", rejected)
+            self._router.count_disconnected(rejected.reason)
+            with contextlib.suppress(OSError):
+                sock.send(tcpq.rejection(str(rejected)), socket.MSG_DONTWAIT)
             sock.close()
-            return
-        self._clients[client.fileno] = client
-        self._relay.join(client)
-        self._epoll.register(client.fileno, select.EPOLLIN)
+        except OSError:  # The client has disconnected already.
+            sock.close()
+        else:
+            self._clients[client.fileno] = client
+            self._router.add(client)
+            self._epoll.register(client.fileno, select.EPOLLIN)
 
-    def _make_room(self) -> bool:
-        """Disconnects the client that has neither subscribed nor published for longest; returns whether there is one
-        that has not for as long as the hub's patience."""
-        idle = [c for c in self._clients.values() if c.idle and self._now - c.connected > self.config.patience]
-        if not idle:
-            return False
-        first = min(idle, key=lambda client: client.connected)
-        self._disconnect(first, "idle", "has neither subscribed nor published, and makes room for another client")
-        return True
+    def _admit(self, sock: socket.socket) -> int | None:
+        """Return the user of a new client; if the hub is full, an idle client is disconnected to make room.
 
-    def _attend(self, client: ClientConnection, event: int) -> None:
+        Raises:
+            TcpqError: The client may not connect.
+        """
+        config, clients = self.config, self._clients.values()
+        if sock.family == socket.AF_UNIX or self._on_loopback:
+            user = tcpq.peer_user(sock)
+            if not config.all_users and user not in {*self._own_users, *config.users}:
+                who = "unknown user" if user is None else f"user {user}"
+                raise TcpqError("user", f"{who} may not connect; start the hub with --user or --all-users")
+            if user not in self._own_users:
+                per_user, all_others = max(1, config.max_clients // 4), max(1, 3 * config.max_clients // 4)
+                others = [client.user for client in clients if client.user not in self._own_users]
+                if len(others) >= all_others or (user is not None and others.count(user) >= per_user):
+                    limits = f"{per_user} clients per user, {all_others} together"
+                    raise TcpqError("quota", f"limit for users other than the hub's own reached: {limits}")
+        else:
+            user = None  # The kernel knows only the users of this machine.
+        if len(clients) >= config.max_clients:
+            idle = [client for client in clients if client.idle and self._now - client.connected_at > config.patience]
+            if not idle:
+                limit = f"max_clients={config.max_clients} reached"
+                raise TcpqError("too many", f"{limit}; disconnect another client or raise max_clients")
+            oldest = min(idle, key=lambda client: client.connected_at)
+            self._disconnect(oldest, "idle", "it has neither subscribed nor published, and max_clients is reached")
+        return user
+
+    def _serve(self, client: ClientConnection, event: int) -> None:
         try:
             if event & select.EPOLLOUT:
-                self._flush(client)
-            if client.fileno in self._waiting:
-                if not event & ~select.EPOLLOUT:  # Its turn comes by the list of those that wait.
+                client.flush(self._now)
+                if not client.queued:
+                    client.awaits_room = False
+                    self._epoll.modify(client.fileno, select.EPOLLIN)
+            if client.fileno in self._unfinished:
+                if not event & ~select.EPOLLOUT:  # Its turn comes once per loop, by way of `_unfinished`.
                     self._handle(client)
             elif event & ~select.EPOLLOUT:
                 self._read(client)
         except BlockingIOError:
             pass
         except OSError as error:
-            self._disconnect(client, "lost", f"is lost: {error}")
-        except tcpq.TcpqError as error:
+            self._disconnect(client, "lost", str(error))
+        except TcpqError as error:
             self._disconnect(client, error.reason, str(error))
-
-    def _flush(self, client: ClientConnection) -> None:
-        client.flush(self._now)
-        if not client.queued:
-            client.watched = False
-            self._epoll.modify(client.fileno, select.EPOLLIN)
 
     def _read(self, client: ClientConnection) -> None:
         for _ in range(_READS):
@@ -259,98 +366,102 @@ class HubServer:
             if size < 0:
                 return
             if size == 0:
-                self._disconnect(client, "closed", "closed its connection")
+                self._disconnect(client, "closed", "it closed the connection")
                 return
             self._unchecked += size
             handled_all = self._handle(client)
             client.acknowledge()
-            # The rest of a message is there as soon as its beginning is acknowledged; but large messages come in turns.
+            # The rest of a message arrives when its beginning is acknowledged; large messages are received in turns.
             if not handled_all or not client.reader.partial or size == SLICE:
                 return
 
     def _handle(self, client: ClientConnection) -> bool:
-        """Handles what a client has sent, but no more than is its turn; returns whether that was all."""
-        reader, left, first = client.reader, _TURN, True
-        while left > 0:
+        """Handle the received records of a client, up to a turn; return whether that was all."""
+        reader, budget, is_first = client.reader, _TURN, True
+        while budget > 0:
             record = reader.next_record()
             if record is None:
-                self._waiting.pop(client.fileno, None)
+                self._unfinished.pop(client.fileno, None)
                 if not reader.partial:
-                    client.begun = None
-                elif not first or client.begun is None:
-                    client.begun = self._now
+                    client.incomplete_since = None
+                elif not is_first or client.incomplete_since is None:
+                    client.incomplete_since = self._now
                 return True
-            first = False
-            left -= self._relay.handle(client, record, self._now)
-        client.begun = None
-        self._waiting[client.fileno] = client
+            is_first = False
+            budget -= self._router.handle(client, record, self._now)
+        client.incomplete_since = None
+        self._unfinished[client.fileno] = client
         return False
+
+    def _send_outgoing(self) -> None:
+        outgoing = self._router.outgoing
+        for client, messages in outgoing.items():
+            if client.closed:
+                continue
+            try:
+                self._router.totals.dropped += client.send(messages, self._now)
+            except OSError as error:
+                self._disconnect(client, "lost", str(error))
+                continue
+            if client.queued and not client.awaits_room:
+                client.awaits_room = True
+                self._epoll.modify(client.fileno, select.EPOLLIN | select.EPOLLOUT)
+        outgoing.clear()
 
     def _disconnect(self, client: ClientConnection, reason: str, message: str) -> None:
         client.close()
-        self._waiting.pop(client.fileno, None)
+        self._unfinished.pop(client.fileno, None)
         if self._clients.pop(client.fileno, None) is not None:
-            # A client that ends with messages unread is lost, too: nothing to worry about.
-            log = _log.info if reason in ("closed", "lost") else _log.warning
-            log("%s %s", client.name, message)
-            self._relay.leave(client, reason)
+            # A connection is also lost, not closed, if a client ends with unread messages.
+            level = logging.INFO if reason in ("closed", "lost") else logging.WARNING
+            _log.log(level, "client %s disconnected: %s", client.name, message)
+            self._router.remove(client, reason)
 
-    def _excuse(self, seconds: float) -> None:
-        """A time in which the hub was held up ends here; it does not count against anybody."""
-        self._relay.excuse(seconds)
+    def _discount(self, seconds: float) -> None:
+        """Shift all time limits by a delay of the hub, during which it did not read what clients sent."""
+        self._router.extend_leases(seconds)
         for client in self._clients.values():
-            client.connected += seconds
-            client.progressed += seconds
-            if client.begun is not None:
-                client.begun += seconds
+            client.connected_at += seconds
+            client.progressed_at += seconds
+            if client.incomplete_since is not None:
+                client.incomplete_since += seconds
 
     def _check_memory(self) -> None:
-        """Disconnects the clients for which most is held, until all together are within the limit."""
+        """Disconnect the clients with the most memory until the sum of all is within the limit."""
         self._unchecked = 0
-        held = {client: client.held for client in self._clients.values()}
-        total = sum(held.values())
-        for client in sorted(held, key=lambda client: -held[client]):
+        memory = {client: client.memory for client in self._clients.values()}
+        total = sum(memory.values())
+        for client in sorted(memory, key=lambda client: -memory[client]):
             if total <= self.config.max_memory:
                 break
-            total -= held[client]
-            message = f"is disconnected: it holds {held[client]} bytes, and all together more than max_memory"
-            self._disconnect(client, "memory", message)
+            total -= memory[client]
+            limit = f"all clients together exceed max_memory={self.config.max_memory}"
+            self._disconnect(client, "memory", f"backlog and incomplete message of {memory[client]} bytes; {limit}")
 
-    def _follow_up(self) -> None:
-        """Sees to the clients that did not take what was sent to them."""
-        relay = self._relay
-        for client, error in relay.lost:
-            self._disconnect(client, "lost", f"is lost: {error}")
-        for client in relay.behind:
-            if not client.closed:
-                self._epoll.modify(client.fileno, select.EPOLLIN | select.EPOLLOUT)
-        relay.lost.clear()
-        relay.behind.clear()
+    def _report(self) -> None:
+        if self._now >= self._reported_at + self._status_period():
+            self._reported_at = self._now
+            self._router.publish_status(self._now)
+            self._send_outgoing()
 
-    def _keep_house(self) -> None:
+    def _check_clients(self) -> None:
+        """Disconnect the clients that exceed the patience; accept clients again after a pause."""
         now, patience = self._now, self.config.patience
-        if now >= self._reported + (_NEWS_PERIOD if self._relay.news else self.config.status_period):
-            self._reported = now
-            self._relay.publish_status(now)
-        if now < self._checked + self._tick:
+        if now < self._checked_at + self._check_period:
             return
-        self._checked = now
-        for client in [c for c in self._clients.values() if now - c.progressed > patience]:
-            if client.queued:
-                self._disconnect(
-                    client, "stalled", f"has not read for {patience:g} s, {client.queued} bytes wait for it"
-                )
-            elif not client.reader.greeted:
-                self._disconnect(client, "greeting", f"has not greeted for {patience:g} s")
+        self._checked_at = now
         for client in list(self._clients.values()):
-            came = client.reader.held
-            if client.begun is not None and now - client.begun > patience + came / _LEAST_RATE:
-                self._disconnect(
-                    client,
-                    "incomplete",
-                    f"has not completed a message for {now - client.begun:.3g} s, {came} bytes of it have come",
-                )
-        if self._paused is not None and now >= self._paused + _ACCEPT_PAUSE:
-            self._paused = None
+            received = client.reader.held
+            if now - client.progressed_at > patience and client.queued:
+                self._disconnect(client, "stalled", f"no reading for {patience:g} s, backlog of {client.queued} bytes")
+            elif now - client.progressed_at > patience and not client.reader.greeted:
+                self._disconnect(client, "greeting", f"no greeting for {patience:g} s")
+            elif client.incomplete_since is not None:
+                seconds = now - client.incomplete_since
+                if seconds > patience + received / _MIN_RATE:
+                    message = f"message incomplete for {seconds:.3g} s, {received} bytes received"
+                    self._disconnect(client, "incomplete", message)
+        if self._accept_paused_at is not None and now >= self._accept_paused_at + _ACCEPT_PAUSE:
+            self._accept_paused_at = None
             for listener in self._listeners:
                 self._epoll.register(listener.fileno(), select.EPOLLIN)

@@ -1,24 +1,24 @@
-"""Which channels a client has subscribed to."""
+"""Subscriptions of a client, and the patterns that the hub matches itself."""
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from vtbdrake.lcm.hub.log_rate import limited_logger
 from vtbdrake.lcm.hub.tcpq import TcpqError
 
-_log = limited_logger(__name__)
+_log = logging.getLogger(__package__)
 
 MAX_SUBSCRIPTIONS = 1024
-"""The most that one client may have at a time."""
+"""Maximum number of subscriptions of a client at a time."""
 
 MAX_COST = 512
-"""The most that the patterns of one client may cost together, see `Pattern.cost`; beyond that it gets all messages."""
+"""Maximum sum of `Pattern.cost` over the patterns of a client; a client with more receives all messages."""
 
-# What is matched here: characters, classes and repetitions of those, alternatives, at most one group, not repeated.
+# Patterns that are matched here: characters, classes, repetitions of these, alternatives, at most one unrepeated group.
 _ATOM = r"(?:\\[^A-Za-z0-9]|\\[dDsSwW]|[^\\()\[\]{}*+?|]|\[\^?[^\\\[\]]+\])"
 _REPETITION = r"(?:[*+?]|\{\d{1,2}(?:,\d{0,2})?\})"
 _ALTERNATIVES = rf"(?:{_ATOM}{_REPETITION}?|\|)*"
@@ -28,11 +28,11 @@ _PARTS = re.compile(rf"({_ATOM})({_REPETITION}?)")
 
 
 class Pattern(NamedTuple):
-    """A pattern that is more than a name.
+    """A compiled pattern that can match more than one channel.
 
     Attributes:
-        matches: tells by its truth whether a channel is meant, as liblcm does: ``^pattern$`` is found.
-        cost: in characters; to match a name takes at most so many steps for each of its characters.
+        matches: returns something true for a channel that matches, as liblcm decides: ``^pattern$`` is found in it.
+        cost: upper bound of the steps per character of a channel that matching takes.
     """
 
     matches: Callable[[str], object]
@@ -40,25 +40,27 @@ class Pattern(NamedTuple):
 
 
 def literal(pattern: str) -> str | None:
-    """Return the only channel that a pattern means; None if it may mean others."""
+    """Return the only channel that a pattern matches; None if it may match others."""
     return re.sub(r"\\(.)", r"\1", pattern, flags=re.DOTALL) if _LITERAL.fullmatch(pattern) else None
 
 
-def compiled(pattern: str) -> Pattern | None:
-    """Return a pattern that is matched in a time linear in the length of a name.
+def compile_pattern(pattern: str) -> Pattern | None:
+    """Compile a pattern that is matched in a time linear in the length of a channel.
 
-    None if it takes more, or if Python's regular expressions may differ from the client's.
+    Returns:
+        None if matching may take longer, or if Python's regular expressions may differ from the client's.
     """
     if not _SIMPLE.fullmatch(pattern):
         return None
     bare = re.sub(r"\\.|\[\^?[^\]]+\]", "a", pattern, flags=re.DOTALL)  # escapes and classes are atoms like any other
-    # A pattern with two parts of unknown length is quadratic, unless they are .* (or .+) and all else is fixed: then
-    # the first place where the text between two of them is found is as good as any other.
+    # Two parts of variable length take quadratic time, unless these are .* (or .+) and the rest is fixed: then the
+    # first place where the text between two of them is found is as good as any other.
     expression = _chain(pattern) if not re.search(r"[|(^$]", bare) else None
     optional, variable = len(re.findall(r"\?(?!:)", bare)), len(re.findall(r"[*+{]", bare))
-    everywhere = _at_top_level(bare) or re.search(r"[\^$]", bare)
+    # With alternatives outside of groups, ^ holds for the first of them only.
+    anywhere = "|" in re.sub(r"\([^)]*\)", "", bare) or re.search(r"[\^$]", bare)
     if expression is None:
-        if variable > (0 if everywhere else 1):
+        if variable > (0 if anywhere else 1):
             return None
         expression = f"^{pattern}$"
     try:
@@ -66,11 +68,11 @@ def compiled(pattern: str) -> Pattern | None:
     except re.error:
         return None
     cost = len(pattern) * (1 + bare.count("|")) * 2**optional
-    return Pattern(regex.search if everywhere else regex.match, cost) if cost <= MAX_COST else None
+    return Pattern(regex.search if anywhere else regex.match, cost) if cost <= MAX_COST else None
 
 
 def _chain(pattern: str) -> str | None:
-    """Return an expression for a fixed number of characters with ``.*`` and ``.+`` between them; None for all else."""
+    """Return an expression for fixed numbers of characters separated by ``.*`` and ``.+``; None for other patterns."""
     pieces = [""]
     for atom, repetition in _PARTS.findall(pattern):
         if not repetition:
@@ -86,76 +88,70 @@ def _chain(pattern: str) -> str | None:
     return "".join([f"^{first}", *(f"(?>.*?{piece})" for piece in between), f".*{last}$"])
 
 
-def _at_top_level(bare: str) -> bool:
-    """Return whether a pattern has alternatives outside of groups: then ``^`` holds for the first of them only."""
-    return "|" in re.sub(r"\([^)]*\)", "", bare)
-
-
 class Subscriptions:
     """The subscriptions of one client.
 
-    Every client filters again what it gets. So a pattern that cannot be matched here in linear time, or that is one too
-    many for the client's budget, means all channels. To find out whether a channel is wanted takes one look-up and at
-    most `MAX_COST` steps for each character of its name.
+    Every client filters again what it receives. So a pattern that cannot be matched here in linear time, or that
+    exceeds the client's budget, stands for all channels. To decide whether a client receives a channel takes one
+    lookup and at most `MAX_COST` steps for each character of the channel.
     """
 
     def __init__(self) -> None:
+        self.cost = 0  # of all patterns that are matched
         self._count = 0
-        self._times: Counter[str] = Counter()  # each pattern was subscribed
-        self._channels: Counter[str] = Counter()  # each channel is meant by a pattern that means it alone
+        self._by_pattern: Counter[str] = Counter()  # number of subscriptions
+        self._by_channel: Counter[str] = Counter()  # number of subscriptions to this channel alone
         self._patterns: dict[str, Pattern] = {}
-        self._everything: set[str] = set()
-        self.cost = 0
-        """Of all patterns that are matched."""
+        self._unmatched: set[str] = set()  # patterns that stand for all channels
 
     def add(self, pattern: str) -> str | None:
-        """Adds a subscription; returns the channel if it means a single one, else None.
+        """Add a subscription.
+
+        Returns:
+            The channel, if the pattern matches a single one, else None.
 
         Raises:
-            TcpqError: it is one too many.
+            TcpqError: The client has too many subscriptions.
         """
         if self._count >= MAX_SUBSCRIPTIONS:
-            raise TcpqError("malformed", f"subscribes more than {MAX_SUBSCRIPTIONS} times")
+            raise TcpqError("malformed", f"more than {MAX_SUBSCRIPTIONS} subscriptions")
         self._count += 1
-        self._times[pattern] += 1
+        self._by_pattern[pattern] += 1
         channel = literal(pattern)
         if channel is not None:
-            self._channels[channel] += 1
-        elif self._times[pattern] == 1:
-            self._add_pattern(pattern)
+            self._by_channel[channel] += 1
+        elif self._by_pattern[pattern] == 1:
+            compiled = compile_pattern(pattern)
+            if compiled is not None and self.cost + compiled.cost <= MAX_COST:
+                self._patterns[pattern] = compiled
+                self.cost += compiled.cost
+            else:
+                self._unmatched.add(pattern)
+                why = "is too complex" if compiled is None else "exceeds the client's budget for patterns"
+                _log.warning("pattern %r %s: the client receives all messages and filters them itself", pattern, why)
         return channel
 
-    def _add_pattern(self, pattern: str) -> None:
-        found = compiled(pattern)
-        if found is not None and self.cost + found.cost <= MAX_COST:
-            self._patterns[pattern] = found
-            self.cost += found.cost
-            return
-        self._everything.add(pattern)
-        why = "is too complex to be matched" if found is None else "is one pattern too many to be matched"
-        _log.warning("%r %s by the hub: its client gets all messages, and chooses itself", pattern, why)
-
     def remove(self, pattern: str) -> str | None:
-        """Ends one subscription of a pattern, of which there may be more or none; returns the same as `add`."""
+        """Remove one subscription to a pattern, if there is one; return the same as `add`."""
         channel = literal(pattern)
-        if pattern not in self._times:
+        if pattern not in self._by_pattern:
             return channel
         self._count -= 1
-        self._times[pattern] -= 1
+        self._by_pattern[pattern] -= 1
         if channel is not None:
-            self._channels[channel] -= 1
-        if not self._times[pattern]:
-            del self._times[pattern]
-            self._everything.discard(pattern)
+            self._by_channel[channel] -= 1
+        if not self._by_pattern[pattern]:
+            del self._by_pattern[pattern]
+            self._unmatched.discard(pattern)
             if pattern in self._patterns:
                 self.cost -= self._patterns.pop(pattern).cost
         return channel
 
-    def wants(self, channel: str) -> bool:
-        """Whether messages on a channel are to be sent to the client."""
+    def match(self, channel: str) -> bool:
+        """Return whether the client receives the messages of a channel."""
         return (
-            bool(self._everything)
-            or self._channels.get(channel, 0) > 0
+            bool(self._unmatched)
+            or self._by_channel.get(channel, 0) > 0
             or any(pattern.matches(channel) for pattern in self._patterns.values())
         )
 

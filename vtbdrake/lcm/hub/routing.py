@@ -1,0 +1,303 @@
+"""Routing of the records of clients: subscribers of a channel, protected channels, and the statistics."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from math import inf
+from typing import Any, NamedTuple
+
+from vtbdrake.lcm.hub import tcpq
+from vtbdrake.lcm.hub.clients import ClientConnection
+from vtbdrake.lcm.hub.reader import publish_record
+
+_log = logging.getLogger(__package__)
+
+# Clients may publish on any number of channels; the subscribers of at most so many are remembered.
+_MAX_ROUTES = 4096
+
+# Cost of handling a record, and of one on a channel whose subscribers must be found first, in the same unit.
+_RECORD, _NEW_CHANNEL = 1, 16
+
+
+@dataclass
+class ChannelStatistics:
+    """Statistics of a protected channel."""
+
+    owner: str | None = None  # name of the owner, also of one that has disconnected until its lease expires
+    lease_over: bool = False  # whether the owner's lease has expired
+    refused: int = 0  # rejected publications and rejected requests to take over the channel
+    last_refused: str | None = None  # name of the client that was rejected last
+    taken: int = 0  # times that the channel was taken over from an owner whose lease had expired
+
+
+@dataclass
+class HubStatistics:
+    """Statistics of a hub since its start."""
+
+    clients: int = 0  # connected clients
+    messages: int = 0  # accepted publications
+    volume: int = 0  # size of the accepted publications on the wire, in bytes
+    delivered: int = 0  # messages that were sent, or queued to be sent, to a client
+    dropped: int = 0  # messages that were dropped from the backlogs of slow clients
+    queued: int = 0  # size of all backlogs, in bytes
+    refused: int = 0  # rejected publications
+    disconnected: dict[str, int] = field(default_factory=dict)  # disconnected and rejected clients by reason
+    protected: dict[str, ChannelStatistics] = field(default_factory=dict)  # by channel
+
+    def to_json(self) -> bytes:
+        """Return one line of JSON in UTF-8."""
+        return json.dumps(asdict(self)).encode()
+
+    @classmethod
+    def from_json(cls, text: bytes) -> HubStatistics:
+        """Parse what `to_json` returned: the content of a message on the status channel."""
+        fields: dict[str, Any] = json.loads(text)
+        protected = {name: ChannelStatistics(**channel) for name, channel in fields.pop("protected").items()}
+        return cls(**fields, protected=protected)
+
+
+class ProtectedChannel:
+    """A channel on which only its owner may publish; the docstring of the package has the rules.
+
+    Args:
+        name: name of the channel.
+        lease: time after the owner's last publication during which no other client can take over, in seconds.
+
+    Attributes:
+        owner: the client that may publish; None if there is none.
+    """
+
+    def __init__(self, name: str, *, lease: float) -> None:
+        self.name = name
+        self.owner: ClientConnection | None = None
+        self._lease = lease
+        self._renewed = -inf
+        # The owner's name remains there when it has disconnected.
+        self._statistics = ChannelStatistics()
+
+    def publish(self, client: ClientConnection, now: float) -> bool:
+        """Decide about a publication; return whether it is accepted."""
+        if client is self.owner:
+            self._renewed = now
+            return True
+        if self.owner is None and self._lease_over(now):
+            self._set_owner(client, now)
+            return True
+        self._reject(client, "publication")
+        return False
+
+    def take(self, client: ClientConnection, now: float) -> bool:
+        """Decide about a request to take over the channel; return whether the client is the owner now."""
+        if self.owner is not None and client is not self.owner:
+            if not self._lease_over(now):
+                self._reject(client, "takeover")
+                return False
+            self._statistics.taken += 1
+        self._set_owner(client, now)
+        return True
+
+    def release(self, client: ClientConnection) -> bool:
+        """Remove a client that has disconnected; return whether it was the owner."""
+        if client is not self.owner:
+            return False
+        _log.warning("%s: its owner %s has disconnected", self.name, client.name)
+        self.owner = None
+        return True
+
+    def extend(self, seconds: float) -> None:
+        """Extend the lease by a time in which no client could renew it."""
+        self._renewed += seconds
+
+    def statistics(self, now: float) -> ChannelStatistics:
+        """Return the statistics at a time."""
+        over, owned = self._lease_over(now), self.owner is not None
+        owner = self._statistics.owner if owned or not over else None
+        return replace(self._statistics, owner=owner, lease_over=owned and over)
+
+    def _lease_over(self, now: float) -> bool:
+        return now - self._renewed > self._lease
+
+    def _set_owner(self, client: ClientConnection, now: float) -> None:
+        if client is not self.owner:
+            before = "" if self.owner is None else f", previously {self.owner.name}"
+            _log.warning("%s: its owner is %s%s", self.name, client.name, before)
+        self.owner, self._statistics.owner, self._renewed = client, client.name, now
+
+    def _reject(self, client: ClientConnection, what: str) -> None:
+        statistics = self._statistics
+        statistics.refused += 1
+        statistics.last_refused = client.name
+        _log.warning(
+            "%s: %s by %s rejected; its owner is %s%s (%d rejected so far)",
+            self.name,
+            what,
+            client.name,
+            statistics.owner,
+            "" if self.owner else ", disconnected, with a lease that has not expired",
+            statistics.refused,
+        )
+
+
+class _Route(NamedTuple):
+    channel: str
+    subscribers: tuple[ClientConnection, ...]
+    protected: ProtectedChannel | None  # decides who may publish; None if every client may
+    reserved: bool  # whether the channel is the hub's own: nothing is relayed
+
+
+class Router:
+    """Decides for every record where it goes; it neither reads nor writes sockets.
+
+    Args:
+        protect: names of the protected channels.
+        lease: lease of their owners, in seconds.
+
+    Attributes:
+        outgoing: messages to send, by client: those that arrive together leave together, so that the client wakes up
+            once. The server sends and removes them.
+        status_changed: whether an owner changed or something was rejected since the last status.
+        totals: the statistics that are counted; `statistics` returns all.
+    """
+
+    def __init__(self, protect: Iterable[str], *, lease: float) -> None:
+        self.outgoing: dict[ClientConnection, list[bytes | bytearray]] = {}
+        self.status_changed = False
+        self.totals = HubStatistics()
+        self._clients: list[ClientConnection] = []
+        self._routes: dict[bytes, _Route] = {}
+        self._protected = {name: ProtectedChannel(name, lease=lease) for name in protect}
+
+    def add(self, client: ClientConnection) -> None:
+        """Add a client that has connected."""
+        self._clients.append(client)
+
+    def remove(self, client: ClientConnection, reason: str) -> None:
+        """Remove a client that has disconnected."""
+        self._clients.remove(client)
+        self._routes.clear()
+        self.count_disconnected(reason)
+        for protected in self._protected.values():
+            self.status_changed |= protected.release(client)
+
+    def count_disconnected(self, reason: str) -> None:
+        """Count a client that was disconnected or rejected."""
+        disconnected = self.totals.disconnected
+        disconnected[reason] = disconnected.get(reason, 0) + 1
+
+    def handle(self, client: ClientConnection, record: tcpq.Record, now: float) -> int:
+        """Handle a record of a client.
+
+        Returns:
+            Cost of handling it: 1, or 16 if the subscribers of a channel had to be found.
+
+        Raises:
+            TcpqError: The client violates the protocol.
+        """
+        kind, channel, content = record
+        if kind == tcpq.PUBLISH:
+            return self._publish(client, channel, content, now)
+        if kind == tcpq.SUBSCRIBE:
+            self._forget_routes(client.subscriptions.add(_decode(channel)))
+        elif kind == tcpq.UNSUBSCRIBE:
+            self._forget_routes(client.subscriptions.remove(_decode(channel)))
+        else:
+            self.outgoing.setdefault(client, []).append(tcpq.GREETING)
+        return _RECORD
+
+    def _forget_routes(self, channel: str | None) -> None:
+        """Forget the subscribers of a channel, or of all channels if it is None."""
+        if channel is None:
+            self._routes.clear()
+        else:
+            self._routes.pop(channel.encode(), None)
+
+    def _publish(self, client: ClientConnection, channel: bytes, content: bytes | bytearray, now: float) -> int:
+        client.published = True
+        cost, route = _RECORD, self._routes.get(channel)
+        if route is None:
+            cost, route = _NEW_CHANNEL, self._find_route(channel)
+        if route.reserved:
+            self._take(client, route.channel, now)
+            return cost
+        if route.protected is not None:
+            owner = route.protected.owner
+            accepted = route.protected.publish(client, now)
+            self.status_changed |= not accepted or route.protected.owner is not owner
+            if not accepted:
+                self.totals.refused += 1
+                return cost
+        self.totals.messages += 1
+        self.totals.volume += len(content)
+        self._distribute(route, content)
+        return cost
+
+    def _find_route(self, channel: bytes) -> _Route:
+        name = _decode(channel)
+        route = _Route(
+            channel=name,
+            subscribers=tuple(client for client in self._clients if client.subscriptions.match(name)),
+            protected=self._protected.get(name),
+            reserved=name == tcpq.STATUS_CHANNEL or name.startswith(tcpq.TAKE_PREFIX),
+        )
+        if len(self._routes) >= _MAX_ROUTES:
+            self._routes.clear()
+        self._routes[channel] = route
+        return route
+
+    def _distribute(self, route: _Route, content: bytes | bytearray) -> None:
+        for subscriber in route.subscribers:
+            if not subscriber.closed:
+                self.outgoing.setdefault(subscriber, []).append(content)
+                self.totals.delivered += 1
+
+    def _take(self, client: ClientConnection, channel: str, now: float) -> None:
+        """Handle a publication on one of the hub's own channels: a request to take over a channel, or an error."""
+        self.status_changed = True
+        protected = self._protected.get(channel.removeprefix(tcpq.TAKE_PREFIX))
+        if protected is None:
+            _log.warning(
+                "publication by %s on %s rejected; protected channels: %s", client.name, channel, [*self._protected]
+            )
+        if protected is None or not protected.take(client, now):
+            self.totals.refused += 1
+
+    def extend_leases(self, seconds: float) -> None:
+        """Extend all leases by a time in which the hub was delayed."""
+        for protected in self._protected.values():
+            protected.extend(seconds)
+
+    def publish_status(self, now: float) -> None:
+        """Publish the statistics on the status channel."""
+        self.status_changed = False
+        channel = tcpq.STATUS_CHANNEL.encode()
+        route = self._routes.get(channel) or self._find_route(channel)
+        if route.subscribers:
+            self._distribute(route, publish_record(channel, self.statistics(now).to_json()))
+
+    def statistics(self, now: float) -> HubStatistics:
+        """Return the statistics at a time."""
+        return replace(
+            self.totals,
+            clients=len(self._clients),
+            queued=sum(client.queued for client in self._clients),
+            disconnected=dict(self.totals.disconnected),
+            protected={name: protected.statistics(now) for name, protected in self._protected.items()},
+        )
+
+
+def _decode(channel: bytes) -> str:
+    """Return a channel or pattern as text; liblcm's clients in Python and Java cannot read other bytes.
+
+    Raises:
+        TcpqError: It is not UTF-8, or contains a null character.
+    """
+    try:
+        name = channel.decode()
+    except UnicodeDecodeError:
+        raise tcpq.TcpqError("malformed", f"channel {channel!r} is not UTF-8") from None
+    if "\0" in name:
+        raise tcpq.TcpqError("malformed", f"channel {channel!r} contains a null character")
+    return name
