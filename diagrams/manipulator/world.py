@@ -15,7 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericP
 from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from diagrams.manipulator.model import ARM_SDF
 from vtbdrake.state import parameter
-from vtbdrake.state.collectable import NO_DICT, weakly
+from vtbdrake.state.declarations import NO_DICT, weakly
 
 BALL_STIFFNESS = 1e8
 """Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""

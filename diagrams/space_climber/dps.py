@@ -14,7 +14,7 @@ from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
 from diagrams.space_climber.walking import make_walking
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": len(LEGS)}
 

@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 
 def wrap(angle: float) -> float:

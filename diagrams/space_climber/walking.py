@@ -11,7 +11,7 @@ from diagrams.space_climber.gait import Gait, advance, heights
 from diagrams.space_climber.kinematics import LegKinematics
 from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 
 class GaitGenerator(LeafSystem):

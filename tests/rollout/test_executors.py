@@ -23,7 +23,7 @@ from vtbdrake.rollout import (
     ThreadExecutor,
     WorkerError,
 )
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -101,7 +101,7 @@ def test_a_script_without_a_main_guard_and_with_its_own_functions_uses_processes
             from dataclasses import dataclass
             from tests.testbeds import AcrobotScenario
             from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask
-            from vtbdrake.rollout.many import run_rollouts
+            from vtbdrake.rollout.executor import run_rollouts
 
             @dataclass
             class Mine(AcrobotScenario):

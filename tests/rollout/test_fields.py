@@ -18,7 +18,7 @@ from vtbdrake.rollout import (
     SerialExecutor,
     ThreadExecutor,
 )
-from vtbdrake.rollout import testbeds as keeping
+from vtbdrake.rollout import runner as keeping
 from vtbdrake.state import SnapshotError
 from vtbdrake.testbed import ScenarioError
 

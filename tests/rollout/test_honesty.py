@@ -11,7 +11,7 @@ import vtbdrake as vtb
 from tests.rollout.test_runner import BrokenScenario, TerminatingScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import ProcessExecutor, Quality, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 
 THETA = "sim.sys.Pendulum.theta.position"
 SHOULDER = "sim.sys.Acrobot.shoulder.position"

@@ -7,7 +7,7 @@ import pytest
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import FuturesExecutor, ProcessExecutor, Quality, RolloutTask, SerialExecutor, ThreadExecutor
 from vtbdrake.rollout.cluster import DaskExecutor
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"

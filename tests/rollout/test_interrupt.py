@@ -10,7 +10,7 @@ import pytest
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
 from vtbdrake.rollout import Quality, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed.interrupt import Interruptible
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"

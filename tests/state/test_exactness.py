@@ -20,7 +20,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from vtbdrake.state import VariableError, collect
-from vtbdrake.state.copying import StateCopier
+from vtbdrake.state.snapshot import StateCopier
 
 FRICTIONS = [(0.3, 0.2), (0.9, 0.8), (0.9, 0.8)]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.primitives import Gain
 
-from vtbdrake.testbed.feed import Feed
-from vtbdrake.testbed.signal import Signal
+from vtbdrake.testbed.signal import Feed, Signal
 
 
 def test_what_depends_on_a_port_follows_every_new_value() -> None:

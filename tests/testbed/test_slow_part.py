@@ -13,9 +13,9 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from vtbdrake.state import Codec, collect
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.copying import StateCopier
+from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.testbed import SlowPart, slow_parts
-from vtbdrake.testbed.slow_function import SlowPartError
+from vtbdrake.testbed.slow_part import SlowPartError
 
 PERIOD = 0.05
 STEP = 0.01

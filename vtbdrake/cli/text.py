@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.state.files import whole_file
+from vtbdrake.state.archive import whole_file
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

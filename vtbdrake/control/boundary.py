@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.testbed import Command
 from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.testbed.feed import Feed
+from vtbdrake.testbed.signal import Feed
 
 
 class RealPorts:

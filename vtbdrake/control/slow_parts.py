@@ -17,8 +17,7 @@ from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.pickling import dumps
-from vtbdrake.testbed.slow_function import Arrays, split_memory
-from vtbdrake.testbed.slow_part import SlowPart
+from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
 
 _log = logging.getLogger(__name__)
 

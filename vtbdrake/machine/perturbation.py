@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.state.variable import A
+from vtbdrake.state.variables import A
 from vtbdrake.testbed import WorldAlone
 
 PERTURBED = ("mass", "damping", "friction", "rotor_inertia")

@@ -11,7 +11,7 @@ import numpy as np
 
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout.arguments import as_number, as_whole
-from vtbdrake.rollout.result import TERMINATED
+from vtbdrake.rollout.task import TERMINATED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

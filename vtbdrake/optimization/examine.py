@@ -24,7 +24,7 @@ from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.sweep import Sweep
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.arguments import as_number, as_whole
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 
 # Of each value close to a boundary, under each condition.
 _REPEATS = 5

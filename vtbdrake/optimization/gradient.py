@@ -9,7 +9,7 @@ import numpy as np
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 from vtbdrake.rollout.derivative import DerivativeRunner
-from vtbdrake.rollout.testbeds import split
+from vtbdrake.rollout.runner import split
 
 # Of a quality, when what it does to the risk is measured.
 _STEP = 1e-7

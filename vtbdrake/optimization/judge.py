@@ -12,7 +12,7 @@ import numpy as np
 from vtbdrake.optimization.outcome import Outcome, Row, aggregate
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
-from vtbdrake.rollout.result import FAILED
+from vtbdrake.rollout.task import FAILED
 
 Outcomes = Mapping[Row, Outcome]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.rollout.arguments import all_of, as_number
-from vtbdrake.rollout.testbeds import FIELD
+from vtbdrake.rollout.runner import FIELD
 from vtbdrake.state import Variable, Variables
 
 

@@ -19,7 +19,7 @@ from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, Rollo
 from vtbdrake.rollout.arguments import all_of, as_number, as_whole
 from vtbdrake.rollout.blob import pack
 from vtbdrake.rollout.executor import WorkerError
-from vtbdrake.rollout.testbeds import Testbeds, split
+from vtbdrake.rollout.runner import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible

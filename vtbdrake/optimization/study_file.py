@@ -23,7 +23,7 @@ from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study_error import StudyError, damaged, explained
 from vtbdrake.optimization.study_lock import claim
 from vtbdrake.optimization.study_name import sqlite_name
-from vtbdrake.rollout.result import QUALITY_FAILED
+from vtbdrake.rollout.task import QUALITY_FAILED
 
 VERSION = 2
 _APPLICATION = 0x56544253  # "VTBS"

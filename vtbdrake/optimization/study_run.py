@@ -20,8 +20,8 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver
 from vtbdrake.optimization.study_file import StudyFile, TrialRow
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.arguments import as_number, as_whole
-from vtbdrake.rollout.many import watched
-from vtbdrake.rollout.result import QUALITY_FAILED
+from vtbdrake.rollout.executor import watched
+from vtbdrake.rollout.task import QUALITY_FAILED
 from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ import numpy as np
 
 from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
 from vtbdrake.recording.log_reader import ControlLog
-from vtbdrake.state.files import whole_file
+from vtbdrake.state.archive import whole_file
 
 
 def export(log: ControlLog, path: str | os.PathLike[str]) -> None:

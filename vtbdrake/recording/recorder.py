@@ -42,7 +42,7 @@ from vtbdrake.recording.log_format import (
 )
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.abstract_state import abstract_state
+from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
 from vtbdrake.testbed import Scenario, Signal, VirtualTestbed

@@ -4,9 +4,8 @@ from vtbdrake.rollout.choice import choose_executor, make_executor
 from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, WorkerError
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
-from vtbdrake.rollout.result import RolloutResult
 from vtbdrake.rollout.runner import RolloutRunner
-from vtbdrake.rollout.task import RolloutTask
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 __all__ = [

@@ -12,9 +12,8 @@ from typing import Any
 
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import Runners, Testbeds
+from vtbdrake.rollout.runner import Runners, Testbeds
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 _KEPT = 16
 

@@ -16,9 +16,8 @@ from typing import Any
 
 from vtbdrake.rollout.blob import Blob, Blobs, pack, unpack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import failed
+from vtbdrake.rollout.runner import failed
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker import answer
 from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
 

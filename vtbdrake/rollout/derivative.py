@@ -12,8 +12,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator_
 from pydrake.systems.framework import Context
 
-from vtbdrake.rollout.quality import Quality
-from vtbdrake.rollout.readings import READINGS
+from vtbdrake.rollout.quality import READINGS, Quality
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group, write_group

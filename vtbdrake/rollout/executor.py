@@ -1,12 +1,11 @@
-"""Where rollouts run: one after another, or in threads that share a Diagram. Others have modules of their own.
-
-The results are the same, to the last bit, whichever runs them.
-"""
+"""Where rollouts run: one after another, or in threads that share a Diagram."""
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
+import sys
 import threading
 import weakref
 from abc import ABC, abstractmethod
@@ -15,12 +14,13 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+from tqdm.auto import tqdm
+
 from vtbdrake.rollout.arguments import as_whole
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.runner import CancelledError
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import KEPT, Runners, Testbeds
+from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
 
 Parameters = Mapping[str, Any]
 
@@ -175,3 +175,43 @@ def checked_workers(workers: int | None) -> int:
     if count < 1:
         raise ValueError(f"an executor needs at least one worker, not {workers}")
     return count
+
+
+_log = logging.getLogger(__name__)
+
+
+def run_rollouts(
+    executor: Executor,
+    task: RolloutTask,
+    points: Sequence[Parameters],
+    *,
+    progress: bool = True,
+    description: str = "rollouts",
+) -> list[RolloutResult | None]:
+    """One result per point, in the order of ``points``.
+
+    Ctrl-C ends the rollouts that run and hands out no more; the list then has None where there is no result.
+
+    Raises:
+        QualityError: f raises, is negative or NaN.
+    """
+    results: list[RolloutResult | None] = [None] * len(points)
+    with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and watched())) as bar:
+        rollouts = executor.run(task, points)
+        try:
+            with Interruptible() as interruptible:
+                for index, result in rollouts:
+                    results[index] = result
+                    bar.update()
+                    interruptible.check()
+        except KeyboardInterrupt:
+            done = sum(result is not None for result in results)
+            _log.warning("interrupted: %d of %d rollouts are finished and kept", done, len(points))
+        finally:
+            rollouts.close()  # type: ignore[attr-defined]
+    return results
+
+
+def watched() -> bool:
+    """True in a terminal and in a notebook."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules

@@ -13,9 +13,8 @@ from functools import partial
 
 from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import failed
+from vtbdrake.rollout.runner import failed
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker import answer
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 

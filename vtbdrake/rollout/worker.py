@@ -15,9 +15,8 @@ from typing import Any
 from vtbdrake.child_process import report_ready
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.blob import unpack
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import Runners, Testbeds
+from vtbdrake.rollout.runner import Runners, Testbeds
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 # What a worker says besides its answers: the rollout of limited time begins; its memory has grown too much.
 BEGUN, GROWN = b"B", b"G"

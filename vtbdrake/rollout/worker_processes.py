@@ -15,9 +15,8 @@ from vtbdrake.child_process import ChildProcess, StartError
 from vtbdrake.rollout.arguments import as_number
 from vtbdrake.rollout.blob import Blob, Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
-from vtbdrake.rollout.result import RolloutResult
-from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.rollout.testbeds import KEPT, Testbeds, failed
+from vtbdrake.rollout.runner import KEPT, Testbeds, failed
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker import BEGUN, GROWN, main
 
 _log = logging.getLogger(__name__)

@@ -1,13 +1,11 @@
 """s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
 
-from vtbdrake.state.abstract_state import SnapshotError
 from vtbdrake.state.archive import ArchiveError
-from vtbdrake.state.collect import collect
-from vtbdrake.state.collectable import NO_DICT, weakly
-from vtbdrake.state.element import Codec, Element, continuous_state, discrete_state, parameter
+from vtbdrake.state.codecs import SnapshotError
+from vtbdrake.state.declarations import NO_DICT, Codec, Element, continuous_state, discrete_state, parameter, weakly
 from vtbdrake.state.snapshot import Snapshot
-from vtbdrake.state.variable import Variable, VariableError
-from vtbdrake.state.variables import AddressError, Variables
+from vtbdrake.state.systems import collect
+from vtbdrake.state.variables import AddressError, Variable, VariableError, Variables
 
 __all__ = [
     "NO_DICT",

@@ -7,12 +7,12 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import numpy as np
-
-from vtbdrake.state.files import whole_file
 
 _HEADER = "header.json"
 _ARRAY = ".npy"
@@ -146,3 +146,15 @@ def _array(data: bytes) -> np.ndarray:
         raise ValueError(f"an array of shape {shape} and type {dtype} is not in {len(data) - file.tell()} bytes")
     # The array must be writable, and not keep the bytes.
     return np.frombuffer(data, dtype, offset=file.tell()).reshape(shape, order="F" if fortran_order else "C").copy()
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a path beside ``path`` to write to; what was written there takes its place at the end, unless it fails."""
+    target = Path(path)
+    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)

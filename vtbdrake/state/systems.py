@@ -1,23 +1,27 @@
-"""The variables of LeafSystems: declared ones by name, others by their numeric groups."""
+"""The systems of a Diagram: their paths, their numeric groups and their variables."""
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, System
 from pydrake.systems.primitives import ConstantVectorSource
 
-from vtbdrake.state.element import CONTINUOUS, DISCRETE, PARAMETER, Element
-from vtbdrake.state.kinds import is_camera
-from vtbdrake.state.variable import A, Variable, X
+from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER, Element
+from vtbdrake.state.variables import A, Variable, Variables, X
 
 if TYPE_CHECKING:
+    from pydrake.geometry import SceneGraph
+    from pydrake.multibody.plant import MultibodyPlant
     from pydrake.systems.sensors import RgbdSensor
+
+    from vtbdrake.state.multibody import Prefix
 
 POSE_UNIT = "m, rad"
 # What Drake appends to the class of a system that was given no name: its address in memory.
@@ -174,3 +178,64 @@ def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
 def is_python(system: System) -> bool:
     """True for a system that is written in Python: it holds the interpreter lock while it computes."""
     return not type(system).__module__.startswith("pydrake")
+
+
+def is_plant(system: System) -> TypeGuard[MultibodyPlant]:
+    """Whether a system is a MultibodyPlant."""
+    return _is_a(system, "pydrake.multibody.plant", "MultibodyPlant")
+
+
+def is_scene_graph(system: System) -> TypeGuard[SceneGraph]:
+    """Whether a system is a SceneGraph."""
+    return _is_a(system, "pydrake.geometry", "SceneGraph")
+
+
+def is_camera(system: System) -> TypeGuard[RgbdSensor]:
+    """Whether a system is an RgbdSensor."""
+    return _is_a(system, "pydrake.systems.sensors", "RgbdSensor")
+
+
+def _is_a(system: System, module: str, name: str) -> bool:
+    found: Any = sys.modules.get(module)
+    return found is not None and isinstance(system, getattr(found, name))
+
+
+def collect(
+    diagram: Diagram,
+    *,
+    plant_prefix: Callable[[str, str], str] | None = None,
+    skip: Callable[[str], bool] = lambda path: False,
+    extra: Iterable[Variable] = (),
+) -> Variables:
+    """The variables of every system of ``diagram``.
+
+    Args:
+        plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to
+            that instance. By default the path of the plant.
+        skip: says of the path of a leaf system whether its variables are left out.
+        extra: further variables of the diagram.
+    """
+    plant_prefix = plant_prefix or (lambda path, instance: path)
+    systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
+    scene_graphs = [system for _, system in systems if is_scene_graph(system)]
+    listed: list[Variable] = list(extra)
+    by_demand: dict[str, Callable[[], Variable]] = {}
+    for path, system in systems:
+        if is_plant(system):
+            # They need the modules that such a system has brought with it.
+            from vtbdrake.state.multibody import friction_variables, multibody_variables, pose_entries_by_demand
+
+            prefix = _prefix_of(plant_prefix, path)
+            listed.extend(multibody_variables(system, prefix=prefix))
+            source = system.get_source_id()
+            for scene_graph in scene_graphs:
+                if source is not None and scene_graph.model_inspector().SourceIsRegistered(source):
+                    listed.extend(friction_variables(system, scene_graph, prefix=prefix))
+            by_demand |= pose_entries_by_demand(system, prefix=prefix)
+        elif not is_scene_graph(system):
+            listed.extend(leaf_variables(path, system))
+    return Variables(listed, derived_by_demand=by_demand)
+
+
+def _prefix_of(plant_prefix: Callable[[str, str], str], path: str) -> Prefix:
+    return lambda instance: plant_prefix(path, instance)

@@ -1,14 +1,13 @@
 """Figure 4: signals, switches, the virtual testbed as a Diagram, scenarios that build one."""
 
-from vtbdrake.testbed.abstract_switch import Command
+from vtbdrake.testbed.alone import DpsAlone, WorldAlone
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
 from vtbdrake.testbed.scenario_file import load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.slow_part import SlowPart, slow_parts
-from vtbdrake.testbed.strip import DpsAlone
+from vtbdrake.testbed.switch import Command
 from vtbdrake.testbed.testbed import VirtualTestbed
-from vtbdrake.testbed.world import WorldAlone
 
 __all__ = [
     "Command",

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.copying import StateCopier
+from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variables import check_address, suggestion
 from vtbdrake.testbed.signal import Interface

@@ -10,13 +10,11 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
 from vtbdrake.state import Variable
-from vtbdrake.state.abstract_state import abstract_state
-from vtbdrake.state.kinds import is_plant, is_scene_graph
-from vtbdrake.state.systems import class_name, leaves, name_systems
-from vtbdrake.testbed.belief import Belief
+from vtbdrake.state.codecs import abstract_state
+from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
-from vtbdrake.testbed.testbed import MODES, VirtualTestbed, check_mode
+from vtbdrake.testbed.testbed import MODES, Belief, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat, SceneGraph, SceneGraphConfig

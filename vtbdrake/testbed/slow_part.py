@@ -1,11 +1,11 @@
-"""The slow parts of a DPS: what they compute takes longer than a cycle of the fast loop."""
+"""The slow parts of a DPS: computations that take longer than a cycle of the fast loop."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import ceil, inf
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -13,19 +13,182 @@ from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, S
 
 from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
-from vtbdrake.state.collectable import NO_DICT, weakly
+from vtbdrake.state.declarations import NO_DICT, weakly
 from vtbdrake.state.systems import leaves
-from vtbdrake.testbed.slow_function import (
-    MEMORY,
-    Arrays,
-    SlowFunction,
-    SlowPartError,
-    decode,
-    encode,
-    kept,
-    split_memory,
-)
-from vtbdrake.testbed.slow_progress import DONE, PROGRESS_CODEC, WAITING, Progress, Work
+
+Arrays = Mapping[str, np.ndarray]
+
+MEMORY = "memory"
+T = TypeVar("T")
+
+
+class SlowPartError(ValueError):
+    """What a slow part's function returned, or what was handed in as its result, is not what it declares."""
+
+
+@dataclass(frozen=True)
+class SlowFunction:
+    """A slow part's function with what turns its arguments and results into arrays.
+
+    The arrays of a value are named ``<name>`` or, where its codec makes several, ``<name>.<part>``.
+
+    Attributes:
+        function: the user's, see `SlowPart`.
+        inputs, outputs: the codecs, by port.
+        memory: that of the memory, under its name; empty if there is none.
+        makes: the names of all arrays of a result.
+    """
+
+    function: Callable[..., Any]
+    inputs: Mapping[str, Codec]
+    outputs: Mapping[str, Codec]
+    memory: Mapping[str, Codec]
+    makes: frozenset[str]
+
+    def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
+        """The arrays of the outputs and the memory, for those of the inputs and the memory.
+
+        Raises:
+            SlowPartError: the function did not return what it should; what it raises itself passes.
+        """
+        codecs = {**self.inputs, **self.memory}
+        result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
+        remembered = {}
+        if self.memory:
+            if not (isinstance(result, tuple) and len(result) == 2):
+                raise SlowPartError(f"a slow part with a memory returns (outputs, memory), not {result!r}")
+            result, memory = result
+            remembered = encode({MEMORY: memory}, self.memory)
+        made = encode(self._by_name(result), self.outputs) | remembered
+        if made.keys() != self.makes:
+            raise SlowPartError(
+                f"a result's codecs make the arrays {', '.join(sorted(self.makes))} at first, and now {', '.join(made)}"
+            )
+        return made
+
+    def _by_name(self, outputs: Any) -> Mapping[str, Any]:
+        if not isinstance(outputs, Mapping) and len(self.outputs) == 1:
+            return dict.fromkeys(self.outputs, outputs)
+        if not isinstance(outputs, Mapping) or set(outputs) != set(self.outputs):
+            found = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else repr(outputs)
+            raise SlowPartError(f"a slow part returns its outputs by name ({', '.join(self.outputs)}), not {found}")
+        return outputs
+
+
+def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, np.ndarray]:
+    """The values as arrays of their own, which nobody can change any more.
+
+    Raises:
+        SlowPartError: a value is not of its codec's type.
+    """
+    arrays = {}
+    for name, codec in codecs.items():
+        try:
+            parts = codec.encode(values[name])
+        except (ValueError, TypeError, AttributeError) as error:
+            raise SlowPartError(f"{name}: {error}") from error
+        for part, value in parts.items():
+            arrays[f"{name}.{part}" if part else name] = _own(value)
+    return arrays
+
+
+def kept(arrays: Arrays) -> dict[str, np.ndarray]:
+    """The arrays, as `encode` makes them; those that cannot be changed are not copied."""
+    return {name: _own(array) if array.flags.writeable else array for name, array in arrays.items()}
+
+
+def _own(value: np.ndarray) -> np.ndarray:
+    array = np.array(value)
+    array.flags.writeable = False
+    return array
+
+
+def decode(arrays: Arrays, name: str, codec: Codec) -> Any:
+    """One of the values that the arrays are of."""
+    return codec.decode(parts_of(arrays, name))
+
+
+def parts_of(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
+    """The arrays of one value, by part; empty if it is not there."""
+    prefix = f"{name}."
+    parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+    return {"": arrays[name]} if name in arrays else parts
+
+
+def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
+    """The arrays of the memory and those of the outputs in a result."""
+    memory = {name: array for name, array in arrays.items() if name.partition(".")[0] == MEMORY}
+    return memory, {name: array for name, array in arrays.items() if name not in memory}
+
+
+WAITING, DONE, MISSING = range(3)
+
+
+@dataclass(frozen=True)
+class Work:
+    """What became of one sample.
+
+    Attributes:
+        tick: its number.
+        status: waiting, done or missing.
+        arrays: of the inputs while it waits, of the outputs when it is done.
+    """
+
+    tick: int
+    status: int
+    arrays: Arrays
+
+
+@dataclass(frozen=True)
+class Progress:
+    """It is never changed, and so shared by all copies of a context.
+
+    Attributes:
+        shown: the arrays of the abstract outputs.
+        memory: those of the memory.
+        under_way: the samples whose results are not due yet, in order.
+    """
+
+    shown: Arrays
+    memory: Arrays
+    under_way: tuple[Work, ...] = ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Progress:
+        return self
+
+    def find(self, tick: int) -> Work | None:
+        """The work on sample number ``tick``, if it is under way."""
+        return next((work for work in self.under_way if work.tick == tick), None)
+
+    def having(self, tick: int, arrays: Arrays) -> Progress:
+        """With a result, of which none but the memory counts unless it is waited for; without outputs, it is
+        missing."""
+        memory, outputs = split_memory(arrays)
+        result = Work(tick, DONE if outputs else MISSING, outputs)
+        awaited = (work.tick == tick and work.status == WAITING for work in self.under_way)
+        under_way = tuple(result if found else work for work, found in zip(self.under_way, awaited, strict=True))
+        return replace(self, memory=memory or self.memory, under_way=under_way)
+
+    def after(self, work: Work, shown: Arrays) -> Progress:
+        """When ``work`` was due: with what is shown now, and what came later."""
+        return replace(self, shown=shown, under_way=tuple(w for w in self.under_way if w.tick > work.tick))
+
+
+def _encode(progress: Progress) -> dict[str, np.ndarray]:
+    ticks = [(work.tick, work.status) for work in progress.under_way]
+    groups = {"shown": progress.shown, MEMORY: progress.memory}
+    groups |= {f"under_way.{work.tick}": work.arrays for work in progress.under_way}
+    arrays = {f"{group}.{name}": array for group, members in groups.items() for name, array in members.items()}
+    return {"ticks": np.array(ticks, dtype=np.int64).reshape(-1, 2), **arrays}
+
+
+def _decode(arrays: Arrays) -> Progress:
+    under_way = [Work(int(t), int(status), parts_of(arrays, f"under_way.{t}")) for t, status in arrays["ticks"]]
+    return Progress(parts_of(arrays, "shown"), parts_of(arrays, MEMORY), tuple(under_way))
+
+
+PROGRESS_CODEC = Codec(_encode, _decode)
+
 
 MOST_UNDER_WAY = 16
 # Drake now and then leaves out a periodic event that has an offset, when a simulation is advanced to just that time:

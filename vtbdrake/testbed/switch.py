@@ -1,18 +1,20 @@
-"""T_sense and T_act (Figure 4): for every signal, its position in the Context and the switch that it throws."""
+"""The switches T_sense and T_act of Figure 4."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
     DiagramBuilder,
     InputPort,
     InputPortIndex,
+    LeafSystem,
     LeafSystem_,
     OutputPort,
     System,
@@ -21,11 +23,9 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantValueSource, PortSwitch
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from vtbdrake.state.collectable import NO_DICT
-from vtbdrake.state.element import DISCRETE, Codec, Element
+from vtbdrake.state.declarations import DISCRETE, NO_DICT, Codec, Element, weakly
 from vtbdrake.state.systems import leaf_variables
-from vtbdrake.state.variable import Variable, VariableError, X
-from vtbdrake.testbed.abstract_switch import AbstractSwitch, CommandGate
+from vtbdrake.state.variables import Variable, VariableError, X
 from vtbdrake.testbed.signal import Interface, Signal
 
 SIM, REAL, TWIN = "sim", "real", "twin"
@@ -246,3 +246,76 @@ class Switches:
         self._builder.AddNamedSystem(name, system)
         self._builder.Connect(self._board.GetOutputPort(switch), system.get_input_port(0))
         return inputs, system.get_output_port()
+
+
+@dataclass(frozen=True)
+class Command:
+    """What an abstract signal's port ``real.act.<signal>`` carries: a command, or none (``value`` is None)."""
+
+    value: Any = None
+
+
+class AbstractSwitch(LeafSystem):
+    """PortSwitch for abstract values, which pydrake binds for vectors only. Evaluates the selected input alone.
+
+    .. pydrake_system::
+
+        name: AbstractSwitch
+        input_ports:
+        - port_selector
+        - in1
+        - in2
+        - ...
+        output_ports:
+        - value
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, signal: Signal, count: int) -> None:
+        super().__init__()
+        self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
+        for i in range(count):
+            self.DeclareAbstractInputPort(f"in{i + 1}", signal.abstract_value())
+        self.DeclareAbstractOutputPort(
+            "value",
+            signal.abstract_value,
+            weakly(self, AbstractSwitch._calc),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
+        )
+
+    def _calc(self, context: Context, output: AbstractValue) -> None:
+        selected = self._selector.Eval(context)
+        output.SetFrom(self.EvalAbstractInput(context, int(selected)))
+
+
+class CommandGate(LeafSystem):
+    """What an abstract actuator signal's real port carries: a `Command`, empty while the switch is at port ``closed``.
+
+    .. pydrake_system::
+
+        name: CommandGate
+        input_ports:
+        - port_selector
+        - command
+        output_ports:
+        - value
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, signal: Signal, closed: InputPortIndex) -> None:
+        super().__init__()
+        self._closed = closed
+        self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
+        self._command = self.DeclareAbstractInputPort("command", signal.abstract_value())
+        self.DeclareAbstractOutputPort(
+            "value",
+            lambda: Value(Command()),
+            weakly(self, CommandGate._calc),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
+        )
+
+    def _calc(self, context: Context, output: AbstractValue) -> None:
+        closed = self._selector.Eval(context) == self._closed
+        output.set_value(Command() if closed else Command(self._command.Eval(context)))

@@ -23,7 +23,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
-from vtbdrake.state.files import whole_file
+from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 from tests.testbeds import AcrobotScenario
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, ThreadExecutor
-from vtbdrake.rollout.many import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel
 from vtbdrake.state import Element, discrete_state, parameter
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import casadi
 
-from vtbdrake.state.files import whole_file
+from vtbdrake.state.archive import whole_file
 
 _log = logging.getLogger(__name__)
 

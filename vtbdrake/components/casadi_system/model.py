@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel
-from vtbdrake.state.element import Element, discrete_state, parameter
+from vtbdrake.state.declarations import Element, discrete_state, parameter
 
 NEXT = "_next"
 INPUT, STATE, PARAMETER, TIME = "input", "state", "parameter", "time"

@@ -26,7 +26,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from vtbdrake.components.casadi_system.handler import handler
 from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
-from vtbdrake.state.collectable import NO_DICT, weakly
+from vtbdrake.state.declarations import NO_DICT, weakly
 
 
 @TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]

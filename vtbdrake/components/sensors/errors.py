@@ -21,7 +21,7 @@ from pydrake.systems.framework import (
 
 from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
 from vtbdrake.state import Element, discrete_state, parameter
-from vtbdrake.state.collectable import weakly
+from vtbdrake.state.declarations import weakly
 
 # Channels of a sensor's stream; 0 is its white noise.
 _DRIFT_CHANNEL, _DROPOUT_CHANNEL = 1, 2

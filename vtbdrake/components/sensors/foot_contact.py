@@ -14,7 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import parameter
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateInde
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
 from vtbdrake.state import Element, discrete_state
-from vtbdrake.state.collectable import NO_DICT
+from vtbdrake.state.declarations import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant

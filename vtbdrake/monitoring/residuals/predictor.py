@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams
 
 from vtbdrake.testbed import Scenario, WorldAlone
-from vtbdrake.testbed.belief import Belief
+from vtbdrake.testbed.testbed import Belief
 
 Array = NDArray[np.float64]
 

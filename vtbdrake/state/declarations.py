@@ -1,20 +1,8 @@
-"""What a LeafSystem declares about its own state and parameters.
-
-A system of ours names the pieces of its numeric state x and parameters a in its constructor::
-
-    self.variables = (
-        parameter("period", self.DeclareNumericParameter(BasicVector([2.0])), unit="s", bounds=(0.1, 60.0)),
-        discrete_state("phase", self.DeclareDiscreteState(1), unit="cycle"),
-    )
-
-and, if it keeps abstract state for which `vtbdrake.state.codecs` knows no way, how that state becomes arrays and back::
-
-    self.codecs = {0: Codec(encode=lambda landmarks: {"p_WL": landmarks.p_WL},
-                            decode=lambda arrays: Landmarks(**arrays))}
-"""
+"""What a LeafSystem declares about itself: named variables, codecs of its abstract state, and how it can be freed."""
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf
@@ -89,3 +77,23 @@ class Codec:
 
     encode: Callable[[Any], Mapping[str, np.ndarray]]
     decode: Callable[[Mapping[str, np.ndarray]], Any]
+
+
+# The ``__slots__`` of every class that derives from LeafSystem. A dict of its own, beside that of Drake's class, is
+# visited twice by the collector (drake 1.51), which then takes it for used from elsewhere. Attributes go into Drake's.
+NO_DICT: tuple[str, ...] = ()
+
+
+def weakly(owner: Any, method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls ``method(owner, ...)`` and does not keep ``owner`` alive.
+
+    Drake keeps what computes an output port or a cache entry in C++, where Python's garbage collector does not look. A
+    bound method there holds its system, which holds the method: neither would ever be freed, nor the Diagram around.
+    """
+    reference = weakref.ref(owner)
+
+    def call(*arguments: Any) -> Any:
+        # The wrapper of a system lives as long as its Diagram does.
+        return method(reference(), *arguments)
+
+    return call
