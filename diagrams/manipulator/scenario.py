@@ -26,8 +26,8 @@ from vtbdrake.components.sensors import (
 )
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.testbed import (
     Interface,

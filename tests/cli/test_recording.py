@@ -11,7 +11,7 @@ import pytest
 
 from tests.cli.program import run
 from tests.recording.servo import Servo
-from vtbdrake.lcm.wire import decode
+from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.log_format import LOG, LogError, event
 from vtbdrake.recording.log_reader import LogEvents, read_log

@@ -10,8 +10,8 @@ from drake import lcmt_scope
 from tests.control.scripted import PERIOD, ServoScenario
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.lcm.vectors import vector_map
 from vtbdrake.testbed import Interface
 
 COMMAND = "IIWA_COMMAND"

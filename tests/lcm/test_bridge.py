@@ -23,13 +23,10 @@ import pytest
 
 from tests.control.arm import LIMIT, bridge, command, status
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.bridge import ForeignCommands, LcmBridge
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, HubStatistics
-from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.ownership import Ownership
-from vtbdrake.lcm.routes import CommandWatch
-from vtbdrake.lcm.vectors import vector_map
+from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.testbed import Interface, Signal
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,10 +90,10 @@ for utime in range(1, 101):
         arm.open()
         subprocess.run([sys.executable, "-c", sender], cwd=ROOT, check=True, timeout=60)
         assert wait(arm, lambda: arm.sensed["position"].count == 100)
-        reception = arm.sensed["position"]
-        np.testing.assert_array_equal(reception.value, [1.0] * 7)
-        assert 0.0 <= reception.age(time.monotonic()) < PATIENCE
-        assert (reception.sent, reception.rejected) == (pytest.approx(100e-6), {})
+        received = arm.sensed["position"]
+        np.testing.assert_array_equal(received.value, [1.0] * 7)
+        assert 0.0 <= received.age(time.monotonic()) < PATIENCE
+        assert (received.sent, received.rejected) == (pytest.approx(100e-6), {})
 
 
 def test_what_is_published_and_nothing_else_is_on_the_bus(hub: Hub) -> None:
@@ -176,7 +173,7 @@ def test_private_bus_is_used_when_it_is_asked_for() -> None:
         arm.open()
         arm.publish({"position": np.zeros(7)})
         assert arm.poll(1.0) == 1
-        assert arm.alarms == {"IIWA_COMMAND": 0}
+        assert arm.foreign_messages == {"IIWA_COMMAND": 0}
 
 
 def test_killed_hub_is_noticed_by_the_next_poll_and_its_successor_found() -> None:
@@ -328,7 +325,7 @@ def test_burst_is_taken_in_by_portions(hub: Hub) -> None:
 def test_foreign_publisher_on_a_command_channel_raises_an_alarm(hub: Hub) -> None:
     told: list[str] = []
     peer = Peer(hub.url)
-    with closing(bridge(hub.url, watch=True, on_alarm=lambda channel, data: told.append(channel))) as arm:
+    with closing(bridge(hub.url, watch=True, on_foreign=lambda channel, data: told.append(channel))) as arm:
         arm.open()
         in_step(arm, peer)
         for _ in range(5):
@@ -339,9 +336,9 @@ def test_foreign_publisher_on_a_command_channel_raises_an_alarm(hub: Hub) -> Non
             came = arm.poll(PATIENCE)
             assert came
             taken += came
-        assert arm.alarms == {"IIWA_COMMAND": 0}
+        assert arm.foreign_messages == {"IIWA_COMMAND": 0}
         peer.lcm.publish("IIWA_COMMAND", own)  # a recorded one, byte for byte
-        assert wait(arm, lambda: arm.alarms == {"IIWA_COMMAND": 1})
+        assert wait(arm, lambda: arm.foreign_messages == {"IIWA_COMMAND": 1})
         assert told == ["IIWA_COMMAND"]
 
 
@@ -379,13 +376,13 @@ def test_second_publisher_that_a_hub_refuses_is_an_alarm_too() -> None:
         assert arm.hindrance is None
 
 
-def test_refusals_of_ones_own_commands_and_those_before_are_no_attempts_of_others() -> None:
-    ownership = Ownership(["C"], lambda: "me")
+def test_own_and_earlier_refusals_are_not_foreign() -> None:
+    foreign = ForeignCommands(["C"], lambda: "me")
 
     def told(owner: str, refused: int, last: str) -> int:
         state = ChannelStatistics(owner=owner, refused=refused, last_refused=last)
-        ownership.take(STATUS_CHANNEL, HubStatistics(protected={"C": state}).to_json())
-        return ownership.attempts
+        foreign.take_status(STATUS_CHANNEL, HubStatistics(protected={"C": state}).to_json())
+        return foreign.refused
 
     assert told("me", 7, "other") == 0  # before the first status
     assert told("me", 9, "other") == 2
@@ -393,7 +390,7 @@ def test_refusals_of_ones_own_commands_and_those_before_are_no_attempts_of_other
     assert told("me", 13, "me") == 2
     assert told("me", 0, "other") == 2  # of a hub that was started again
     assert told("me", 1, "other") == 3
-    assert ownership.contended(60.0) == ["C"] and ownership.contended(0.0) == []
+    assert foreign.recent(60.0) == {"C"} and foreign.recent(0.0) == set()
 
 
 def test_on_a_protected_channel_the_hub_tells_who_commands() -> None:
@@ -410,25 +407,32 @@ def test_on_a_protected_channel_the_hub_tells_who_commands() -> None:
         assert listener.contention is None
 
 
-def test_own_commands_that_come_back_late_all_at_once_or_not_in_order_are_no_alarm() -> None:
-    watch = CommandWatch(None)
+def test_own_messages_that_come_back_late_are_not_foreign() -> None:
+    foreign = ForeignCommands(["C"], lambda: None)
     own = [str(number).encode() for number in range(3000)]
     for data in (*own, own[7]):
-        watch.expect(data)
+        foreign.expect("C", data)
     for data in (own[7], *reversed(own)):
-        watch.take("IIWA_COMMAND", data)
-    assert watch.alarms == 0
+        foreign.take("C", data)
+    assert foreign.heard == {"C": 0}
     for data in (own[7], b"foreign"):
-        watch.take("IIWA_COMMAND", data)
-    assert watch.alarms == 2
+        foreign.take("C", data)
+    assert foreign.heard == {"C": 2}
 
 
-def test_own_commands_that_never_come_back_make_room(caplog: pytest.LogCaptureFixture) -> None:
-    watch = CommandWatch(None)
+def test_own_messages_that_never_come_back_are_forgotten() -> None:
+    foreign = ForeignCommands(["C"], lambda: None)
     for number in range(20_000):
-        watch.expect(str(number).encode())
-    watch.take("IIWA_COMMAND", b"0")
-    assert watch.alarms == 1
+        foreign.expect("C", str(number).encode())
+    foreign.take("C", b"0")
+    assert foreign.heard == {"C": 1}
+
+
+def test_own_message_on_another_channel_is_foreign() -> None:
+    foreign = ForeignCommands(["C", "D"], lambda: None)
+    foreign.expect("C", b"1")
+    foreign.take("D", b"1")
+    assert foreign.heard == {"C": 0, "D": 1}
 
 
 def test_callback_that_raises_does_not_end_the_loop(hub: Hub) -> None:
@@ -436,12 +440,12 @@ def test_callback_that_raises_does_not_end_the_loop(hub: Hub) -> None:
         raise RuntimeError
 
     peer = Peer(hub.url)
-    with closing(bridge(hub.url, watch=True, on_alarm=refuse)) as arm:
+    with closing(bridge(hub.url, watch=True, on_foreign=refuse)) as arm:
         arm.open()
         in_step(arm, peer)
         peer.lcm.publish("IIWA_COMMAND", b"1")
         peer.lcm.publish("IIWA_COMMAND", b"2")
-        assert wait(arm, lambda: arm.alarms == {"IIWA_COMMAND": 2})
+        assert wait(arm, lambda: arm.foreign_messages == {"IIWA_COMMAND": 2})
 
 
 def test_foreign_publisher_is_heard_on_udpm() -> None:
@@ -454,10 +458,10 @@ def test_foreign_publisher_is_heard_on_udpm() -> None:
         arm.publish({"position": np.zeros(7)})
         if not arm.poll(1.0):
             pytest.skip("no multicast here")
-        assert arm.alarms == {"IIWA_COMMAND": 0}
+        assert arm.foreign_messages == {"IIWA_COMMAND": 0}
         code = f"import lcm; lcm.LCM({url!r}).publish('IIWA_COMMAND', b'foreign')"
         subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-        if not wait(arm, lambda: arm.alarms == {"IIWA_COMMAND": 1}):
+        if not wait(arm, lambda: arm.foreign_messages == {"IIWA_COMMAND": 1}):
             pytest.skip("multicast does not pass between processes here")
 
 
@@ -511,9 +515,9 @@ def test_bridge_whose_commands_the_hub_refuses_counts_and_logs_it(caplog: pytest
 def test_what_is_no_status_of_a_hub_is_told_and_changes_nothing(
     status: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    ownership = Ownership(["IIWA_COMMAND"], lambda: "127.0.0.1:1")
-    ownership.take("VTB_HUB", status)
-    assert ownership.foreign == frozenset()
+    foreign = ForeignCommands(["IIWA_COMMAND"], lambda: "127.0.0.1:1")
+    foreign.take_status("VTB_HUB", status)
+    assert foreign.blocked == frozenset()
     assert "no status" in caplog.text
 
 

@@ -20,9 +20,9 @@ from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_sta
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
 from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.routes import ChannelReader
 
 ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = 100_000
@@ -113,27 +113,27 @@ def resident() -> int:
 
 @pytest.fixture(scope="module")
 def fuzzed() -> tuple[dict[str, ReceivedSignal], Oracle, list[int]]:
-    receptions = {"position": ReceivedSignal(), "torque": ReceivedSignal()}
-    inlet = ChannelReader(iiwa_status(SENSE), interface().sense, receptions, 0.0)
+    signals = {"position": ReceivedSignal(), "torque": ReceivedSignal()}
+    reader = ChannelReader(iiwa_status(SENSE), interface().sense, signals, 0.0)
     oracle, memory = Oracle(), []
     for number, data in enumerate(stream(1, MESSAGES)):
-        inlet.take("IIWA_STATUS", data)
+        reader.take("IIWA_STATUS", data)
         oracle.judge(data)
-        value = receptions["position"].value
+        value = signals["position"].value
         assert value is None or np.abs(value).max() <= LIMIT
         if number in (MESSAGES // 5, MESSAGES - 1):
             memory.append(resident())
-    return receptions, oracle, memory
+    return signals, oracle, memory
 
 
 def test_every_message_is_counted_once(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
-    for reception in fuzzed[0].values():
-        assert reception.count + sum(reception.rejected.values()) == MESSAGES
+    for received in fuzzed[0].values():
+        assert received.count + sum(received.rejected.values()) == MESSAGES
 
 
 def test_exactly_the_right_messages_are_believed(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
-    receptions, oracle, _ = fuzzed
-    counts = {name: reception.count for name, reception in receptions.items()}
+    signals, oracle, _ = fuzzed
+    counts = {name: received.count for name, received in signals.items()}
     assert counts == oracle.accepted
     assert min(counts.values()) > MESSAGES // 20
 
@@ -149,9 +149,9 @@ def test_memory_stays_flat(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list
     assert late - early < 5_000_000
 
 
-def judged(reception: ReceivedSignal) -> int:
+def judged(received: ReceivedSignal) -> int:
     """How many messages came, good or bad."""
-    return reception.count + sum(reception.rejected.values())
+    return received.count + sum(received.rejected.values())
 
 
 def test_broken_messages_of_another_process_do_no_harm_on_a_real_bus() -> None:
@@ -178,7 +178,7 @@ for data in stream(2, {count}):
             process.kill()
             process.wait()
         assert judged(arm.sensed["position"]) == count
-        for name, reception in arm.sensed.items():
-            assert reception.count == oracle.accepted[name]
-            assert reception.count + sum(reception.rejected.values()) == count
+        for name, received in arm.sensed.items():
+            assert received.count == oracle.accepted[name]
+            assert received.count + sum(received.rejected.values()) == count
         assert arm.connected

@@ -1,19 +1,20 @@
-"""Maps between messages and signals, and what they refuse when they are made."""
+"""Maps between messages and signals: strict decoding, both ways of vectors, and what is refused."""
 
 from __future__ import annotations
 
+import struct
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from drake import lcmt_iiwa_command, lcmt_iiwa_status
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_image, lcmt_robot_state
 
 from tests.control.arm import ACT, SENSE, command, status
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.vectors import vector_map
+from vtbdrake.lcm.maps import LcmMap, decode, vector_map
+from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal
 
 
@@ -21,18 +22,59 @@ def signals(**sizes: int) -> list[Signal]:
     return [Signal(name, size=size, idle=0.0) for name, size in sizes.items()]
 
 
-def test_status_of_an_arm_becomes_its_signals_in_whichever_way_it_is_read() -> None:
-    read = iiwa_status(SENSE).reader(signals(position=7, torque=7))
-    for utime in (1_500_000, 2_500_000, 3_500_000):  # the first field by field, the others in one go
-        sample = read(status(utime, position=utime * 1e-6, torque=-4.0).encode())
-        assert sample.sent == utime * 1e-6
-        np.testing.assert_array_equal(sample.values["position"], [utime * 1e-6] * 7)
-        np.testing.assert_array_equal(sample.values["torque"], [-4.0] * 7)
+def mixed(types: ModuleType) -> Any:
+    message = types.mixed_t()
+    message.utime, message.name, message.n, message.m = 5, "camera", 2, 3
+    message.grid = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    message.blob = b"abc"
+    message.points = [types.point_t(), types.point_t()]
+    return message
+
+
+def reason(message_type: Any, data: bytes) -> str:
+    with pytest.raises(MalformedError) as caught:
+        decode(message_type, data)
+    return caught.value.reason
+
+
+def test_message_is_decoded_as_lcm_gen_does(user_types: ModuleType) -> None:
+    data = mixed(user_types).encode()
+    assert decode(user_types.mixed_t, data).encode() == data
+
+
+def test_every_truncation_is_rejected(user_types: ModuleType) -> None:
+    data = mixed(user_types).encode()
+    assert {reason(user_types.mixed_t, data[:length]) for length in range(len(data))} == {"truncated"}
+
+
+def test_trailing_bytes_and_other_types_are_rejected() -> None:
+    assert reason(lcmt_iiwa_status, status(1).encode() + b"\0") == "trailing"
+    assert reason(lcmt_iiwa_status, lcmt_robot_state().encode()) == "fingerprint"
+
+
+def test_negative_length_is_rejected() -> None:
+    data = bytearray(lcmt_image().encode())
+    at = data.index(struct.pack(">iiii", 0, 0, 0, 0)) + 12
+    data[at : at + 4] = struct.pack(">i", -1)
+    assert reason(lcmt_image, bytes(data)) == "size"
+
+
+def test_billions_of_empty_rows_are_not_read(user_types: ModuleType) -> None:
+    data = bytearray(user_types.mixed_t().encode())
+    at = 8 + 8 + 4 + 1  # fingerprint, utime, name
+    data[at : at + 4] = struct.pack(">i", 2**31 - 1)
+    assert reason(user_types.mixed_t, bytes(data)) == "size"
+
+
+def test_status_of_an_arm_becomes_its_signals() -> None:
+    sent, values = iiwa_status(SENSE).decoder(signals(position=7, torque=7))(status(9, position=0.5).encode())
+    assert sent == 9 * 1e-6
+    assert {name: value.tolist() for name, value in values.items()} == {"position": [0.5] * 7, "torque": [0.2] * 7}
 
 
 @pytest.mark.parametrize("names", [("position", "torque"), ("position",), ("torque",)])
 def test_command_is_what_lcm_gen_decodes_and_what_is_not_commanded_is_empty(names: tuple[str, ...]) -> None:
-    write = iiwa_command(ACT).writer(signals(position=7, torque=7))
+    write = iiwa_command(ACT).encoder(signals(position=7, torque=7))
     values = {name: np.arange(7.0) + (10.0 if name == "torque" else 0.0) for name in names}
     for utime in (7, 8):
         data = write(values, utime)
@@ -47,25 +89,31 @@ def test_fields_of_a_users_type_travel_both_ways(user_types: ModuleType) -> None
     map = vector_map("WIND", user_types.wind_t, fields)
     of = signals(wind=2, gust=2, level=1, height=1)
     values = {"wind": [7.5, 0.3], "gust": [9.0, 9.5], "level": [4.0], "height": [-1.25]}
-    data = map.writer(of)(values, 42)
+    data = map.encoder(of)(values, 42)
     message = user_types.wind_t.decode(data)
     assert (message.utime, message.speed, message.direction, message.level) == (42, 7.5, 0.3, 4)
     assert (message.gust, message.where.z) == ((9.0, 9.5), -1.25)
-    sample = map.reader(of)(data)
-    assert sample.sent == pytest.approx(42e-6)
-    for name, value in values.items():
-        np.testing.assert_array_equal(sample.values[name], value)
+    sent, decoded = map.decoder(of)(data)
+    assert sent == pytest.approx(42e-6)
+    assert {name: value.tolist() for name, value in decoded.items()} == values
+
+
+def test_fields_beside_arrays_of_messages_travel_both_ways(user_types: ModuleType) -> None:
+    map = vector_map("MIXED", user_types.mixed_t, {"n": "n"})
+    sent, decoded = map.decoder(signals(n=1))(mixed(user_types).encode())
+    assert (sent, decoded["n"].tolist()) == (5 * 1e-6, [2.0])
+    assert user_types.mixed_t.decode(map.encoder(signals(n=1))({"n": [0.0]}, 6)).utime == 6
 
 
 def test_arrays_that_share_a_length_are_filled_when_a_status_is_written() -> None:
-    data = iiwa_status(SENSE).writer(signals(position=7, torque=7))({"position": [1.0] * 7, "torque": [2.0] * 7}, 3)
+    data = iiwa_status(SENSE).encoder(signals(position=7, torque=7))({"position": [1.0] * 7, "torque": [2.0] * 7}, 3)
     message = lcmt_iiwa_status.decode(data)
     assert message.joint_position_measured == (1.0,) * 7
     assert message.joint_velocity_estimated == (0.0,) * 7
 
 
 def test_message_that_cannot_leave_out_a_signal_says_so(user_types: ModuleType) -> None:
-    write = vector_map("WIND", user_types.wind_t, {"speed": "speed", "gust": "gust"}).writer(signals(speed=1, gust=2))
+    write = vector_map("WIND", user_types.wind_t, {"speed": "speed", "gust": "gust"}).encoder(signals(speed=1, gust=2))
     with pytest.raises(LookupError, match="gust"):
         write({"speed": [1.0]}, 1)
 
@@ -85,12 +133,12 @@ def test_field_that_cannot_be_a_signal_is_refused(user_types: ModuleType, fields
 
 def test_signal_of_another_size_than_its_fields_is_refused(user_types: ModuleType) -> None:
     with pytest.raises(ValueError, match="gust has 3 entries, but gust of wind_t on channel WIND has 2"):
-        vector_map("WIND", user_types.wind_t, {"gust": "gust"}).reader(signals(gust=3))
+        vector_map("WIND", user_types.wind_t, {"gust": "gust"}).decoder(signals(gust=3))
 
 
 def test_signals_of_different_sizes_in_arrays_of_one_length_are_refused() -> None:
     with pytest.raises(ValueError, match="position and torque have 7 and 6 entries, but field num_joints"):
-        iiwa_status(SENSE).reader(signals(position=7, torque=6))
+        iiwa_status(SENSE).decoder(signals(position=7, torque=6))
 
 
 def test_type_that_lcm_gen_did_not_make_is_refused() -> None:

@@ -12,7 +12,8 @@ import pytest
 from drake import lcmt_iiwa_status
 
 from tests.control.arm import status
-from vtbdrake.lcm.wire import MalformedError, decode
+from vtbdrake.lcm.maps import decode
+from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.machine import (
     ClockJump,
     Corrupt,

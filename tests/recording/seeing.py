@@ -15,8 +15,7 @@ from pydrake.systems.sensors import ImageGrey8U
 
 from tests.control.scripted import PERIOD
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command
-from vtbdrake.lcm.images import image_map
+from vtbdrake.lcm.drake_messages import iiwa_command, image_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 

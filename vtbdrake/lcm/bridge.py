@@ -2,47 +2,56 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, ReceivedSignal
+from vtbdrake.control.ranges import Range
 from vtbdrake.control.reported import reported_signals
-from vtbdrake.lcm.connections import Handler
-from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX
-from vtbdrake.lcm.link import LcmLink
+from vtbdrake.lcm.connections import Handler, LcmLink
+from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.ownership import Ownership
-from vtbdrake.lcm.routes import ChannelReader, ChannelWriter, CommandWatch, SentSignal
+from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal
+
+_log = logging.getLogger(__name__)
 
 _HUB = "tcpq://"
 _PRIVATE = ("memq://", "file://")
 
-CONTENTION = 1.0
-"""Seconds for which a command of somebody else speaks against commanding as well."""
+FOREIGN_TIMEOUT = 1.0
+"""Seconds for which a foreign actuator command prevents a switch to the real machine."""
+
+MAX_AHEAD = 1.5
+"""Seconds by which a sender's time may get ahead of ours from one message to the next: by a shorter latency, or because
+the sender is a simulation that runs faster than real time."""
 
 
 class LcmBridge(Bridge):
     """Carries the signals of a testbed over LCM.
 
-    Received messages are checked before anything of them is believed: type, length, sizes, finite entries, the limits
-    of the signals, and the order of the sender's times. What fails is counted in its `ReceivedSignal`, and never
-    raised. Each signal of a message stands for itself: one that is out of its limits does not take the others along.
+    Every received message is checked: type, length, sizes, finite entries, the limits of the signals, and the order of
+    the sender's times. What fails is counted in its `ReceivedSignal`, and never raised. The signals of a message are
+    checked one by one: one that is out of its limits does not invalidate the others.
 
-    A late message (its time is below the last accepted one's) is ``out of order``, one with the same time a
-    ``duplicate``, one whose time is 1.5 s further on than the time that has passed here ``ahead of time``. A sender
-    that was restarted, or whose clock was set, is believed once none of its messages has fitted to its old time for
-    ``reorder_window`` seconds.
+    A message is rejected as ``out of order`` if its time is before the last accepted one's, as a ``duplicate`` if it is
+    the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` further on than the time that has passed here. A
+    sender that was restarted, or whose clock was set, is accepted after ``reorder_window`` seconds in which no message
+    has continued its old time.
 
-    Commands are the guards' business, but what is not finite or not within a signal's limits does not leave here
-    either: the whole message is withheld and counted, as is one that lacks a signal which it cannot do without.
+    Limiting actuator commands is the guards' business, but one that is not finite or not within its signal's limits is
+    never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
 
     Attributes:
-        url: the bus.
-        sent: by actuator signal, how many commands left, and why others did not.
-        alarms: by command channel, how many messages came there that are not ours (empty if ``watch`` is off).
-        clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was believed.
+        url: the LCM URL of the bus.
+        sent: by actuator signal, how many commands were sent, and why others were not.
+        foreign_messages: by actuator channel, how many messages of other publishers were heard; empty if ``watch`` is
+            off.
+        clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was accepted.
         losses, reconnections: how often the bus was lost and found again.
     """
 
@@ -56,30 +65,31 @@ class LcmBridge(Bridge):
         commands: Sequence[LcmMap] = (),
         reported: Mapping[str, str] | None = None,
         watch: bool | None = None,
-        on_alarm: Callable[[str, bytes], None] | None = None,
+        on_foreign: Callable[[str, bytes], None] | None = None,
         reorder_window: float = 0.1,
         connect_timeout: float = 2.0,
         burst: int = 200,
     ) -> None:
-        """
+        """Check the maps; `open` connects.
+
         Args:
             interface: the DPS's signals.
             url: an LCM URL: ``tcpq://127.0.0.1:7700`` (a hub), ``udpm://239.255.76.67:7667?ttl=0``, ... ``memq://`` is
-                private to the connection, and used only if it is asked for by this name.
+                private to the connection.
             sense: maps of the sensor signals, each in exactly one of them.
             act: maps of the actuator signals, each in exactly one of them.
             commands: maps of those commands u that come over LCM.
-            reported: by actuator signal, the name under which a map of ``sense`` carries the command that the machine
-                says acts on it; such a value is no sensor signal.
-            watch: whether to listen to the own command channels for foreign publishers. Left out: on every bus that
-                others can be on.
-            on_alarm: called, in `poll`, with channel and bytes of a foreign message.
+            reported: by actuator signal, the name under which a map of ``sense`` carries the actuator command that the
+                machine says it executes.
+            watch: whether to listen on the actuator channels for other publishers. By default on every bus that others
+                can be on.
+            on_foreign: called, in `poll`, with channel and bytes of a message of another publisher.
             reorder_window: in seconds, see above.
             connect_timeout: seconds that `open` waits for a hub.
-            burst: the most messages that one `poll` takes in.
+            burst: the most messages that one `poll` receives.
 
         Raises:
-            ValueError: a signal has no map or several, a map names a signal that is not there or does not fit its
+            ValueError: a signal has no map or several, a map names a signal that does not exist or does not fit its
                 message type, or two maps have one channel.
         """
         if "://" not in url:
@@ -91,41 +101,37 @@ class LcmBridge(Bridge):
         # Never goes back, unlike the time of day that it starts from.
         self._time_of_day = time.time() - time.monotonic()
 
-        _check_channels([*sense, *commands, *act])
+        carriers = reported_signals(interface, reported or {})
+        published = [*interface.sense, *carriers.values()]
+        _check_maps(sense, act, commands, published, interface)
         self.channels = {name: map.channel for map in sense for name in map.signals}
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
-        self.commanded: dict[str, ReceivedSignal] = {}
-        self.sent = {signal.name: SentSignal() for signal in interface.act}
-        _check_complete(interface.act, act, "actuator")
-        carriers = reported_signals(interface, reported or {})
         self.reported = {name: ReceivedSignal() for name in carriers}
-        heard = [*interface.sense, *carriers.values()]
-        _check_complete(heard, sense, "sensor")
-        receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
-        self._inlets = [ChannelReader(map, _signals(heard, map, "sensor"), receptions, reorder_window) for map in sense]
-        _check_unique(commands)
-        for map in commands:
-            signals = _signals(interface.commands, map, "command")
-            self.commanded |= {signal.name: ReceivedSignal() for signal in signals}
-            self._inlets.append(ChannelReader(map, signals, self.commanded, reorder_window))
-        self._outlets = [ChannelWriter(map, _signals(interface.act, map, "actuator"), self.sent) for map in act]
-        if watch is None:
-            watch = not url.startswith(_PRIVATE)
-        self._watches = {map.channel: CommandWatch(on_alarm) for map in act} if watch else {}
-        handlers: dict[str, Handler] = {inlet.channel: self._tapped(inlet) for inlet in self._inlets}
-        handlers |= {channel: watch.take for channel, watch in self._watches.items()}
-        self._ownership = Ownership([map.channel for map in act], lambda: self._link.name)
+        self.commanded = {name: ReceivedSignal() for map in commands for name in map.signals}
+        self.sent = {signal.name: SentSignal() for signal in interface.act}
+        received = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
+        self._readers = [ChannelReader(map, _signals(published, map), received, reorder_window) for map in sense]
+        self._readers += [
+            ChannelReader(map, _signals(interface.commands, map), self.commanded, reorder_window) for map in commands
+        ]
+        self._writers = [ChannelWriter(map, _signals(interface.act, map), self.sent) for map in act]
+
+        self._watch = not url.startswith(_PRIVATE) if watch is None else watch
+        self._foreign = ForeignCommands([map.channel for map in act], lambda: self._link.name, on_foreign)
+        handlers: dict[str, Handler] = {reader.channel: self._tapped(reader) for reader in self._readers}
+        if self._watch:
+            handlers |= {map.channel: self._foreign.take for map in act}
         if url.startswith(_HUB):
-            handlers[STATUS_CHANNEL] = self._ownership.take
+            handlers[STATUS_CHANNEL] = self._foreign.take_status
         self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
 
     @property
-    def alarms(self) -> dict[str, int]:
-        return {channel: watch.alarms for channel, watch in self._watches.items()}
+    def foreign_messages(self) -> dict[str, int]:
+        return dict(self._foreign.heard) if self._watch else {}
 
     @property
     def clock_jumps(self) -> dict[str, int]:
-        return {inlet.channel: inlet.clock_jumps for inlet in self._inlets}
+        return {reader.channel: reader.clock_jumps for reader in self._readers}
 
     @property
     def losses(self) -> int:
@@ -141,20 +147,17 @@ class LcmBridge(Bridge):
 
     @property
     def hindrance(self) -> str | None:
-        if not self._ownership.foreign:
+        if not self._foreign.blocked:
             return None
-        return f"the hub protects {', '.join(sorted(self._ownership.foreign))} for somebody else"
+        return f"the hub protects {', '.join(sorted(self._foreign.blocked))} for somebody else"
 
     @property
     def foreign(self) -> int:
-        return sum(watch.alarms for watch in self._watches.values()) + self._ownership.attempts
+        return sum(self._foreign.heard.values()) + self._foreign.refused
 
     @property
     def contention(self) -> str | None:
-        # Of a channel that a hub protects, the hub tells who may command; see `hindrance`.
-        since = time.monotonic() - CONTENTION
-        found = {c for c, watch in self._watches.items() if watch.last > since} - self._ownership.protected
-        found.update(self._ownership.contended(CONTENTION))
+        found = self._foreign.recent(FOREIGN_TIMEOUT)
         if not found:
             return None
         return f"somebody else publishes commands on {', '.join(sorted(found))}: only one may command a machine"
@@ -168,79 +171,336 @@ class LcmBridge(Bridge):
     def poll(self, timeout: float = 0.0) -> int:
         return self._link.take(timeout, self._burst)
 
-    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
-        """
+    def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
+        """Send actuator commands.
+
+        Args:
+            actuation: actuator commands by signal.
+
+        Returns:
+            The signals whose actuator commands were not sent, or do not pass the hub.
+
         Raises:
             ValueError: there is no such actuator signal.
         """
-        for name in commands:
+        for name in actuation:
             if name not in self.sent:
                 raise ValueError(f"there is no actuator signal {name}; there are {', '.join(self.sent)}")
         self._utime = utime = max(self._utime + 1, int((self._time_of_day + time.monotonic()) * 1e6))
-        leaving = [(outlet, data) for outlet in self._outlets if (data := outlet.message(commands, utime)) is not None]
-        if not leaving:
-            return tuple(commands)
-        if self._watches:
-            for outlet, data in leaving:
-                self._watches[outlet.channel].expect(data)
-        left = self._link.publish(*[(outlet.channel, data) for outlet, data in leaving])
-        gone: set[str] = set()
-        for outlet, data in leaving:
-            # What is refused has left all the same: the hub lets it pass as soon as the channel is free.
-            refused = "refused" if outlet.channel in self._ownership.foreign else ""
-            problem = refused if left else "no bus"
-            outlet.count(problem)
+        messages = [
+            (writer, data) for writer in self._writers if (data := writer.message(actuation, utime)) is not None
+        ]
+        if not messages:
+            return tuple(actuation)
+        if self._watch:
+            for writer, data in messages:
+                self._foreign.expect(writer.channel, data)
+        sent = self._link.publish(*[(writer.channel, data) for writer, data in messages])
+        passed: set[str] = set()
+        for writer, data in messages:
+            # A refused message was sent all the same: the hub lets it pass as soon as the channel is free.
+            refused = "refused" if writer.channel in self._foreign.blocked else ""
+            problem = refused if sent else "no bus"
+            writer.count(problem)
             if not problem:
-                gone.update(outlet.named)
-            if left and self.tap is not None:
-                self.tap(outlet.channel, data)
-        return () if len(gone) == len(commands) else tuple(name for name in commands if name not in gone)
+                passed.update(writer.named)
+            if sent and self.tap is not None:
+                self.tap(writer.channel, data)
+        return () if len(passed) == len(actuation) else tuple(name for name in actuation if name not in passed)
 
-    def _tapped(self, inlet: ChannelReader) -> Handler:
+    def _tapped(self, reader: ChannelReader) -> Handler:
         def take(channel: str, data: bytes) -> None:
             if self.tap is not None:
                 self.tap(channel, data)
-            inlet.take(channel, data)
+            reader.take(channel, data)
 
         return take
 
     def take_over(self) -> None:
-        """Asks a hub for the command channels that it protects; it grants those whose owner has fallen silent.
+        """Ask a hub for the actuator channels that it protects; it grants those whose owner has fallen silent.
 
         Raises:
             ValueError: the bus has no hub.
         """
         if not self.url.startswith(_HUB):
             raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to take over")
-        self._link.publish(*[(TAKE_PREFIX + outlet.channel, b"") for outlet in self._outlets])
+        self._link.publish(*[(TAKE_PREFIX + writer.channel, b"") for writer in self._writers])
 
 
-def _signals(signals: Sequence[Signal], map: LcmMap, kind: str) -> list[Signal]:
+class ChannelReader:
+    """Checks the messages of one channel and updates its signals; `LcmBridge` tells the rules.
+
+    Attributes:
+        channel: name of the channel.
+        clock_jumps: how often the sender's time jumped, back or ahead, and was accepted.
+    """
+
+    def __init__(
+        self, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal], reorder_window: float
+    ) -> None:
+        """Prepare the decoder.
+
+        Args:
+            map: the map of the channel.
+            signals: the signals of the map, in its order.
+            received: what to update, by signal.
+            reorder_window: in seconds, see `LcmBridge`.
+
+        Raises:
+            ValueError: the map cannot carry the signals.
+        """
+        self.channel = map.channel
+        self.clock_jumps = 0
+        self._decode = map.decoder(signals)
+        self._signals = [(signal.name, received[signal.name], Range(signal)) for signal in signals]
+        for _, received_signal, range in self._signals:
+            received_signal.range = range
+        self._reorder_window = reorder_window
+        self._last = -inf  # time of the sender in the last accepted message
+        self._ahead = inf  # by how much it was ahead of ours
+        self._unfit_since = inf  # when the first message since then came that does not continue the sender's time
+
+    def take(self, channel: str, data: bytes) -> None:
+        """Handle one message."""
+        now = time.monotonic()
+        try:
+            sent, values = self._decode(data)
+            fits = self._last < sent <= now + self._ahead + MAX_AHEAD
+            reason = "" if fits else self._order(sent, now)
+        except MalformedError as error:
+            reason = error.reason
+        except (Exception, SystemExit):  # a failed assertion in Drake's C++ is a SystemExit
+            reason = "decode"
+        if reason:
+            for _, received, _ in self._signals:
+                received.reject(reason)
+            return
+        accepted = False
+        for name, received, range in self._signals:
+            if reason := range.check(values[name]) if name in values else "missing":
+                received.reject(reason)
+            else:
+                received.accept(values[name], now, sent)
+                accepted = True
+        if accepted and isfinite(sent):
+            self.clock_jumps += not fits
+            self._last, self._ahead, self._unfit_since = sent, sent - now, inf
+
+    def _order(self, sent: float, now: float) -> str:
+        """Return why a message that does not continue the sender's time is rejected; empty if it is accepted."""
+        if not isfinite(sent):
+            return ""
+        if sent == self._last:
+            return "duplicate"
+        self._unfit_since = min(self._unfit_since, now)
+        if now - self._unfit_since > self._reorder_window:
+            return ""
+        return "out of order" if sent < self._last else "ahead of time"
+
+
+@dataclass
+class SentSignal:
+    """The record of one actuator signal.
+
+    Attributes:
+        count: how many actuator commands were sent.
+        withheld: how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its
+            message needs another signal), ``companion`` (another signal of its message was at fault), ``encode``,
+            ``no bus`` (lost, or it takes nothing at present), ``refused`` (the hub protects the channel for somebody
+            else; counted from when the hub has said so).
+    """
+
+    count: int = 0
+    withheld: dict[str, int] = field(default_factory=dict)
+
+    def withhold(self, reason: str) -> None:
+        """Count an actuator command that was not sent."""
+        self.withheld[reason] = self.withheld.get(reason, 0) + 1
+
+
+class ChannelWriter:
+    """Makes the messages of one channel.
+
+    Attributes:
+        channel: name of the channel.
+        named: the signals of the last message.
+    """
+
+    def __init__(self, map: LcmMap, signals: Sequence[Signal], sent: Mapping[str, SentSignal]) -> None:
+        """Prepare the encoder.
+
+        Args:
+            map: the map of the channel.
+            signals: the signals of the map, in its order.
+            sent: what to count in, by signal.
+
+        Raises:
+            ValueError: the map cannot carry the signals.
+        """
+        self.channel = map.channel
+        self.named: list[str] = []
+        self._encode = map.encoder(signals)
+        self._ranges = {signal.name: Range(signal) for signal in signals}
+        self._sent = sent
+
+    def message(self, actuation: Mapping[str, Any], utime: int) -> bytes | None:
+        """Return the message with this channel's actuator commands; None if there are none, or one must not be sent."""
+        values, faults = {}, {}
+        for name, range in self._ranges.items():
+            if name in actuation:
+                values[name] = actuation[name]
+                if reason := range.check(values[name]):
+                    faults[name] = reason
+        self.named = list(values)
+        if not values:
+            return None
+        if not faults:
+            try:
+                return self._encode(values, utime)
+            except LookupError:
+                faults = dict.fromkeys(values, "incomplete")
+            except (Exception, SystemExit):
+                faults = dict.fromkeys(values, "encode")
+        for name in values:
+            self._sent[name].withhold(faults.get(name, "companion"))
+        return None
+
+    def count(self, problem: str) -> None:
+        """Count the last message as sent, or as withheld because of the problem."""
+        for name in self.named:
+            if problem:
+                self._sent[name].withhold(problem)
+            else:
+                self._sent[name].count += 1
+
+
+class ForeignCommands:
+    """Detects other publishers on the actuator channels: their messages, and what a hub tells of protected channels.
+
+    Our own messages come back, too, in any order: they are recognized by their bytes, which the time stamp makes
+    unique. A copy of one is foreign. A protected channel lets only its owner's messages pass.
+
+    Attributes:
+        heard: by channel, how many messages of others were heard.
+        refused: how many messages of others a hub has refused on channels that are ours.
+        blocked: the channels that a hub protects for somebody else; it says so within 10 ms of the first refusal.
+    """
+
+    _MEMORY = 4096  # own messages on their way per channel: some seconds of a hub that stands still
+
+    def __init__(
+        self,
+        channels: Sequence[str],
+        name: Callable[[], str | None],
+        on_foreign: Callable[[str, bytes], None] | None = None,
+    ) -> None:
+        """Start with nothing heard.
+
+        Args:
+            channels: the actuator channels.
+            name: returns under which name the hub knows our connection at present.
+            on_foreign: called with channel and bytes of a foreign message.
+        """
+        self.heard = dict.fromkeys(channels, 0)
+        self.refused = 0
+        self.blocked: frozenset[str] = frozenset()
+        self._name = name
+        self._on_foreign = on_foreign
+        self._protected: frozenset[str] = frozenset()
+        # By channel and message, how often it was sent and has not come back; the oldest first.
+        self._own: dict[str, dict[bytes, int]] = {channel: {} for channel in channels}
+        self._heard_at: dict[str, float] = {}
+        self._refused_at: dict[str, float] = {}
+        self._refusals: dict[str, int] = {}  # of the hub so far, by channel
+
+    def expect(self, channel: str, data: bytes) -> None:
+        """Remember a message that is about to be sent."""
+        own = self._own[channel]
+        own[data] = own.pop(data, 0) + 1
+        if len(own) > self._MEMORY:
+            del own[next(iter(own))]
+
+    def take(self, channel: str, data: bytes) -> None:
+        """Handle a message that came on an actuator channel."""
+        own = self._own[channel]
+        if (left := own.pop(data, 0)) > 0:
+            if left > 1:
+                own[data] = left - 1
+            return
+        self.heard[channel] += 1
+        self._heard_at[channel] = time.monotonic()
+        if self._on_foreign is None:
+            return
+        try:
+            self._on_foreign(channel, data)
+        except Exception:
+            _log.exception("on_foreign raised an exception and is not called any more")
+            self._on_foreign = None
+
+    def take_status(self, _: str, data: bytes) -> None:
+        """Handle a message of the hub's status channel."""
+        try:
+            status = HubStatistics.from_json(data).protected
+        except (ValueError, TypeError, KeyError, AttributeError):
+            _log.warning("a message on the hub's status channel is no status: %r", data[:100])
+            return
+        ours, blocked = self._name(), set()
+        self._protected = frozenset(status.keys() & self.heard.keys())
+        for channel in self._protected:
+            state = status[channel]
+            if state.owner is not None and state.owner != ours:
+                blocked.add(channel)
+                if channel not in self.blocked:
+                    _log.error("commands on %s are refused by the hub: the channel belongs to %s", channel, state.owner)
+            # Refusals before the first status are not counted.
+            before = self._refusals.get(channel, state.refused)
+            self._refusals[channel] = state.refused
+            if ours is not None and state.owner == ours != state.last_refused and state.refused > before:
+                self.refused += state.refused - before
+                self._refused_at[channel] = time.monotonic()
+        self.blocked = frozenset(blocked)
+
+    def recent(self, seconds: float) -> set[str]:
+        """Return the channels on which somebody else has published within the last seconds.
+
+        For a protected channel that means that somebody else was refused there while it was ours.
+        """
+        since = time.monotonic() - seconds
+        heard = {channel for channel, at in self._heard_at.items() if at > since}
+        return heard - self._protected | {channel for channel, at in self._refused_at.items() if at > since}
+
+
+def _signals(signals: Sequence[Signal], map: LcmMap) -> list[Signal]:
     known = {signal.name: signal for signal in signals}
-    for name in map.signals:
-        if name not in known:
-            there = ", ".join(known) or "none"
-            raise ValueError(f"channel {map.channel} carries {name}, which is no {kind} signal; there are: {there}")
     return [known[name] for name in map.signals]
 
 
-def _check_complete(signals: Sequence[Signal], maps: Sequence[LcmMap], kind: str) -> None:
-    for signal in signals:
-        channels = [map.channel for map in maps if signal.name in map.signals]
-        if len(channels) != 1:
-            found = f"several: {', '.join(channels)}" if channels else "none"
-            raise ValueError(f"{kind} signal {signal.name} needs a map to one LCM channel, it has {found}")
-
-
-def _check_unique(maps: Sequence[LcmMap]) -> None:
-    names = [name for map in maps for name in map.signals]
-    twins = sorted({name for name in names if names.count(name) > 1})
-    if twins:
-        raise ValueError(f"a command comes over one LCM channel, but these over several: {', '.join(twins)}")
-
-
-def _check_channels(maps: Sequence[LcmMap]) -> None:
-    channels = [map.channel for map in maps]
-    twins = sorted({channel for channel in channels if channels.count(channel) > 1})
-    if twins:
+def _check_maps(
+    sense: Sequence[LcmMap],
+    act: Sequence[LcmMap],
+    commands: Sequence[LcmMap],
+    published: Sequence[Signal],
+    interface: Interface,
+) -> None:
+    """Raise ValueError if the maps do not fit the signals; ``published`` are those that the machine publishes."""
+    channels = [map.channel for map in [*sense, *commands, *act]]
+    if twins := sorted({channel for channel in channels if channels.count(channel) > 1}):
         raise ValueError(f"a channel has one map with all its signals, but these have several: {', '.join(twins)}")
+    for kind, maps, signals in (
+        ("sensor", sense, published),
+        ("actuator", act, interface.act),
+        ("command", commands, interface.commands),
+    ):
+        carriers: dict[str, list[str]] = {signal.name: [] for signal in signals}
+        for map in maps:
+            for name in map.signals:
+                if name not in carriers:
+                    raise ValueError(
+                        f"channel {map.channel} carries {name}, which is no {kind} signal; there are: "
+                        f"{', '.join(carriers) or 'none'}"
+                    )
+                carriers[name].append(map.channel)
+        for name, found in carriers.items():
+            if len(found) > 1 or (not found and kind != "command"):
+                several = f"several: {', '.join(found)}" if found else "none"
+                raise ValueError(f"{kind} signal {name} needs a map to one LCM channel, it has {several}")

@@ -1,17 +1,22 @@
-"""Connections to an LCM bus, which tell when they are lost."""
+"""Connections to an LCM bus that never block, and a link that restores them."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import socket
 import struct
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from urllib.parse import urlsplit
 
 import lcm
 
+from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.hub.reader import TcpqReader, publish_record
 from vtbdrake.lcm.hub.tcpq import (
     MAGIC_CLIENT,
@@ -35,19 +40,22 @@ _WORDS = struct.Struct(">II")
 _SO_TIMESTAMPNS = 35  # <asm-generic/socket.h>; the type of the control message, too
 _TIMESPEC = struct.Struct("@ll")
 
+FIRST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
+"""Seconds between attempts to connect again; each pause is twice the one before."""
 
-class RefusedError(ConnectionRefusedError):
-    """There is a hub, which does not let this client in, and says why."""
+
+class RejectedError(ConnectionRefusedError):
+    """The hub rejects this client, for the reason in the message."""
 
 
 class Connection(ABC):
-    """One connection. Its calls do not wait. After an OSError it is of no use any more.
+    """One connection, whose calls do not wait. It is of no use after an OSError.
 
     Attributes:
-        name: under which a hub knows it; None where there is no hub.
-        arrived: when the message that is handed on had arrived at this computer, by `time.monotonic`; if it was to be
-            stamped and can be, else None.
-        pending: whether the rest of what was published waits for room; `take` sends it.
+        name: the client's name at the hub; None without a hub.
+        arrived: when the last received message arrived at this computer, by `time.monotonic`; None unless the kernel
+            stamps messages.
+        pending: whether the rest of what was published waits to be sent; `take` sends it.
     """
 
     name: str | None = None
@@ -56,11 +64,11 @@ class Connection(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """What becomes readable when messages arrive."""
+        """Return the file descriptor that becomes readable when messages arrive."""
 
     @abstractmethod
     def take(self, limit: int) -> int:
-        """Hands up to ``limit`` messages that have arrived to their handlers; says how many.
+        """Pass up to ``limit`` messages that have arrived to their handlers, and return how many.
 
         Raises:
             OSError: the connection is lost.
@@ -68,7 +76,7 @@ class Connection(ABC):
 
     @abstractmethod
     def publish(self, messages: Sequence[tuple[str, bytes]]) -> None:
-        """Publishes messages, each a channel and its bytes.
+        """Publish messages, each a channel and its bytes.
 
         Raises:
             BlockingIOError: the bus takes nothing at present; the messages are dropped.
@@ -76,14 +84,18 @@ class Connection(ABC):
         """
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the connection."""
 
 
 def connect(url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> Connection:
-    """A connection to the bus at ``url``, subscribed to the channels of ``handlers``.
+    """Connect to a bus and subscribe to channels.
 
     Args:
-        stamped: whether the kernel is to stamp what arrives; it does for tcpq, by TCP.
+        url: the LCM URL of the bus.
+        handlers: by channel, what takes its messages.
+        timeout: seconds to wait for a hub.
+        stamped: whether the kernel shall stamp what arrives; it does so for tcpq, over TCP.
 
     Raises:
         OSError: there is no bus.
@@ -94,7 +106,7 @@ def connect(url: str, handlers: Mapping[str, Handler], timeout: float, *, stampe
 
 
 class LibraryConnection(Connection):
-    """By liblcm: udpm, mpudpm, memq, file."""
+    """A connection by liblcm: udpm, mpudpm, memq, file."""
 
     def __init__(self, url: str, handlers: Mapping[str, Handler]) -> None:
         try:
@@ -123,11 +135,11 @@ class LibraryConnection(Connection):
 
 
 class TcpqConnection(Connection):
-    """To a tcpq hub, by a socket of its own that is never waited for: the hub's shortcut if there is one, or TCP.
+    """A connection to a tcpq hub: by the hub's shortcut if there is one, else by TCP.
 
-    liblcm's client writes a message in five sends, waits inside of a message for as long as the hub does, connects anew
-    (and waits again) in whatever call comes after a loss, even in the destructor, and believes any length that it is
-    told.
+    liblcm's client is not used because it blocks: it sends a message in five parts, waits in the middle of a message
+    for as long as the hub does, and reconnects (and waits) in any call after a loss, even in its destructor. It also
+    believes any length that it is told.
     """
 
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
@@ -135,8 +147,14 @@ class TcpqConnection(Connection):
         # The hub's greeting is read below; what follows has the form of a client's records.
         self._reader = TcpqReader(max_message=_LONGEST_MESSAGE, greeted=True)
         self._unsent = b""
-        self._socket = _open(tcpq_address(url), timeout, stamped=stamped)
+        self._stamped = stamped
+        # The kernel does not stamp what comes by a Unix socket.
+        shortcut = None if stamped else connect_shortcut(*tcpq_address(url))
+        self._socket = shortcut or socket.create_connection(tcpq_address(url), timeout)
         try:
+            if shortcut is None:
+                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.settimeout(timeout)
             self.name = address_name(self._socket.getsockname())
             self._greet()
             for channel in handlers:
@@ -148,14 +166,13 @@ class TcpqConnection(Connection):
         except OSError:
             self._socket.close()
             raise
-        self._stamped = stamped
 
     def _greet(self) -> None:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # Who is not let in may be told before that.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # A rejection may have been sent before.
             self._socket.sendall(_WORDS.pack(MAGIC_CLIENT, VERSION))
         magic, size = _WORDS.unpack(self._receive_exactly(_WORDS.size))
         if magic == MAGIC_REJECTION:
-            raise RefusedError(self._receive_exactly(min(size, MAX_REJECTION)).decode(errors="replace"))
+            raise RejectedError(self._receive_exactly(min(size, MAX_REJECTION)).decode(errors="replace"))
         if magic != MAGIC_SERVER:
             raise ConnectionError("what listens there is no tcpq hub")
 
@@ -177,17 +194,16 @@ class TcpqConnection(Connection):
                 self._send(self._unsent)
         count = self._dispatch(limit) if self._reader.partial else 0
         size = _RECEIVE
-        while count < limit and size == _RECEIVE:  # a smaller piece was all that there was
+        while count < limit and size == _RECEIVE:  # after a smaller piece, nothing is left
             size = self._receive_stamped() if self._stamped else self._reader.receive(self._socket.fileno(), _RECEIVE)
-            if size <= 0:
-                if size < 0:
-                    break
+            if size == 0:
                 raise ConnectionResetError("the hub closed the connection")
-            count += self._dispatch(limit - count)
+            if size > 0:
+                count += self._dispatch(limit - count)
         return count
 
     def _receive_stamped(self) -> int:
-        """As `TcpqReader.receive`; `arrived` is then the time of the last byte that came."""
+        """Receive as `TcpqReader.receive` does, and set `arrived` to the time of the last byte."""
         try:
             chunk, ancillary, _, _ = self._socket.recvmsg(_RECEIVE, socket.CMSG_SPACE(_TIMESPEC.size))
         except BlockingIOError:
@@ -201,13 +217,13 @@ class TcpqConnection(Connection):
         return len(chunk)
 
     def _dispatch(self, limit: int) -> int:
-        publication, handlers, count = self._reader.next_publication, self._handlers, 0
+        next_publication, handlers, count = self._reader.next_publication, self._handlers, 0
         try:
-            while count < limit and (come := publication()) is not None:
+            while count < limit and (publication := next_publication()) is not None:
                 count += 1
-                if come[0] in handlers:
-                    channel, handler = handlers[come[0]]
-                    handler(channel, come[1])
+                if publication[0] in handlers:
+                    channel, handler = handlers[publication[0]]
+                    handler(channel, publication[1])
         except TcpqError as error:
             raise ConnectionError(f"the hub violates the protocol: {error}") from None
         return count
@@ -216,9 +232,8 @@ class TcpqConnection(Connection):
         if self.pending:
             self._send(self._unsent)
             if self.pending:
-                raise BlockingIOError("an earlier message is still on its way")
-        records = [publish_record(channel.encode(), data) for channel, data in messages]
-        self._send(records[0] if len(records) == 1 else b"".join(records))
+                raise BlockingIOError("an earlier message is not sent completely yet")
+        self._send(b"".join([publish_record(channel.encode(), data) for channel, data in messages]))
 
     def _send(self, records: bytes) -> None:
         sent = self._socket.send(records)
@@ -229,19 +244,8 @@ class TcpqConnection(Connection):
         self._socket.close()
 
 
-def _open(address: tuple[str, int], timeout: float, *, stamped: bool) -> socket.socket:
-    """A connection to the hub, with a time-out, until it is told otherwise."""
-    # The kernel does not stamp what comes by a Unix socket.
-    sock = None if stamped else connect_shortcut(*address)
-    if sock is None:
-        sock = socket.create_connection(address, timeout)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.settimeout(timeout)
-    return sock
-
-
 def tcpq_address(url: str) -> tuple[str, int]:
-    """Host and port of ``tcpq://host:port``; both may be left out.
+    """Return host and port of ``tcpq://host:port``, with defaults for what is left out.
 
     Raises:
         ValueError: the port is no number.
@@ -251,5 +255,178 @@ def tcpq_address(url: str) -> tuple[str, int]:
 
 
 def _literally(channel: str) -> str:
-    """A subscription is a regular expression; this one means the channel's name only."""
+    """Return the regular expression that matches this channel only."""
     return "".join(f"\\{c}" if c in r".^$*+?()[]{}|" + "\\" else c for c in channel)
+
+
+class _Search(threading.Thread):
+    """Tries to connect until it succeeds or is cancelled; a thread of its own, because connecting may take long."""
+
+    def __init__(self, connect: Callable[[], Connection]) -> None:
+        super().__init__(name="vtbdrake-lcm-search", daemon=True)
+        self._connect = connect
+        self._cancelled = threading.Event()
+        self._lock = threading.Lock()
+        self._found: Connection | None = None
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        # A thread inherits the scheduling of the one that starts it; this one must not compete with a real-time loop.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        pause = FIRST_PAUSE
+        while not self._cancelled.is_set():
+            try:
+                connection = self._connect()
+            except OSError:
+                self._cancelled.wait(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+                continue
+            with self._lock:
+                if self._cancelled.is_set():
+                    connection.close()
+                else:
+                    self._found = connection
+            break
+        self.ended.set()
+
+    def result(self) -> Connection | None:
+        """Return the connection, once."""
+        with self._lock:
+            found, self._found = self._found, None
+        return found
+
+    def cancel(self) -> None:
+        self._cancelled.set()
+        if (found := self.result()) is not None:
+            found.close()
+
+
+class LcmLink:
+    """Receives and publishes while there is a bus, and searches for it while there is none.
+
+    Attributes:
+        url: the LCM URL of the bus.
+        losses: how often the bus was lost.
+        reconnections: how often it was found again.
+    """
+
+    def __init__(
+        self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float, stamped: bool = False
+    ) -> None:
+        """Prepare the link; `open` connects. The arguments are those of `connect`."""
+        self.url = url
+        self.losses = 0
+        self.reconnections = 0
+        self._connect = partial(connect, url, handlers, connect_timeout, stamped=stamped)
+        self._connection: Connection | None = None
+        self._search: _Search | None = None
+
+    def open(self) -> None:
+        """Connect to the bus.
+
+        Raises:
+            BridgeError: there is no bus.
+        """
+        if self.is_open:
+            return
+        try:
+            self._connection = self._connect()
+        except RejectedError as error:
+            raise BridgeError(f"the hub at {self.url} rejects the connection: {error}") from error
+        except OSError as error:
+            remedy = "start a hub there (vtbdrake hub)" if self.url.startswith("tcpq:") else "is the URL right?"
+            if isinstance(error, TimeoutError):
+                remedy = "if a hub runs there, it is frozen; else, is the URL right?"
+            raise BridgeError(f"no LCM bus at {self.url} ({error}); {remedy}") from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has a bus or searches for it."""
+        return self._connection is not None or self._search is not None
+
+    @property
+    def connected(self) -> bool:
+        """Whether it has a bus at present."""
+        return self._current() is not None
+
+    @property
+    def name(self) -> str | None:
+        """The client's name at the hub; None without a connection or a hub."""
+        return None if self._connection is None else self._connection.name
+
+    @property
+    def arrived(self) -> float | None:
+        """When the last received message arrived; see `Connection`."""
+        return None if self._connection is None else self._connection.arrived
+
+    @property
+    def sources(self) -> list[Connection]:
+        """What becomes readable when messages arrive, for `select`; empty while there is no bus."""
+        connection = self._current()
+        return [] if connection is None else [connection]
+
+    def _current(self) -> Connection | None:
+        if self._search is not None and (found := self._search.result()) is not None:
+            self._connection, self._search = found, None
+            self.reconnections += 1
+        return self._connection
+
+    def _required(self) -> Connection | None:
+        if not self.is_open:
+            raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
+        return self._current()
+
+    def take(self, timeout: float, limit: int) -> int:
+        """Pass messages to their handlers, and return how many.
+
+        Args:
+            timeout: seconds to wait for the first message.
+            limit: the most messages that are taken.
+        """
+        connection = self._connection or self._required()
+        if connection is None:
+            if timeout > 0 and self._search is not None:
+                self._search.ended.wait(timeout)
+            return 0
+        try:
+            count = connection.take(limit)
+            end = time.monotonic() + timeout
+            while not count and timeout > 0:
+                select.select((connection,), (connection,) if connection.pending else (), (), timeout)
+                count = connection.take(limit)
+                timeout = end - time.monotonic()
+            return count
+        except OSError:
+            self._lose()
+            return 0
+
+    def publish(self, *messages: tuple[str, bytes]) -> bool:
+        """Publish messages (channel and bytes), and return whether they went to the bus."""
+        connection = self._connection or self._required()
+        if connection is None:
+            return False
+        try:
+            connection.publish(messages)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._lose()
+            return False
+        return True
+
+    def _lose(self) -> None:
+        self.losses += 1
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        self._search = _Search(self._connect)
+        self._search.start()
+
+    def close(self) -> None:
+        """Close the connection, or end the search; the link may be opened again."""
+        if self._search is not None:
+            self._search.cancel()
+            self._search = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None

@@ -1,23 +1,47 @@
-"""Ready-made maps for Drake's message types."""
+"""Ready-made maps for Drake's message types: iiwa arms, camera images and point clouds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from drake import lcmt_iiwa_command, lcmt_iiwa_status
+import numpy as np
+from drake import (
+    lcmt_iiwa_command,
+    lcmt_iiwa_status,
+    lcmt_image,
+    lcmt_image_array,
+    lcmt_point_cloud,
+    lcmt_point_cloud_field,
+)
+from pydrake.perception import PointCloud
+from pydrake.systems.sensors import (
+    ImageBgr8U,
+    ImageBgra8U,
+    ImageDepth16U,
+    ImageDepth32F,
+    ImageGrey8U,
+    ImageLabel16I,
+    ImageRgb8U,
+    ImageRgba8U,
+)
 
-from vtbdrake.lcm.vectors import VectorMap, vector_map
+from vtbdrake.lcm.maps import Decoder, LcmMap, VectorMap, decode, vector_map
+from vtbdrake.lcm.messages import MalformedError
+from vtbdrake.testbed import Signal
 
 
 def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "IIWA_STATUS") -> VectorMap:
-    """The state of an arm that speaks the iiwa messages, as the arm sends it.
+    """Return a map for the state of an arm that speaks the iiwa messages, as the arm sends it.
 
     Args:
-        fields: by signal, the field of `lcmt_iiwa_status` that it is: ``joint_position_measured``,
+        fields: by signal, the field of `lcmt_iiwa_status` that holds it: ``joint_position_measured``,
             ``joint_velocity_estimated``, ``joint_position_commanded``, ``joint_position_ipo`` in rad and rad/s;
             ``joint_torque_measured``, ``joint_torque_commanded`` (with the sign of the arm's own software, opposite to
             Drake's) and ``joint_torque_external`` in N m. A sequence, if signals and fields have the same names.
-        channel: the channel's name.
+        channel: name of the channel.
 
     Raises:
         ValueError: there is no such field.
@@ -28,13 +52,13 @@ def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "II
 def iiwa_command(
     fields: Mapping[str, str] | Sequence[str] = ("joint_position",), *, channel: str = "IIWA_COMMAND"
 ) -> VectorMap:
-    """Commands to an arm that speaks the iiwa messages.
+    """Return a map for the actuator commands to an arm that speaks the iiwa messages.
 
     Args:
-        fields: by signal, the field of `lcmt_iiwa_command` that it is: ``joint_position`` in rad, ``joint_torque`` in
-            N m. One that is not commanded is empty in the message. A sequence, if signals and fields have the same
+        fields: by signal, the field of `lcmt_iiwa_command` that holds it: ``joint_position`` in rad, ``joint_torque``
+            in N m. A field without a command is empty in the message. A sequence, if signals and fields have the same
             names.
-        channel: the channel's name.
+        channel: name of the channel.
 
     Raises:
         ValueError: there is no such field.
@@ -44,3 +68,180 @@ def iiwa_command(
 
 def _same_names(fields: Mapping[str, str] | Sequence[str]) -> Mapping[str, str]:
     return fields if isinstance(fields, Mapping) else {name: name for name in fields}
+
+
+_PIXELS = {
+    ImageBgr8U: (lcmt_image.PIXEL_FORMAT_BGR, lcmt_image.CHANNEL_TYPE_UINT8),
+    ImageBgra8U: (lcmt_image.PIXEL_FORMAT_BGRA, lcmt_image.CHANNEL_TYPE_UINT8),
+    ImageDepth16U: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_UINT16),
+    ImageDepth32F: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_FLOAT32),
+    ImageGrey8U: (lcmt_image.PIXEL_FORMAT_GRAY, lcmt_image.CHANNEL_TYPE_UINT8),
+    ImageLabel16I: (lcmt_image.PIXEL_FORMAT_LABEL, lcmt_image.CHANNEL_TYPE_INT16),
+    ImageRgb8U: (lcmt_image.PIXEL_FORMAT_RGB, lcmt_image.CHANNEL_TYPE_UINT8),
+    ImageRgba8U: (lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMap(LcmMap):
+    """An `LcmMap` that receives images; `image_map` and `image_array_map` make one. It sends none.
+
+    A signal's ``model_value`` gives pixel type, width and height. Rejected are an image of another size (``size``), of
+    another pixel type (``type``), and one that is compressed by anything but zlib (``compression``).
+
+    Attributes:
+        select: returns the `lcmt_image` of each signal from a message.
+    """
+
+    select: Callable[[Any], Mapping[str, Any]]
+
+    def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        models = {signal.name: signal.model_value for signal in signals}
+        for name, model in models.items():
+            if type(model) not in _PIXELS or not model.width() * model.height():
+                raise ValueError(
+                    f"signal {name} on channel {self.channel} needs an image of its size as model_value, such as "
+                    f"ImageRgba8U(640, 480), not {model!r}"
+                )
+
+        def decode_images(data: bytes) -> tuple[float, Mapping[str, Any]]:
+            message = decode(self.type, data)
+            images = self.select(message)
+            values = {name: _to_image(images[name], model) for name, model in models.items() if name in images}
+            return message.header.utime * 1e-6, values
+
+        return decode_images
+
+
+def image_map(channel: str, signal: str) -> ImageMap:
+    """Return a map for one camera that sends `lcmt_image` messages."""
+    return ImageMap(channel=channel, type=lcmt_image, signals=[signal], select=lambda message: {signal: message})
+
+
+def image_array_map(channel: str, frames: Mapping[str, str]) -> ImageMap:
+    """Return a map for `lcmt_image_array` messages, as Drake's `ImageToLcmImageArrayT` makes them.
+
+    Args:
+        channel: name of the channel.
+        frames: by signal, the ``frame_name`` of its image. A message need not have all of them: a signal whose image is
+            not in it counts it as ``missing``.
+    """
+
+    def select(message: Any) -> dict[str, Any]:
+        found = {image.header.frame_name: image for image in message.images}
+        return {signal: found[frame] for signal, frame in frames.items() if frame in found}
+
+    return ImageMap(channel=channel, type=lcmt_image_array, signals=tuple(frames), select=select)
+
+
+def _to_image(message: Any, model: Any) -> Any:
+    """Return the image in an `lcmt_image`, of the type and size of ``model``."""
+    image = type(model)(model.width(), model.height())
+    pixels = image.mutable_data
+    if (message.pixel_format, message.channel_type) != _PIXELS[type(model)]:
+        raise MalformedError("type")
+    if (message.width, message.height) != (image.width(), image.height()) or message.row_stride != pixels[0].nbytes:
+        raise MalformedError("size")
+    content = message.data
+    if message.compression_method == lcmt_image.COMPRESSION_METHOD_ZLIB:
+        try:
+            # Never more than the image has: a few bytes can stand for gigabytes.
+            content = zlib.decompressobj().decompress(content, pixels.nbytes + 1)
+        except zlib.error:
+            raise MalformedError("compression") from None
+    elif message.compression_method != lcmt_image.COMPRESSION_METHOD_NOT_COMPRESSED:
+        raise MalformedError("compression")
+    if len(content) != pixels.nbytes:
+        raise MalformedError("size")
+    order = ">" if message.bigendian else "<"
+    pixels[:] = np.frombuffer(content, pixels.dtype.newbyteorder(order)).reshape(pixels.shape)
+    return image
+
+
+_NUMBERS = {
+    lcmt_point_cloud_field.INT8: "i1",
+    lcmt_point_cloud_field.UINT8: "u1",
+    lcmt_point_cloud_field.INT16: "i2",
+    lcmt_point_cloud_field.UINT16: "u2",
+    lcmt_point_cloud_field.INT32: "i4",
+    lcmt_point_cloud_field.UINT32: "u4",
+    lcmt_point_cloud_field.FLOAT32: "f4",
+    lcmt_point_cloud_field.FLOAT64: "f8",
+}
+
+
+class PointCloudMap(LcmMap):
+    """An `LcmMap` that receives point clouds; `point_cloud_map` makes one. It sends none.
+
+    The signal's ``model_value`` tells which properties its clouds have: positions, normals, colours. Rejected are a
+    message that lacks one of them (``missing``), and one whose data are not as long as it says (``size``). Points may
+    be infinite or NaN: so a sensor says that it saw nothing there.
+    """
+
+    def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        (signal,) = signals
+        if not isinstance(signal.model_value, PointCloud):
+            raise ValueError(
+                f"signal {signal.name} on channel {self.channel} needs a PointCloud as model_value, not "
+                f"{signal.model_value!r}"
+            )
+
+        def decode_cloud(data: bytes) -> tuple[float, Mapping[str, Any]]:
+            message = decode(self.type, data)
+            return message.utime * 1e-6, {signal.name: _to_cloud(message, signal.model_value)}
+
+        return decode_cloud
+
+
+def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
+    """Return a map for `lcmt_point_cloud` messages, as Drake's `PointCloudToLcm` makes them."""
+    return PointCloudMap(channel=channel, type=lcmt_point_cloud, signals=[signal])
+
+
+def _to_cloud(message: Any, model: PointCloud) -> PointCloud:
+    """Return the cloud in an `lcmt_point_cloud`, with the properties of ``model``."""
+    points = _points(message)
+    cloud = PointCloud(len(points), model.fields())
+    with np.errstate(over="ignore", invalid="ignore"):  # double to single precision
+        if model.has_xyzs():
+            cloud.mutable_xyzs()[:] = [_column(points, name) for name in ("x", "y", "z")]
+        if model.has_normals():
+            cloud.mutable_normals()[:] = [_column(points, f"normal_{name}") for name in ("x", "y", "z")]
+    if model.has_rgbs():
+        # Four bytes in one number, the least significant one first: red, green, blue and nothing.
+        packed = _column(points, "rgb")
+        if packed.dtype.kind + str(packed.dtype.itemsize) != "u4":
+            raise MalformedError("type")
+        colours = packed.astype("<u4").view(np.uint8).reshape(-1, 4)
+        cloud.mutable_rgbs()[:] = colours[:, :3].T
+    return cloud
+
+
+def _points(message: Any) -> np.ndarray:
+    """Return the points as an array of records.
+
+    The announced number of points is checked against the size of the data before any memory is allocated.
+    """
+    step = message.point_step
+    if min(message.width, message.height) < 0 or step < 1 or message.row_step != message.width * step:
+        raise MalformedError("size")
+    if len(message.data) != message.height * message.row_step:
+        raise MalformedError("size")
+    order = ">" if message.flags & lcmt_point_cloud.IS_BIGENDIAN else "<"
+    fields = [field for field in message.fields if field.count == 1 and field.datatype in _NUMBERS]
+    types = [np.dtype(order + _NUMBERS[field.datatype]) for field in fields]
+    # numpy's own check of large offsets overflows, and it reads wherever they point.
+    if any(not 0 <= field.byte_offset <= step - type.itemsize for field, type in zip(fields, types, strict=True)):
+        raise MalformedError("size")
+    names, offsets = [field.name for field in fields], [field.byte_offset for field in fields]
+    try:
+        record = np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": step})
+    except ValueError:  # two fields of one name
+        raise MalformedError("type") from None
+    return np.frombuffer(message.data, record)
+
+
+def _column(points: np.ndarray, name: str) -> np.ndarray:
+    if points.dtype.names is None or name not in points.dtype.names:
+        raise MalformedError("missing")
+    return points[name]

@@ -1,32 +1,29 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from vtbdrake.control.kernels import Box, ReceivedSignal
+import numpy as np
+from numpy.typing import NDArray
+
+Fields = Sequence[tuple[str, str, Sequence[int | str]]]
+
+class MalformedError(ValueError):
+    reason: str
+    def __init__(self, reason: str) -> None: ...
 
 class MessageDecoder:
     def __init__(
-        self,
-        example: bytes,
-        *,
-        fixed: Sequence[tuple[int, int]],
-        places: Sequence[tuple[int, int, int, int, str]],
-        stamp: tuple[int, int, str] | None,
-        receptions: Sequence[ReceivedSignal],
-        sizes: Sequence[int | None],
-        lower: Sequence[float],
-        upper: Sequence[float],
+        self, fingerprint: bytes, fields: Fields, signals: Mapping[str, Sequence[str]], stamp: str = ""
     ) -> None: ...
-    def take(self, data: bytes, last: float, most: float, now: float) -> float | None: ...
+    def decode(self, data: bytes) -> tuple[float, dict[str, NDArray[np.float64]]]: ...
 
 class MessageEncoder:
     def __init__(
         self,
-        example: bytes,
+        fingerprint: bytes,
+        fields: Fields,
+        signals: Mapping[str, Sequence[str]],
+        stamp: str = "",
         *,
-        places: Sequence[tuple[int, int, int, int, str]],
-        stamp: tuple[int, int, str] | None,
-        names: Sequence[str],
-        sizes: Sequence[int | None],
-        boxes: Sequence[Box | None] | None = None,
+        example: bytes,
     ) -> None: ...
-    def fill(self, values: Mapping[str, Any], utime: int) -> bytes | None: ...
+    def encode(self, values: Mapping[str, Any], utime: int) -> bytes: ...

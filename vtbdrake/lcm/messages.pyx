@@ -1,14 +1,16 @@
-"""Compiled decoders and encoders of LCM messages that hold numbers only."""
+"""Compiled decoder and encoder of LCM messages whose signals are numbers."""
 
 from cpython.bytes cimport PyBytes_AS_STRING, PyBytes_FromStringAndSize, PyBytes_GET_SIZE
 from cpython.mem cimport PyMem_Free
 from libc.math cimport NAN, isfinite, rint
 from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint16_t, uint32_t, uint64_t
-from libc.string cimport memcmp, memcpy
+from libc.string cimport memcmp
+
+import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.control.kernels cimport Box, ReceivedSignal, entries_of, zeros
+from vtbdrake.control.kernels cimport entries_of, zeros
 from vtbdrake.lcm.byte_order cimport (
     get_double,
     get_float,
@@ -24,51 +26,244 @@ from vtbdrake.lcm.byte_order cimport (
 
 cnp.import_array()
 
+cdef dict _WIDTHS = {"d": 8, "q": 8, "f": 4, "i": 4, "h": 2, "b": 1, "?": 1, "s": 1}  # bytes, by type
 
-cdef struct Run:
-    # Numbers of one type, one after the other.
-    char code  # as `struct` calls their type
+
+class MalformedError(ValueError):
+    """A message that does not have the type of its channel; ``reason`` is one that `ReceivedSignal.rejected` counts."""
+
+    def __init__(self, reason):
+        super().__init__(reason)
+        self.reason = reason
+
+
+cdef struct Dimension:
+    int64_t size  # if it is fixed
+    Py_ssize_t field  # that holds the size; -1 if it is fixed
+
+
+cdef struct Field:
+    char code  # type as in `struct`
     Py_ssize_t width  # of a number, in bytes
-    Py_ssize_t offset  # of the first, in the message
-    Py_ssize_t count
-    Py_ssize_t vector  # whose they are
-    Py_ssize_t begin  # from which of its entries on
+    Py_ssize_t dimension, dimension_end  # its dimensions among those of the layout
+    # In the message that was located last:
+    Py_ssize_t offset  # of the first number
+    Py_ssize_t count  # of numbers
 
 
-cdef Py_ssize_t _width(char code) except -1:
-    if code == b"d" or code == b"q":
-        return 8
-    if code == b"f" or code == b"i":
-        return 4
-    if code == b"h":
-        return 2
-    if code == b"b" or code == b"?":
-        return 1
-    raise ValueError(f"there is no number of type {chr(code)!r} in a message")
+cdef class MessageLayout:
+    """The layout of a message type, which locates the numbers of each of its messages.
+
+    Args:
+        fingerprint: the first 8 bytes of every message.
+        fields: path, type and dimensions of every field in the order of encoding. Types as in `struct`; ``s`` is a
+            string. A dimension is a number or the path of an earlier integer field.
+        signals: the paths of the fields that make up each signal, by name.
+        stamp: path of the field with the sender's time in microseconds; empty if there is none.
+    """
+
+    cdef bytes fingerprint
+    cdef Py_ssize_t field_count
+    cdef Field* fields
+    cdef Dimension* dimensions
+    cdef Py_ssize_t stamp  # field; -1 if there is none
+    cdef list names  # of the signals
+    cdef Py_ssize_t part_count
+    cdef Py_ssize_t* parts  # fields of all signals, one signal after the other
+    cdef Py_ssize_t* part_ends  # by signal
+
+    def __cinit__(self, bytes fingerprint not None, fields, signals, str stamp="", **_):
+        cdef Py_ssize_t i = 0, k = 0
+        cdef dict index = {path: i for i, (path, _, _) in enumerate(fields)}
+        if len(fingerprint) != 8 or len(index) != len(fields):
+            raise ValueError("a message type has a fingerprint of 8 bytes, and fields with different paths")
+        self.fingerprint = fingerprint
+        self.field_count = len(fields)
+        self.fields = <Field*>zeros(len(fields), sizeof(Field))
+        self.dimensions = <Dimension*>zeros(sum(len(dimensions) for _, _, dimensions in fields), sizeof(Dimension))
+        for i, (_, code, dimensions) in enumerate(fields):
+            self.fields[i].code = ord(code)
+            self.fields[i].width = _WIDTHS[code]
+            self.fields[i].dimension = k
+            for dimension in dimensions:
+                self.dimensions[k].field = -1
+                if isinstance(dimension, str):
+                    length = index[dimension]
+                    if not (length < i and self.fields[length].code in b"qihb" and not fields[length][2]):
+                        raise ValueError(f"{dimension} is no length: it has to be one integer, and to come before")
+                    self.dimensions[k].field = length
+                else:
+                    self.dimensions[k].size = dimension
+                k += 1
+            self.fields[i].dimension_end = k
+        self.stamp = index[stamp] if stamp else -1
+        self.names = list(signals)
+        paths = [path for parts in signals.values() for path in parts]
+        for path in [*paths, stamp] if stamp else paths:
+            if fields[index[path]][1] == "s" or (path == stamp and fields[index[path]][2]):
+                raise ValueError(f"{path} does not hold numbers, or is a time of several numbers")
+        self.part_count = len(paths)
+        self.parts = <Py_ssize_t*>zeros(len(paths), sizeof(Py_ssize_t))
+        self.part_ends = <Py_ssize_t*>zeros(len(signals), sizeof(Py_ssize_t))
+        for i, path in enumerate(paths):
+            self.parts[i] = index[path]
+        k = 0
+        for i, name in enumerate(signals):
+            k += len(signals[name])
+            self.part_ends[i] = k
+
+    def __dealloc__(self):
+        PyMem_Free(self.fields)
+        PyMem_Free(self.dimensions)
+        PyMem_Free(self.parts)
+        PyMem_Free(self.part_ends)
+
+    cdef int locate(self, bytes data) except -1:
+        """Find each field in a message. Every byte is checked to be there before it is read."""
+        cdef const char* message = PyBytes_AS_STRING(data)
+        cdef Py_ssize_t size = PyBytes_GET_SIZE(data), offset = 8, count, i, k
+        cdef int64_t length
+        cdef Field* field
+        if size < 8:
+            raise MalformedError("truncated")
+        if memcmp(message, PyBytes_AS_STRING(self.fingerprint), 8):
+            raise MalformedError("fingerprint")
+        for i in range(self.field_count):
+            field = &self.fields[i]
+            count = 1
+            if field.code == b"s":
+                if size - offset < 4:
+                    raise MalformedError("truncated")
+                count = get_uint32(message + offset)
+                offset += 4
+            for k in range(field.dimension, field.dimension_end):
+                length = self.dimensions[k].size
+                if self.dimensions[k].field >= 0:
+                    length = _integer(message, &self.fields[self.dimensions[k].field])
+                if length < 0:
+                    raise MalformedError("size")
+                # More than the message can hold is as wrong as anything larger; so nothing overflows.
+                count = size if length and count > size // length else count * <Py_ssize_t>length
+            if count > (size - offset) // field.width:
+                raise MalformedError("truncated")
+            field.offset, field.count = offset, count
+            offset += count * field.width
+        if offset != size:
+            raise MalformedError("trailing")
+        return 0
+
+    cdef Py_ssize_t count(self, Py_ssize_t signal) noexcept:
+        """Return how many numbers the signal has in the located message."""
+        cdef Py_ssize_t k, count = 0
+        for k in range(self.part_ends[signal - 1] if signal else 0, self.part_ends[signal]):
+            count += self.fields[self.parts[k]].count
+        return count
 
 
-cdef Run* _runs(object places, Py_ssize_t size) except NULL:
-    """Of (vector, begin, offset, count, code), in a message of ``size`` bytes."""
-    cdef list checked = []
-    cdef Run run
-    cdef Run* runs
-    cdef Py_ssize_t i
-    for vector, begin, offset, count, code in places:
-        run.width = _width(ord(code))
-        if not (offset >= 0 and count >= 0 and offset + count * run.width <= size):
-            raise ValueError(f"{count} numbers from byte {offset} on are not in a message of {size} bytes")
-        checked.append((ord(code), run.width, offset, count, vector, begin))
-    runs = <Run*>zeros(len(checked), sizeof(Run))
-    for i in range(len(checked)):
-        run.code, run.width, run.offset, run.count, run.vector, run.begin = checked[i]
-        runs[i] = run
-    return runs
+cdef class MessageDecoder(MessageLayout):
+    """Decodes messages whose signals are numbers; the arguments are those of `MessageLayout`."""
+
+    def decode(self, bytes data not None):
+        """Decode one message.
+
+        Returns:
+            The sender's time in seconds (NaN if the message has none), and by signal its numbers, an array of as many
+            doubles as the message has for it.
+
+        Raises:
+            MalformedError: ``fingerprint``: the message is of another type; ``truncated``: its end is missing;
+                ``trailing``: bytes follow it; ``size``: an array has a negative length.
+        """
+        cdef const char* message = PyBytes_AS_STRING(data)
+        cdef const char* at
+        cdef double sent = NAN
+        cdef double* entry
+        cdef cnp.npy_intp count
+        cdef Py_ssize_t signal, k, n
+        cdef Field* field
+        cdef dict values = {}
+        self.locate(data)
+        if self.stamp >= 0:
+            field = &self.fields[self.stamp]
+            sent = _read(message + field.offset, field.code) * 1e-6
+        for signal in range(len(self.names)):
+            count = self.count(signal)
+            value = cnp.PyArray_SimpleNew(1, &count, cnp.NPY_DOUBLE)
+            entry = <double*>cnp.PyArray_DATA(value)
+            for k in range(self.part_ends[signal - 1] if signal else 0, self.part_ends[signal]):
+                field = &self.fields[self.parts[k]]
+                at = message + field.offset
+                for n in range(field.count):
+                    entry[0] = _read(at, field.code)
+                    entry += 1
+                    at += field.width
+            values[self.names[signal]] = value
+        return sent, values
 
 
-cdef Run* _run(object place, Py_ssize_t size) except NULL:
-    """Of a single number, as of (offset, 1, code)."""
-    offset, _, code = place
-    return _runs([(0, 0, offset, 1, code)], size)
+cdef class MessageEncoder(MessageLayout):
+    """Encodes messages that differ from an example only in their time and in the numbers of their signals.
+
+    Args:
+        example: such a message.
+        (others): those of `MessageLayout`.
+    """
+
+    cdef bytes example
+
+    def __cinit__(self, *_, bytes example not None, **__):
+        # In __cinit__, as it runs once: the fields stay where they are in this example.
+        self.locate(example)
+        self.example = example
+
+    def encode(self, values, int64_t utime):
+        """Return the message with these vectors, by signal, and this time in microseconds.
+
+        Integers are rounded, half to even.
+
+        Raises:
+            ValueError: a vector does not have as many entries as in the example.
+            OverflowError: a number does not fit into its field.
+        """
+        cdef char* message
+        cdef char* at
+        cdef double* entry
+        cdef Py_ssize_t signal, k, n
+        cdef Field* field
+        data = PyBytes_FromStringAndSize(PyBytes_AS_STRING(self.example), PyBytes_GET_SIZE(self.example))
+        message = PyBytes_AS_STRING(data)
+        if self.stamp >= 0:
+            field = &self.fields[self.stamp]
+            if field.code == b"q":
+                put_uint64(message + field.offset, <uint64_t>utime)  # exactly: not every integer is a double
+            elif not _write(message + field.offset, field.code, <double>utime):
+                raise OverflowError(f"the time {utime} us does not fit into its field")
+        for signal in range(len(self.names)):
+            value = values[self.names[signal]]
+            entry = entries_of(value, self.count(signal))
+            if entry is NULL:
+                value = np.array(value, dtype=float)
+                entry = entries_of(value, self.count(signal))
+                if entry is NULL:
+                    raise ValueError(
+                        f"{self.names[signal]} has {self.count(signal)} entries in this message, not shape {value.shape}"
+                    )
+            for k in range(self.part_ends[signal - 1] if signal else 0, self.part_ends[signal]):
+                field = &self.fields[self.parts[k]]
+                at = message + field.offset
+                for n in range(field.count):
+                    if not _write(at, field.code, entry[0]):
+                        raise OverflowError(f"{entry[0]} of {self.names[signal]} does not fit into its field")
+                    entry += 1
+                    at += field.width
+        return data
+
+
+cdef inline int64_t _integer(const char* message, const Field* field) noexcept:
+    cdef const char* at = message + field.offset
+    if field.code == b"q":
+        return <int64_t>get_uint64(at)
+    return <int64_t>_read(at, field.code)
 
 
 cdef inline double _read(const char* at, char code) noexcept:
@@ -88,7 +283,7 @@ cdef inline double _read(const char* at, char code) noexcept:
 
 
 cdef inline bint _write(char* at, char code, double number) noexcept:
-    """Whether it could be written: integers are rounded (half to even), and must fit."""
+    """Write a number unless it does not fit; integers are rounded, half to even."""
     if code == b"d":
         put_double(at, number)
         return True
@@ -99,7 +294,7 @@ cdef inline bint _write(char* at, char code, double number) noexcept:
         return True
     number = rint(number)
     if code == b"q":
-        if not -9.2e18 < number < 9.2e18:
+        if not -9223372036854775808.0 <= number < 9223372036854775808.0:
             return False
         put_uint64(at, <uint64_t><int64_t>number)
     elif code == b"i":
@@ -118,193 +313,4 @@ cdef inline bint _write(char* at, char code, double number) noexcept:
         return False
     else:
         at[0] = number != 0.0
-    return True
-
-
-cdef class MessageDecoder:
-    """Takes in those messages of a channel that are laid out like an example.
-
-    Args:
-        example: of such a message.
-        fixed: offset and size of the bytes that all such messages have in common.
-        places: where the vectors' entries are, in their order: (vector, its entry, offset, number of entries, type as
-            `struct` calls it).
-        stamp: offset, number (1) and type of the sender's time in microseconds; None if there is none.
-        receptions: of the signals, which are vectors.
-        sizes: theirs.
-        lower, upper: limits of all entries.
-    """
-
-    cdef bytes example
-    cdef Run* fixed
-    cdef Py_ssize_t fixed_count
-    cdef Run* runs
-    cdef Py_ssize_t run_count
-    cdef Run* stamp
-    cdef list receptions
-    cdef Py_ssize_t* sizes
-    cdef double* numbers
-    cdef Box box
-
-    def __cinit__(self, bytes example, *, fixed, places, stamp, receptions, sizes, lower, upper):
-        cdef Py_ssize_t i, size = len(example)
-        if not (
-            sum(place[3] for place in places) == sum(sizes) == len(lower) == len(upper)
-            and len(sizes) == len(receptions)
-            and min(sizes, default=0) >= 0
-        ):
-            raise ValueError("the message has other numbers than the signals")
-        self.example = example
-        self.fixed = _runs([(0, 0, offset, count, "b") for offset, count in fixed], size)
-        self.fixed_count = len(fixed)
-        self.runs = _runs(places, size)
-        self.run_count = len(places)
-        self.stamp = _run(stamp, size) if stamp is not None else NULL
-        self.receptions = [<ReceivedSignal?>reception for reception in receptions]
-        self.sizes = <Py_ssize_t*>zeros(len(sizes), sizeof(Py_ssize_t))
-        for i in range(len(sizes)):
-            self.sizes[i] = sizes[i]
-        self.numbers = <double*>zeros(sum(sizes), sizeof(double))
-        self.box = Box(lower, upper)
-
-    def __dealloc__(self):
-        PyMem_Free(self.fixed)
-        PyMem_Free(self.runs)
-        PyMem_Free(self.stamp)
-        PyMem_Free(self.sizes)
-        PyMem_Free(self.numbers)
-
-    def take(self, bytes data not None, double last, double most, double now):
-        """Tells the receptions of a message that came at the time ``now``.
-
-        Returns:
-            The sender's time in seconds, NaN if there is none. None if nothing was done: the message is laid out in
-            another way, its time is not above ``last`` or above ``most``, or an entry is not within its limits.
-        """
-        cdef const char* message = PyBytes_AS_STRING(data)
-        cdef const char* example = PyBytes_AS_STRING(self.example)
-        cdef const char* at
-        cdef double* number = self.numbers
-        cdef double sent = NAN
-        cdef Run* run
-        cdef ReceivedSignal reception
-        cdef cnp.npy_intp size
-        cdef Py_ssize_t i, k
-        if PyBytes_GET_SIZE(data) != PyBytes_GET_SIZE(self.example):
-            return None
-        for i in range(self.fixed_count):
-            run = &self.fixed[i]
-            if memcmp(message + run.offset, example + run.offset, run.count):
-                return None
-        if self.stamp is not NULL:
-            sent = _read(message + self.stamp.offset, self.stamp.code) * 1e-6
-            if not last < sent <= most:
-                return None
-        for i in range(self.run_count):
-            run = &self.runs[i]
-            at = message + run.offset
-            for k in range(run.count):
-                number[0] = _read(at, run.code)
-                number += 1
-                at += run.width
-        if not self.box.holds(self.numbers):
-            return None
-        number = self.numbers
-        for i in range(len(self.receptions)):
-            reception = <ReceivedSignal>self.receptions[i]
-            size = self.sizes[i]
-            value = cnp.PyArray_SimpleNew(1, &size, cnp.NPY_DOUBLE)
-            memcpy(cnp.PyArray_DATA(value), number, size * sizeof(double))
-            number += size
-            reception.accept(value, now, sent)
-        return sent
-
-
-cdef class MessageEncoder:
-    """Writes messages that differ from an example only by the time and by entries of vectors.
-
-    Args:
-        example: of such a message.
-        places, stamp: as of `MessageDecoder`.
-        names: of the vectors.
-        sizes: theirs.
-        boxes: of those that have limits; by default of none.
-    """
-
-    cdef bytes example
-    cdef Run* runs
-    cdef Py_ssize_t run_count
-    cdef Run* stamp
-    cdef list names
-    cdef list boxes
-    cdef Py_ssize_t* sizes
-    cdef double** vectors
-
-    def __cinit__(self, bytes example, *, places, stamp, names, sizes, boxes=None):
-        cdef Py_ssize_t i
-        if not len(names) == len(sizes) == (len(names) if boxes is None else len(boxes)):
-            raise ValueError(f"{len(names)} vectors have a size each, and a box each if any has one")
-        self.example = example
-        self.names = list(names)
-        self.boxes = [None] * len(self.names) if boxes is None else list(boxes)
-        self.runs = _runs(places, len(example))
-        self.run_count = len(places)
-        self.stamp = _run(stamp, len(example)) if stamp is not None else NULL
-        self.vectors = <double**>zeros(len(self.names), sizeof(double*))
-        self.sizes = <Py_ssize_t*>zeros(len(self.names), sizeof(Py_ssize_t))
-        for i in range(len(self.names)):
-            self.sizes[i] = sizes[i]
-        for vector, begin, _, count, _ in places:
-            if not 0 <= vector < len(names):
-                raise ValueError(f"there is no vector {vector} among {', '.join(names)}")
-            if not 0 <= begin <= begin + count <= sizes[vector]:
-                raise ValueError(f"{names[vector]} has no entries {begin} to {begin + count - 1}")
-
-    def __dealloc__(self):
-        PyMem_Free(self.runs)
-        PyMem_Free(self.stamp)
-        PyMem_Free(self.vectors)
-        PyMem_Free(self.sizes)
-
-    def fill(self, values, int64_t utime):
-        """The message with these vectors, by name, and this time in microseconds.
-
-        Integers are rounded, half to even. None if one of ``values`` is missing, something else than an array of doubles
-        of the right size, or not within its limits, or if a number does not fit its field.
-        """
-        cdef Box box
-        cdef double* entries
-        cdef char* message
-        cdef char* at
-        cdef Run* run
-        cdef Py_ssize_t i, k
-        # They live as long as this list, even if a mapping makes them when they are asked for.
-        cdef list vectors = [values.get(name) for name in self.names]
-        for i in range(len(vectors)):
-            entries = entries_of(vectors[i], self.sizes[i])
-            if entries is NULL:
-                return None
-            box = self.boxes[i]
-            if box is not None and not (box.size == self.sizes[i] and box.holds(entries)):
-                return None
-            self.vectors[i] = entries
-        data = PyBytes_FromStringAndSize(PyBytes_AS_STRING(self.example), PyBytes_GET_SIZE(self.example))
-        message = PyBytes_AS_STRING(data)
-        if self.stamp is not NULL and not _write_stamp(message + self.stamp.offset, self.stamp.code, utime):
-            return None
-        for i in range(self.run_count):
-            run = &self.runs[i]
-            at = message + run.offset
-            entries = self.vectors[run.vector] + run.begin
-            for k in range(run.count):
-                if not _write(at, run.code, entries[k]):
-                    return None
-                at += run.width
-        return data
-
-
-cdef inline bint _write_stamp(char* at, char code, int64_t utime) noexcept:
-    if code != b"q":
-        return _write(at, code, <double>utime)
-    put_uint64(at, <uint64_t>utime)  # exactly: not every integer is a double
     return True

@@ -15,7 +15,7 @@ from typing import Any
 from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.json_object import json_object
 from vtbdrake.control.statistics import Histogram, LoopStatistics
-from vtbdrake.lcm.link import LcmLink
+from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.machine.faults import InjectedFaultError, fault_from_dict
 from vtbdrake.machine.machine import Machine
 

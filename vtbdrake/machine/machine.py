@@ -11,8 +11,8 @@ import numpy as np
 
 from vtbdrake.control import watchdog
 from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.lcm.routes import ChannelReader
 from vtbdrake.machine.brake import HoldingBrake
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import ACT, SENSE, InjectedFault, InjectedFaultError, NoBrake, Packet, whole_cycles

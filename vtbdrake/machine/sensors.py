@@ -49,7 +49,7 @@ class Sensors:
         carriers = reported_signals(world.interface, protocol.reported)
         known = signals | {signal.name: signal for signal in carriers.values()}
         self._reported = {signal.name: name for name, signal in carriers.items()}
-        self._maps = [(map, map.writer([known[name] for name in map.signals])) for map in protocol.sense]
+        self._maps = [(map, map.encoder([known[name] for name in map.signals])) for map in protocol.sense]
         self._every = {
             map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
             for map in protocol.sense

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vtbdrake.control.cycle import Change
-from vtbdrake.lcm.wire import MalformedError, decode
+from vtbdrake.lcm.maps import decode
+from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end

@@ -19,7 +19,7 @@ from vtbdrake.control.boundary import RealPorts
 from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after, times_after
 from vtbdrake.control.parameters import parameters_at_hand
 from vtbdrake.control.switching import throw
-from vtbdrake.lcm.maps import Reader
+from vtbdrake.lcm.maps import Decoder
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log_format import DPS, TESTBED, LogError, installed_versions, target_kind
 from vtbdrake.recording.log_reader import ControlLog, read_log
@@ -420,20 +420,20 @@ def _abstract_decoders(log: ControlLog, target: AddressedDiagram) -> dict[str, C
         raise LogError(f"the target has no scenario, whose protocol says how to decode {', '.join(abstract)}")
     found = {}
     for map in protocol_of(target.scenario).sense:
-        reader = map.reader([signals[name] for name in map.signals])
+        decoder = map.decoder([signals[name] for name in map.signals])
         for name in map.signals:
             if name in abstract:
-                found[name] = _message_decoder(log, map.channel, reader, name)
+                found[name] = _message_decoder(log, map.channel, decoder, name)
     return found
 
 
-def _message_decoder(log: ControlLog, channel: str, reader: Reader, name: str) -> Callable[[int], Any]:
+def _message_decoder(log: ControlLog, channel: str, decoder: Decoder, name: str) -> Callable[[int], Any]:
     places = {number: (begin, end) for number, _, begin, end in log.events.on(channel)}
 
     def decode(event: int) -> Any:
         if event not in places:
             raise LogError(f"{log.path} lacks the message with the value of {name}, event {event} on {channel}")
-        return reader(log.events.data(*places[event])).values[name]
+        return decoder(log.events.data(*places[event]))[1][name]
 
     return decode
 

@@ -25,9 +25,9 @@ from tests.lcm.hub.clients import (
     wait_until,
 )
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import Hub, HubConfig
 from vtbdrake.lcm.hub.tcpq import connect_shortcut, peer_user
-from vtbdrake.lcm.link import LcmLink
 
 STRANGER = 65534
 WELCOME = b"\x28\x76\x17\xfa\x00\x00\x01\x00"

@@ -28,10 +28,9 @@ from tests.lcm.hub.clients import (
     record,
     wait_until,
 )
-from vtbdrake.lcm.connections import TcpqConnection
+from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.lcm.hub.tcpq import address_name, connect_shortcut, shortcut_name
-from vtbdrake.lcm.link import LcmLink
 
 MEBIBYTE = 1024 * 1024
 WELCOME = b"\x28\x76\x17\xfa\x00\x00\x01\x00"

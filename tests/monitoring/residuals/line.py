@@ -12,8 +12,8 @@ from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guard import Guards
 from vtbdrake.control.reported import reported_signals
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.lcm.routes import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.machine.machine import Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 

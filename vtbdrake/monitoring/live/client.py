@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.control.json_object import json_object
+from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
-from vtbdrake.lcm.link import LcmLink
 from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
 
 _CONNECT_TIMEOUT = 2.0  # s

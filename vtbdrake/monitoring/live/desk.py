@@ -19,7 +19,7 @@ from typing import Any
 
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.worker_process import FrameConnection
-from vtbdrake.lcm.link import LcmLink
+from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.monitoring.live.messages import (
     ANSWER,
     GET,

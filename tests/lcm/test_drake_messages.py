@@ -21,10 +21,9 @@ from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U, ImageToLcmImageArrayT
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.lcm.images import image_array_map, image_map
+from vtbdrake.lcm.bridge import ChannelReader
+from vtbdrake.lcm.drake_messages import image_array_map, image_map, point_cloud_map
 from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.point_clouds import point_cloud_map
-from vtbdrake.lcm.routes import ChannelReader
 from vtbdrake.testbed import Signal
 
 WIDTH, HEIGHT = 6, 4
@@ -51,11 +50,11 @@ def sent_by_drake(system: System, values: list[Any], message_type: Any) -> bytes
 
 
 def take(map: LcmMap, signals: list[Signal], *messages: bytes) -> dict[str, ReceivedSignal]:
-    receptions = {signal.name: ReceivedSignal() for signal in signals}
-    inlet = ChannelReader(map, signals, receptions, 0.1)
+    received = {signal.name: ReceivedSignal() for signal in signals}
+    reader = ChannelReader(map, signals, received, 0.1)
     for message in messages:
-        inlet.take(CHANNEL, message)
-    return receptions
+        reader.take(CHANNEL, message)
+    return received
 
 
 def noise(image_type: Any) -> Any:
@@ -69,11 +68,11 @@ def test_images_that_drake_sends_arrive_pixel_by_pixel() -> None:
     images = {name: noise(image_type) for name, image_type in types.items()}
     data = sent_by_drake(ImageToLcmImageArrayT(*types), list(images.values()), lcmt_image_array)
     signals = [Signal(f"camera_{name}", model_value=types[name](WIDTH, HEIGHT)) for name in types]
-    receptions = take(image_array_map(CHANNEL, {f"camera_{name}": name for name in types}), signals, data)
+    received = take(image_array_map(CHANNEL, {f"camera_{name}": name for name in types}), signals, data)
     for name, image in images.items():
-        reception = receptions[f"camera_{name}"]
-        np.testing.assert_array_equal(reception.value.data, image.data)
-        assert (reception.count, reception.sent) == (1, 0.5)
+        camera = received[f"camera_{name}"]
+        np.testing.assert_array_equal(camera.value.data, image.data)
+        assert (camera.count, camera.sent) == (1, 0.5)
 
 
 def message_of(image: ImageRgba8U) -> lcmt_image:
@@ -100,8 +99,8 @@ def test_compressed_image_arrives_pixel_by_pixel() -> None:
     image = noise(ImageRgba8U)
     message = message_of(image)
     compress(message)
-    reception = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
-    np.testing.assert_array_equal(reception.value.data, image.data)
+    received = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
+    np.testing.assert_array_equal(received.value.data, image.data)
 
 
 def set_fields(**fields: Any) -> Callable[[lcmt_image], None]:
@@ -128,8 +127,8 @@ def set_fields(**fields: Any) -> Callable[[lcmt_image], None]:
 def test_image_that_is_not_what_the_signal_says_is_rejected(change: Callable[[lcmt_image], None], reason: str) -> None:
     message = message_of(noise(ImageRgba8U))
     change(message)
-    reception = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
-    assert (reception.count, reception.rejected) == (0, {reason: 1})
+    received = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
+    assert (received.count, received.rejected) == (0, {reason: 1})
 
 
 def test_few_bytes_that_stand_for_many_are_not_unpacked() -> None:
@@ -150,14 +149,14 @@ def test_camera_that_is_not_in_a_message_is_missing() -> None:
     message.images[0].header.frame_name = "color"
     frames = {"camera": "color", "other": "colour"}
     signals = [camera(), Signal("other", model_value=ImageRgba8U(WIDTH, HEIGHT))]
-    receptions = take(image_array_map(CHANNEL, frames), signals, message.encode())
-    assert receptions["camera"].count == 1
-    assert receptions["other"].rejected == {"missing": 1}
+    received = take(image_array_map(CHANNEL, frames), signals, message.encode())
+    assert received["camera"].count == 1
+    assert received["other"].rejected == {"missing": 1}
 
 
 def test_image_signal_without_a_size_is_refused() -> None:
     with pytest.raises(ValueError, match=r"signal camera on channel PICTURES needs an image of its size"):
-        image_map(CHANNEL, "camera").reader([Signal("camera", model_value=ImageRgba8U())])
+        image_map(CHANNEL, "camera").decoder([Signal("camera", model_value=ImageRgba8U())])
 
 
 def cloud(points: int) -> PointCloud:
@@ -173,18 +172,18 @@ def cloud(points: int) -> PointCloud:
 def test_point_cloud_that_drake_sends_arrives_point_by_point(points: int) -> None:
     sent = cloud(points)
     data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
-    reception = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=cloud(0))], data)["lidar"]
-    assert (reception.count, reception.sent) == (1, 0.5)
+    received = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=cloud(0))], data)["lidar"]
+    assert (received.count, received.sent) == (1, 0.5)
     for name in ("xyzs", "normals", "rgbs"):
-        np.testing.assert_array_equal(getattr(reception.value, name)(), getattr(sent, name)())
+        np.testing.assert_array_equal(getattr(received.value, name)(), getattr(sent, name)())
 
 
 def test_points_that_see_nothing_stay_infinite() -> None:
     sent = PointCloud(2)
     sent.mutable_xyzs()[:] = np.inf
     data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
-    reception = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=PointCloud(0))], data)["lidar"]
-    assert np.isinf(reception.value.xyzs()).all()
+    received = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=PointCloud(0))], data)["lidar"]
+    assert np.isinf(received.value.xyzs()).all()
 
 
 @pytest.mark.parametrize(
@@ -206,13 +205,13 @@ def test_point_cloud_that_contradicts_itself_is_rejected(change: Callable[[Any],
     message = lcmt_point_cloud.decode(sent_by_drake(PointCloudToLcm("lidar"), [cloud(50)], lcmt_point_cloud))
     change(message)
     signals = [Signal("lidar", model_value=cloud(0))]
-    reception = take(point_cloud_map(CHANNEL, "lidar"), signals, message.encode())["lidar"]
-    assert (reception.count, reception.rejected) == (0, {reason: 1})
+    received = take(point_cloud_map(CHANNEL, "lidar"), signals, message.encode())["lidar"]
+    assert (received.count, received.rejected) == (0, {reason: 1})
 
 
 def test_signal_that_is_no_point_cloud_is_refused() -> None:
     with pytest.raises(ValueError, match="needs a PointCloud as model_value"):
-        point_cloud_map(CHANNEL, "lidar").reader([camera()])
+        point_cloud_map(CHANNEL, "lidar").decoder([camera()])
 
 
 @pytest.mark.parametrize("kind", ["images", "cloud"])
@@ -227,13 +226,13 @@ def test_broken_pictures_are_counted_and_do_no_harm(kind: str) -> None:
     else:
         good = sent_by_drake(PointCloudToLcm("lidar"), [cloud(3)], lcmt_point_cloud)
         map, signal = point_cloud_map(CHANNEL, "camera"), Signal("camera", model_value=cloud(0))
-    reception = ReceivedSignal()
-    inlet = ChannelReader(map, [signal], {"camera": reception}, 0.0)
+    received = ReceivedSignal()
+    reader = ChannelReader(map, [signal], {"camera": received}, 0.0)
     for _ in range(5_000):
         data = bytearray(good)
         for _ in range(chance.randrange(1, 6)):
             at = chance.randrange(8, len(data))
             data[at : at + chance.choice((1, 4))] = chance.choice((b"\xff", b"\x7f\xff\xff\xff", b"\0", b"\0\0\0\0"))
-        inlet.take(CHANNEL, bytes(data))
-    assert reception.count + sum(reception.rejected.values()) == 5_000
-    assert "decode" not in reception.rejected
+        reader.take(CHANNEL, bytes(data))
+    assert received.count + sum(received.rejected.values()) == 5_000
+    assert "decode" not in received.rejected
