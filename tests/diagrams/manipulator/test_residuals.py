@@ -44,7 +44,7 @@ def together_with(scenario: ManipulatorScenario, **values: Any) -> Together:
 def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:
     assert together.shadow is not None
     loops = {"twin": together.driver, "shadow": together.shadow}
-    return {mode: ResidualMonitor(loop, mode, aside=False, **options) for mode, loop in loops.items()}
+    return {mode: ResidualMonitor(loop, mode, worker=False, **options) for mode, loop in loops.items()}
 
 
 @pytest.mark.parametrize(

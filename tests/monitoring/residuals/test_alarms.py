@@ -28,7 +28,7 @@ def start(
     loops = {"twin": together.driver, "shadow": together.shadow}
     learn = calibration is None
     monitors = {
-        mode: ResidualMonitor(loop, mode, config=config, calibration=calibration, learn=learn, aside=False)
+        mode: ResidualMonitor(loop, mode, config=config, calibration=calibration, learn=learn, worker=False)
         for mode, loop in loops.items()
     }
     return together, monitors
@@ -129,7 +129,7 @@ def test_alarm_ends_when_the_fault_has_gone() -> None:
 def test_an_hour_of_nominal_operation_raises_no_alarm() -> None:
     robot = machine(SCENARIO, noise=NOISE, seed=3)
     together = Together(SCENARIO, robot)
-    monitor = ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=nominal(), aside=False)
+    monitor = ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=nominal(), worker=False)
     together.run(round(3600.0 / PERIOD))
     assert not monitor.alarms
     assert len(monitor.history) == 3599
@@ -140,7 +140,7 @@ def test_tolerance_alone_is_a_scale() -> None:
     tolerance = {"sense.position": 1e-3, "sense.velocity": 1e-3, "act.torque": 1e-3}
     together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
     config = replace(CONFIG, tolerance=tolerance)
-    monitor = ResidualMonitor(together.driver, "twin", config=config, aside=False)
+    monitor = ResidualMonitor(together.driver, "twin", config=config, worker=False)
     together.run(100)
     assert (monitor.alarms[0].signal, monitor.alarms[0].scale) == ("sense.velocity", 1e-3)
 
@@ -148,7 +148,7 @@ def test_tolerance_alone_is_a_scale() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mean": {"sense.speed": [0.0]}}, "the calibration's mean is of sense.speed"),
+        ({"mean": {"sense.speed": [0.0]}}, "the calibration has a mean of sense.speed"),
         ({"horizon": 20}, "of windows of 20 periods"),
     ],
 )
@@ -156,14 +156,14 @@ def test_calibration_of_something_else_is_refused(change: dict[str, object], mes
     together = Together(SCENARIO, machine(SCENARIO))
     other = replace(nominal(), **change)
     with pytest.raises(CalibrationError, match=message):
-        ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=other, aside=False)
+        ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=other, worker=False)
 
 
 @pytest.mark.parametrize(
     ("tolerance", "message"),
     [
         ({"sense.speed": 1.0}, "no residual of 'sense.speed'; there are: sense.position, sense.velocity, act.torque"),
-        ({"sense.position": [1.0, 2.0]}, "sense.position has 1 entries"),
+        ({"sense.position": [1.0, 2.0]}, "residual of sense.position has 1 entries"),
         ({"sense.position": 1.0}, "the residual of sense.velocity has no scale: calibrate it"),
     ],
 )
@@ -171,4 +171,4 @@ def test_tolerance_that_does_not_fit_is_refused(tolerance: dict[str, object], me
     together = Together(SCENARIO, machine(SCENARIO))
     with pytest.raises(ValueError, match=message):
         config = replace(CONFIG, tolerance=tolerance)
-        ResidualMonitor(together.driver, "twin", config=config, aside=False)
+        ResidualMonitor(together.driver, "twin", config=config, worker=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vtbdrake.monitoring.residuals import Calibration, CalibrationError, calibrate
+from vtbdrake.monitoring.residuals.alarms import Calibration, CalibrationError, calibrate
 
 PLACES = {"sense.a": slice(0, 2), "act.b": slice(2, 3)}
 
@@ -61,7 +61,7 @@ def test_signal_that_never_came_has_no_deviation() -> None:
 
 
 def test_short_run_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="200 windows or more, not in 150"):
+    with pytest.raises(CalibrationError, match="at least 200 windows, not 150"):
         of(noise(150))
 
 
@@ -74,7 +74,7 @@ def test_file_gives_back_what_was_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"mean": {}}', '{"other": 1}'])
 def test_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "nominal.json").write_text(text)
-    with pytest.raises(CalibrationError, match="no calibration"):
+    with pytest.raises(CalibrationError, match="not a calibration"):
         Calibration.load(tmp_path / "nominal.json")
 
 
@@ -82,5 +82,5 @@ def test_file_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> No
 def test_file_whose_numbers_are_none_is_refused(tmp_path: Path, mean: object) -> None:
     content = {"mean": mean, "deviation": {"sense.level": [1.0]}, "windows": 200, "horizon": 10, "period": 0.001}
     (tmp_path / "nominal.json").write_text(json.dumps(content))
-    with pytest.raises(CalibrationError, match="no calibration"):
+    with pytest.raises(CalibrationError, match="not a calibration"):
         Calibration.load(tmp_path / "nominal.json")

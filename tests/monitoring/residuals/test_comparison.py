@@ -11,7 +11,10 @@ import pytest
 from tests.monitoring.residuals.line import Together
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.monitoring.residuals import Comparison, Predictor, ResidualConfig, ResidualMonitor, RowLayout, Sampler
+from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
+from vtbdrake.monitoring.residuals.comparison import Comparison, RowLayout
+from vtbdrake.monitoring.residuals.monitor import Sampler
+from vtbdrake.testbed.prediction import Predictor
 
 CONFIG = ResidualConfig(period=PERIOD, settle=0)
 EXACT = [
@@ -25,7 +28,7 @@ EXACT = [
 
 def monitored(runtime: Runtime | None, mode: str, config: ResidualConfig = CONFIG) -> ResidualMonitor:
     assert runtime is not None
-    return ResidualMonitor(runtime, mode, config=config, learn=True, aside=False)
+    return ResidualMonitor(runtime, mode, config=config, learn=True, worker=False)
 
 
 def residuals(monitor: ResidualMonitor) -> np.ndarray:
@@ -140,7 +143,7 @@ def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
     runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
     predictor = Predictor(scenario, period=PERIOD, values={})
     layout = RowLayout(predictor.interface, ("torque",), {"dps.seen[0]": 1, "dps.seen": 2})
-    sampler = Sampler(runtime, layout, predictor.ages, mode="twin", horizon=CONFIG.horizon)
+    sampler = Sampler(runtime, layout, predictor.estimates, mode="twin", horizon=CONFIG.horizon)
     rows = layout.empty(cycles)
     for row in rows:
         assert sampler.fill(row[None], runtime.cycle()) == 1
@@ -169,7 +172,7 @@ def test_second_command_for_one_period_is_the_one_that_acts() -> None:
     expected = np.array([window.residual for window in comparison.take(rows)])
     again, _ = rows_of(1)
     first = rows.copy()
-    first[:, again._where.command["torque"]] += 5.0
+    first[:, again._where.actuation["torque"]] += 5.0
     found = again.take(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
@@ -179,8 +182,8 @@ def test_failed_prediction_is_told_and_begins_anew() -> None:
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin")
     together.run(50)
-    assert monitor._check is not None
-    predictor = monitor._check._comparison._predictor
+    assert monitor._comparison is not None
+    predictor = monitor._comparison._predictor
     predictor._now -= 100  # Drake does not go back in time.
     together.run(60)
     np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)

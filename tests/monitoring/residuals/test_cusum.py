@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vtbdrake.monitoring.residuals import Cusum, run_length, threshold_for
+from vtbdrake.monitoring.residuals.alarms import Cusum, run_length, threshold_for
 
 
 def test_sums_are_those_of_the_definition() -> None:

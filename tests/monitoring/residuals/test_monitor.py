@@ -38,7 +38,7 @@ def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -
 
 def test_other_process_finds_what_the_own_one_does() -> None:
     together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
-    own = ResidualMonitor(together.driver, "twin", config=CONFIG, aside=False)
+    own = ResidualMonitor(together.driver, "twin", config=CONFIG, worker=False)
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as other:
         assert other.running
         together.run(305)
@@ -68,9 +68,9 @@ def test_arrays_show_how_an_alarm_came_about() -> None:
         }
         together.run(305)
     alarm, table = monitor.alarms[0], monitor.arrays()
-    entry = monitor.layout.places[alarm.signal].start + alarm.entry
+    entry = monitor.places[alarm.signal].start + alarm.entry
     begin = int(np.argmax(table["statistic"][:, entry] > alarm.threshold))
-    assert table["statistic"].shape == (len(monitor.history), monitor.layout.size)
+    assert table["statistic"].shape == (len(monitor.history), 3)
     assert table["statistic"][begin, entry] == alarm.statistic
     assert (table["time"][begin], table[alarm.signal][begin, alarm.entry]) == (alarm.began, alarm.residual)
 
@@ -124,7 +124,7 @@ def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
     together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
     assert together.shadow is not None
     config = replace(CONFIG, settle=0)
-    monitor = ResidualMonitor(together.shadow, "shadow", config=config, aside=False)
+    monitor = ResidualMonitor(together.shadow, "shadow", config=config, worker=False)
     together.run(105)
     together.shadow.switch(sense="sim")
     together.run(95)
@@ -139,7 +139,7 @@ def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
 def test_idle_dps_is_not_compared() -> None:
     line = Line(SCENARIO, machine(SCENARIO))
     runtime = loop(DpsAlone(SCENARIO), line, PERIOD, begin=False)
-    monitor = ResidualMonitor(runtime, "twin", config=CONFIG, aside=False)
+    monitor = ResidualMonitor(runtime, "twin", config=CONFIG, worker=False)
     for _ in range(200):
         runtime.cycle()
     monitor.close()
@@ -183,14 +183,14 @@ def test_shadow_goes_on_behind_a_dps_that_raised_and_tells_it_once(caplog: pytes
     together = Together(SCENARIO, machine(SCENARIO), shadowing=MoodyPendulum())
     shadow = together.shadow
     assert shadow is not None
-    monitor = ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+    monitor = ResidualMonitor(shadow, "shadow", config=CONFIG, worker=False)
     together.run(200)
     before = len(monitor.history)
     shadow.write({"dps.rhythm.mood": 0.0})
     together.run(20)
     shadow.write({"dps.rhythm.mood": 1.0})
     together.run(200)
-    assert caplog.text.count("the DPS raised RuntimeError when it was asked for its answer: ") == 1
+    assert caplog.text.count("the DPS raised RuntimeError when its estimates were read: ") == 1
     assert len(monitor.history) - before >= 18 and monitor.skipped >= 2
     assert "sense.position" not in [alarm.signal for alarm in monitor.alarms]
 
@@ -208,7 +208,7 @@ def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
     def residuals(kind: type[Line]) -> np.ndarray:
         line = kind(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
         driver = loop(DpsAlone(SCENARIO), line, PERIOD)
-        monitor = ResidualMonitor(driver, "twin", config=CONFIG, aside=False)
+        monitor = ResidualMonitor(driver, "twin", config=CONFIG, worker=False)
         driver.run(cycles=300)
         assert monitor.arrays()["time"].size > 10
         return monitor.arrays()["sense.velocity"]
@@ -216,19 +216,19 @@ def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
     np.testing.assert_array_equal(residuals(HalfTimeless), residuals(Line))
 
 
-@pytest.mark.parametrize("aside", [True, False])
-def test_world_of_other_signals_is_refused(aside: bool) -> None:
+@pytest.mark.parametrize("worker", [True, False])
+def test_world_of_other_signals_is_refused(worker: bool) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
-    with pytest.raises(ValueError, match=r"ServoScenario predicts other signals than sense.position"):
-        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), aside=aside)
+    with pytest.raises(ValueError, match=r"ServoScenario has other signals than sense.position"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), worker=worker)
 
 
-@pytest.mark.parametrize("aside", [True, False])
-def test_testbed_without_a_belief_is_refused(aside: bool) -> None:
+@pytest.mark.parametrize("worker", [True, False])
+def test_testbed_without_a_belief_is_refused(worker: bool) -> None:
     scenario = DrivenPendulum(believes=False)
     together = Together(scenario, machine(scenario))
-    with pytest.raises(ValueError, match=r"DrivenPendulum does not declare .* residuals need a belief"):
-        ResidualMonitor(together.driver, "twin", config=CONFIG, aside=aside)
+    with pytest.raises(ValueError, match=r"DrivenPendulum does not declare .* from which a prediction starts"):
+        ResidualMonitor(together.driver, "twin", config=CONFIG, worker=worker)
 
 
 def test_unknown_variable_of_the_predicted_world_is_refused() -> None:
@@ -243,18 +243,18 @@ def test_shadow_of_a_machine_that_reports_nothing_is_refused() -> None:
     ear.reported = {}
     shadow = loop(SCENARIO.build(mode="shadow"), ear, PERIOD)
     with pytest.raises(ValueError, match="does not report torque"):
-        ResidualMonitor(shadow, "shadow", config=CONFIG, aside=False)
+        ResidualMonitor(shadow, "shadow", config=CONFIG, worker=False)
 
 
 def test_other_mode_is_refused() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
-    with pytest.raises(ValueError, match="shadow, twin, not of 'real'"):
+    with pytest.raises(ValueError, match="must be shadow or twin, not 'real'"):
         ResidualMonitor(together.driver, "real", config=CONFIG)
 
 
 def test_other_period_than_the_loops_is_refused() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
-    with pytest.raises(ValueError, match=r"0.001 s do not fit a loop of 0.1 s"):
+    with pytest.raises(ValueError, match=r"0.001 s, must be the period of the loop, 0.1 s"):
         ResidualMonitor(together.driver, "twin")
 
 
@@ -262,17 +262,17 @@ def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
     scenario = DrivenPendulum(sampled=True)
     together = Together(scenario, machine(scenario))
     together.driver.period = 0.04
-    with pytest.raises(ValueError, match=r"0.1 s old, which is no whole number of periods of 0.04 s"):
-        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, period=0.04), aside=False)
+    with pytest.raises(ValueError, match=r"0.1 s, must be a multiple of the period, 0.04 s"):
+        ResidualMonitor(together.driver, "twin", config=replace(CONFIG, period=0.04), worker=False)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"period": 0.0}, "period of residuals is positive"),
-        ({"horizon": 0}, "horizon of residuals is a whole number from 1"),
-        ({"delay": 0.5}, "delay of residuals is a whole number from 0"),
-        ({"false_alarm_interval": float("nan")}, "false_alarm_interval of residuals is positive"),
+        ({"period": 0.0}, "period must be positive"),
+        ({"horizon": 0}, "horizon must be an integer of at least 1"),
+        ({"delay": 0.5}, "delay must be an integer of at least 0"),
+        ({"false_alarm_interval": float("nan")}, "false_alarm_interval must be positive"),
         ({"tolerance": {"sense.position": -1.0}}, "tolerance of sense.position"),
     ],
 )
@@ -287,6 +287,6 @@ def test_config_is_that_of_the_deployment() -> None:
             return replace(super().deployment(), residuals=CONFIG)
 
     own = Own()
-    monitor = ResidualMonitor(loop(DpsAlone(own), Ear(own), PERIOD), "twin", aside=False)
+    monitor = ResidualMonitor(loop(DpsAlone(own), Ear(own), PERIOD), "twin", worker=False)
     monitor.close()
     assert monitor.config is CONFIG

@@ -1,29 +1,142 @@
-"""Compares what a machine tells with what its model predicts, window by window."""
+"""Comparison of what a machine measures with what its model predicts, window by window."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
+from math import inf
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.monitoring.residuals.config import TWIN, ResidualConfig
-from vtbdrake.monitoring.residuals.predictor import Predictor
-from vtbdrake.monitoring.residuals.rows import INDEX, TIME, Array, RowLayout
-from vtbdrake.testbed import Interface
+from vtbdrake.testbed import Interface, Scenario
+from vtbdrake.testbed.prediction import Predictor
 
 _log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+SHADOW, TWIN = "shadow", "twin"
+INDEX, TIME = 0, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualConfig:
+    """Configuration of residuals: what the prediction needs to know beside the scenario, and what an alarm is.
+
+    A scenario has its own in `Scenario.deployment`.
+
+    Attributes:
+        scenario: scenario of the predicted world; by default that of the loop's target. It has the latencies of the
+            sensors, but no random errors.
+        period: period of the machine's cycles and the DPS's, in seconds.
+        horizon: length of a prediction in periods, after which it begins anew from the belief.
+        delay: periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
+            where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on.
+        settle: windows that are predicted but not used at first and after a gap, while state that the belief does not
+            cover (currents of drives, samples in transit) follows the actuator commands.
+        values: values of variables of the predicted world by address, such as the assumed payload.
+        tolerance: by signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
+            each; persistent residuals below half of it are not reported.
+        allowance: k of `Cusum`, in scales.
+        false_alarm_interval: mean time between two false alarms of all signals together, in seconds.
+
+    Raises:
+        ValueError: A value is out of its range.
+    """
+
+    scenario: Scenario | None = None
+    period: float = 1e-3
+    horizon: int = 10
+    delay: int = 0
+    settle: int = 10
+    values: Mapping[str, Any] = field(default_factory=dict)
+    tolerance: Mapping[str, ArrayLike] = field(default_factory=dict)
+    allowance: float = 0.5
+    false_alarm_interval: float = 3.6e6
+
+    def __post_init__(self) -> None:
+        for name in ("period", "allowance", "false_alarm_interval"):
+            if not 0.0 < getattr(self, name) < inf:
+                raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
+        for name, least in (("horizon", 1), ("delay", 0), ("settle", 0)):
+            if int(getattr(self, name)) != getattr(self, name) or getattr(self, name) < least:
+                raise ValueError(f"{name} must be an integer of at least {least}, not {getattr(self, name)!r}")
+        for signal, tolerance in self.tolerance.items():
+            if not (np.asarray(tolerance) >= 0.0).all():
+                raise ValueError(f"the tolerance of {signal} must not be negative, as {tolerance!r} is")
+
+    @property
+    def window(self) -> float:
+        """Return the length of a prediction in seconds."""
+        return self.horizon * self.period
+
+
+class RowLayout:
+    """The layout of a row, which holds the values of one sample; values that are unknown or not new are NaN.
+
+    Entry 0 is the index of the sample by the machine's own time, in periods since the first; entry 1 the DPS's time at
+    the end of the cycle.
+
+    Args:
+        interface: The signals.
+        reported: Actuator signals whose actuator commands the machine reports.
+        estimates: Sizes of the estimates of the DPS, by address.
+
+    Attributes:
+        sense: slices of the measured values, by sensor signal.
+        actuation: slices of the DPS's actuator commands, by actuator signal.
+        reported: slices of the reported actuator commands, which acted in the period before the sample.
+        estimates: slices of the estimates, by address.
+        all_sense: slice of all of ``sense``.
+        all_actuation, all_reported: indices of all of ``actuation`` and ``reported``.
+        compared: indices of the actuator commands that are compared with ``all_reported``.
+        width: number of entries of a row.
+    """
+
+    def __init__(self, interface: Interface, reported: Collection[str], estimates: Mapping[str, int]) -> None:
+        self.width = 2
+        actuators = {signal.name: signal.size or 0 for signal in interface.act}
+        self.sense = self._place({signal.name: signal.size or 0 for signal in interface.sense})
+        self.all_sense = slice(2, self.width)
+        self.actuation = self._place(actuators)
+        self.reported = self._place({name: size for name, size in actuators.items() if name in reported})
+        self.estimates = self._place(estimates)
+        self.all_actuation = _indices(self.actuation.values())
+        self.all_reported = _indices(self.reported.values())
+        self.compared = _indices(self.actuation[name] for name in self.reported)
+
+    def _place(self, sizes: Mapping[str, int]) -> dict[str, slice]:
+        places = slices(sizes, self.width)
+        self.width += sum(sizes.values())
+        return places
+
+    def empty(self, count: int) -> Array:
+        """Return rows of shape (count, width) in which nothing is known yet."""
+        return np.full((count, self.width), np.nan)
+
+
+def slices(sizes: Mapping[str, int], begin: int = 0) -> dict[str, slice]:
+    """Return consecutive slices of the given sizes."""
+    ends = accumulate(sizes.values(), initial=begin)
+    return {name: slice(a, b) for name, (a, b) in zip(sizes, pairwise(ends), strict=True)}
+
+
+def _indices(places: Iterable[slice]) -> list[int]:
+    return [k for place in places for k in range(place.start, place.stop)]
 
 
 class Window(NamedTuple):
     """The residuals of one prediction.
 
     Attributes:
-        time: of the DPS at its end, in seconds.
-        residual: mean of measured less predicted over its samples, all signals one after another; NaN where there was
+        time: time of the DPS at its end, in seconds.
+        residual: mean of measured less predicted values over its samples, all signals concatenated; NaN where there was
             no sample.
-        statistic: of each entry, what an alarm compares with its threshold; None where nobody judges.
+        statistic: statistic of each entry that an alarm compares with its threshold; None without alarm detection.
     """
 
     time: float
@@ -31,52 +144,38 @@ class Window(NamedTuple):
     statistic: Array | None = None
 
 
-class ResidualLayout:
-    """Which entries of a window belong to which signal: ``sense.<name>``, and ``act.<name>`` of reported commands.
-
-    Attributes:
-        places: by signal.
-        size: of all together.
-    """
-
-    def __init__(self, interface: Interface, reported: Collection[str]) -> None:
-        self.places: dict[str, slice] = {}
-        self.size = 0
-        known = [signal for signal in interface.act if signal.name in reported]
-        for side, signals in (("sense", interface.sense), ("act", known)):
-            for signal in signals:
-                width = signal.size or 0
-                self.places[f"{side}.{signal.name}"] = slice(self.size, self.size + width)
-                self.size += width
-
-    def where(self, k: int) -> tuple[str, int]:
-        """Signal and entry of it, of entry ``k`` of a window."""
-        for name, place in self.places.items():
-            if k < place.stop:
-                return name, k - place.start
-        raise IndexError(k)
+def residual_places(interface: Interface, reported: Collection[str]) -> dict[str, slice]:
+    """Return the slices of a window by signal: ``sense.<name>``, and ``act.<name>`` of reported actuator commands."""
+    sizes = {f"sense.{signal.name}": signal.size or 0 for signal in interface.sense}
+    sizes |= {f"act.{signal.name}": signal.size or 0 for signal in interface.act if signal.name in reported}
+    return slices(sizes)
 
 
 class Comparison:
-    r"""Predicts the samples of each window from the belief at its begin, and compares them with those that came.
+    r"""Predicts the samples of each window from the belief at its beginning and compares them with the measured ones.
 
-    With the machine's samples y_i at instants i T, the belief b_s about its state at s T, the commands c_j that act
-    from j T to (j+1) T, and the model's prediction ``\hat y``, a window of H periods that begins at s has the residuals
+    With the machine's samples y_i at instants i T, the belief b_s about its state at s T, the actuator commands c_j
+    that act from j T to (j+1) T, and the model's prediction ``\hat y``, a window of H periods that begins at s has the
+    residuals
 
         mean over i = s+1 .. s+H of  y_i - \hat y_i(b_s, c_s, ..., c_{i-1})                  (sense)
         mean over j = s .. s+H-1 of  (reported command of j) - (the DPS's command for j)     (act)
 
-    The DPS's command in the row of y_i is for j = i + delay; the one that is reported beside y_i acted in j = i - 1.
-    A twin is driven by the DPS's commands, a shadow by those that are reported: they are what acts.
+    The DPS's actuator command in the row of y_i is for j = i + delay; the one that is reported beside y_i acted in
+    j = i - 1. A twin is driven by the DPS's actuator commands, a shadow by the reported ones: they are what acts.
+
+    Args:
+        predictor: The model.
+        rows: Layout of the rows.
+        config: Configuration.
+        mode: ``shadow`` or ``twin``.
 
     Attributes:
-        layout: of the residuals.
-        skipped: windows that were not judged, for rows that are missing, or a belief or command in them.
-        failed: those whose prediction failed; ``error`` says how the last one did.
+        skipped: number of windows without a result, because rows, a belief or actuator commands were missing.
+        failed: number of windows whose prediction failed; ``error`` describes the last failure.
     """
 
     def __init__(self, predictor: Predictor, rows: RowLayout, config: ResidualConfig, *, mode: str) -> None:
-        self.layout = ResidualLayout(predictor.interface, rows.reported)
         self.skipped = 0
         self.failed = 0
         self.error = ""
@@ -84,8 +183,8 @@ class Comparison:
         self._where = rows
         self._config = config
         self._twin = mode == TWIN
-        # Rows that have to be there before a window can be predicted, after its end: what comes late comes by then.
-        self._wait = max(1, max(predictor.ages) - config.horizon)
+        # A window is predicted so many rows after its end: late rows and beliefs have arrived by then.
+        self._wait = max(1, max(predictor.estimates) - config.horizon)
         self._rows: dict[int, Array] = {}
         self._nothing = rows.empty(1)[0]
         self._newest: int | None = None
@@ -93,7 +192,7 @@ class Comparison:
         self._settled = 0
 
     def take(self, rows: Array) -> list[Window]:
-        """The windows that further rows complete."""
+        """Return the windows that further rows, of shape (n, width), complete."""
         horizon, found = self._config.horizon, []
         for row in rows:
             index = int(row[INDEX])
@@ -114,18 +213,17 @@ class Comparison:
         return found
 
     def _complete(self, index: int, late: Array) -> None:
-        """Adds what came late of a row; of two commands for one period the second one acts."""
+        """Add late values to a row. Of two actuator commands for one period the second one acts."""
         row = self._rows.get(index)
         if row is None:
             return
-        commands = self._where.commanded
         new = np.isnan(row)
-        new[commands] = True
+        new[self._where.all_actuation] = True
         new &= ~np.isnan(late)
         self._rows[index] = np.where(new, late, row)
 
     def _restart(self, index: int) -> None:
-        """Begins anew with the first window all of whose rows come from here on."""
+        """Begin with the first window all of whose rows come from here on."""
         horizon, before = self._config.horizon, self._next
         self._rows.clear()
         self._next = -(-(index + (self._config.delay if self._twin else 0)) // horizon) * horizon
@@ -138,10 +236,10 @@ class Comparison:
         try:
             differences, whole = self._compare(s)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            _log.warning("a prediction failed, and begins anew: %s", error)
+            _log.warning("a prediction failed and begins anew: %s", error)
             self.failed += 1
             self.error = f"{type(error).__name__}: {error}"
-            self._predictor.forget()
+            self._predictor.reset()
             self._started = False
             self._settled = -self._config.settle
             return None
@@ -157,32 +255,31 @@ class Comparison:
         return Window(float(self._rows[s + self._config.horizon][TIME]), mean)
 
     def _compare(self, s: int) -> tuple[Array, bool]:
-        """The differences (horizon, all residuals), and whether all was there that it takes."""
+        """Return the differences, of shape (horizon, all residuals), and whether nothing was missing for them."""
         where, periods = self._where, range(s, s + self._config.horizon)
         commanded = self._block(j - self._config.delay for j in periods)
-        told = self._block(j + 1 for j in periods)
-        acting = commanded[:, where.commanded] if self._twin else told[:, where.reports]
-        commands = [None if np.isnan(u).any() else u for u in acting]
-        missing = bool(np.isnan(told[:, INDEX]).any()) or any(u is None for u in commands)
-        whole = self._believe(s) and not missing
-        sense = told[:, where.sensed] - np.array([self._predictor.step(u) for u in commands])
-        return np.hstack((sense, told[:, where.reports] - commanded[:, where.compared])), whole
+        measured = self._block(j + 1 for j in periods)
+        acting = commanded[:, where.all_actuation] if self._twin else measured[:, where.all_reported]
+        actuation = [None if np.isnan(u).any() else u for u in acting]
+        missing = bool(np.isnan(measured[:, INDEX]).any()) or any(u is None for u in actuation)
+        whole = self._set_belief(s) and not missing
+        sense = measured[:, where.all_sense] - np.array([self._predictor.step(u) for u in actuation])
+        return np.hstack((sense, measured[:, where.all_reported] - commanded[:, where.compared])), whole
 
     def _block(self, indices: Iterable[int]) -> Array:
-        """Rows by index; NaN where there is none."""
         return np.array([self._rows.get(i, self._nothing) for i in indices])
 
-    def _believe(self, s: int) -> bool:
-        """Sets the predicted world to what was believed of instant s; whether all of it is known."""
+    def _set_belief(self, s: int) -> bool:
+        """Set the predicted world to the belief about instant s; return whether all of the belief is known."""
         if not self._started and s in self._rows:
-            self._predictor.restart(round(self._rows[s][TIME] / self._config.period) - 1)
+            self._predictor.set_time(round(self._rows[s][TIME] / self._config.period) - 1)
             self._started = True
         known = self._started
-        for age, addresses in self._predictor.ages.items():
+        for age, addresses in self._predictor.estimates.items():
             row = self._rows.get(s + age)
             estimates = {} if row is None else {address: row[self._where.estimates[address]] for address in addresses}
             if not estimates or any(np.isnan(value).any() for value in estimates.values()):
                 known = False
             else:
-                self._predictor.believe(age, estimates)
+                self._predictor.set_belief(age, estimates)
         return known

@@ -1,4 +1,4 @@
-"""Residuals beside the loop: a watcher that has another process predict, compare and judge."""
+"""Residuals beside the loop: a watcher whose worker process predicts, compares and detects alarms."""
 
 from __future__ import annotations
 
@@ -6,62 +6,77 @@ import logging
 import pickle
 import select
 from collections import deque
-from math import inf, prod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from math import inf, isnan, prod
+from typing import Self
 
 import numpy as np
 
 from vtbdrake.control.cycle import SWITCH, Cycle
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.worker_process import WorkerProcess
-from vtbdrake.monitoring.residuals.alarm import Alarm, Judge
-from vtbdrake.monitoring.residuals.calibration import Calibration, calibrate
-from vtbdrake.monitoring.residuals.check import Report, ResidualCheck, serve
-from vtbdrake.monitoring.residuals.comparison import Comparison, ResidualLayout, Window
-from vtbdrake.monitoring.residuals.config import SHADOW, ResidualConfig, check_mode
-from vtbdrake.monitoring.residuals.predictor import Predictor
-from vtbdrake.monitoring.residuals.rows import Array, RowLayout, Sampler
-from vtbdrake.testbed import Interface
+from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
+from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, calibrate
+from vtbdrake.monitoring.residuals.comparison import (
+    INDEX,
+    SHADOW,
+    TIME,
+    TWIN,
+    Array,
+    Comparison,
+    ResidualConfig,
+    RowLayout,
+    Window,
+    residual_places,
+)
+from vtbdrake.testbed import Interface, Scenario, VirtualTestbed
+from vtbdrake.testbed.prediction import Predictor
+from vtbdrake.testbed.switch import REAL
 
 _log = logging.getLogger(__name__)
 
-_START = 120.0  # s in which another process builds a world
+_START_TIMEOUT = 120.0  # s in which the worker process builds a world
+_MAX_WAITING = 100  # blocks of rows that may wait for the worker process; older ones are skipped
+_REPORT_WINDOWS = 10  # windows, with or without a result, after which a report is sent, if there is no alarm before
 
 
 class ResidualError(RuntimeError):
-    """The process that makes the residuals does not begin."""
+    """The worker process that computes the residuals does not start."""
 
 
 class ResidualMonitor:
-    """Compares the machine with its model while the loop runs, and raises alarms where they part.
+    """Compares the machine with its model while the loop runs, and raises alarms where they differ.
 
-    It watches the loop from its making until `close`. The loop itself only fills a row of numbers per cycle and sends
-    them once per window; another process does the rest. If that is too slow it leaves out windows and counts them; if
-    it dies, the loop goes on, `running` becomes False, and it is logged.
+    It watches the loop from its construction until `close`. The loop only fills a row of numbers per cycle and sends
+    the rows once per window; a worker process does the rest. If that is too slow, windows are skipped and counted; if
+    it dies, the loop goes on, `running` becomes False, and an error is logged.
 
-    While a sensor signal is not on real, nothing is predicted; it begins anew afterwards.
+    While a sensor signal is not on real, nothing is predicted; the prediction begins anew afterwards.
 
     Args:
-        runtime: the loop, not running yet.
-        mode: ``shadow``: what the machine reports acts on it, and the DPS's commands are compared with that; ``twin``:
-            what the DPS sends acts on it.
-        config: by default what the method ``residuals`` of the target's scenario says, see `ResidualConfig`.
-        calibration: what residuals are like in nominal operation; without it, tolerances have to say.
-        learn: no alarms: residuals are taken down, for `calibrate`.
-        aside: False does it all in the loop's own process and thread, in which the loop waits for it: for tests,
-            replays, and loops without a clock.
-        memory: how many windows, and how many alarms, are remembered.
+        runtime: The loop, which does not run yet.
+        mode: ``shadow``: what the machine reports acts on it, and the DPS's actuator commands are compared with that;
+            ``twin``: what the DPS sends acts on it.
+        config: Configuration; by default that of the scenario's deployment.
+        calibration: Calibration from nominal operation; without it, tolerances are needed.
+        learn: Whether to raise no alarms, but collect residuals for `calibrate`.
+        worker: Whether a worker process does the computing. If not, the loop waits for it: for tests, replays, and
+            loops without a clock.
+        memory: Number of windows, and of alarms, that are kept.
 
     Attributes:
-        alarms: those of late, in the order in which they began; what has ended says so.
-        history: windows of late.
-        skipped: windows left out: rows were missing, or it could not keep up.
-        failed: those whose prediction failed; ``error`` says how the last one did.
+        config: the configuration.
+        places: slices of a window by signal.
+        alarms: recent alarms, in the order in which they began.
+        history: recent windows.
+        skipped: number of windows without a result, because rows were missing or the worker process was too slow.
+        failed: number of windows whose prediction failed; ``error`` describes the last failure.
 
     Raises:
-        ValueError: the scenario declares no belief, has other signals than the loop's target, or one that is no
-            vector; a signal of a tolerance or calibration is unknown, or has no scale; the machine does not report
-            what a shadow needs.
-        ResidualError: the other process does not begin.
+        ValueError: The scenario declares no belief, has other signals than the loop's target, or an abstract one; a
+            signal of a tolerance or calibration is unknown, or has no scale; the machine does not report what a shadow
+            needs.
+        ResidualError: The worker process does not start.
     """
 
     def __init__(
@@ -72,108 +87,92 @@ class ResidualMonitor:
         config: ResidualConfig | None = None,
         calibration: Calibration | None = None,
         learn: bool = False,
-        aside: bool = True,
+        worker: bool = True,
         memory: int = 60_000,
     ) -> None:
-        check_mode(mode)
-        own = runtime.target.scenario
-        self.config = config = config or (own.deployment().residuals if own is not None else ResidualConfig())
-        scenario = config.scenario or own
+        target, interface, reported = runtime.target, runtime.target.interface, runtime.bridge.reported
+        self.config = config = config or (
+            target.scenario.deployment().residuals if target.scenario else ResidualConfig()
+        )
+        scenario = config.scenario or target.scenario
         if scenario is None:
-            raise ValueError(
-                "the loop's target was not built by a scenario: say which one predicts, by ResidualConfig.scenario"
-            )
-        signals = _sizes(runtime.target.interface)
-        if _sizes(scenario.interface()) != signals:
-            raise ValueError(
-                f"{scenario.name()} predicts other signals than {', '.join(signals)} of the loop's target: "
-                "ResidualConfig.scenario needs the same interface"
-            )
-        if config.period != runtime.period:
-            raise ValueError(
-                f"residuals with a period of {config.period} s do not fit a loop of {runtime.period} s: give "
-                "ResidualConfig.period that of the loop"
-            )
-        reported = runtime.bridge.reported
-        missing = [signal.name for signal in runtime.target.interface.act if signal.name not in reported]
-        if mode == SHADOW and missing:
-            raise ValueError(
-                f"a shadow needs to know what acts on the machine, which does not report {', '.join(missing)}: name a "
-                "reported signal in the scenario's protocol"
-            )
-        self.layout = ResidualLayout(runtime.target.interface, reported)
+            raise ValueError("the loop's target has no scenario: set ResidualConfig.scenario to one that predicts")
+        _check(runtime, mode, config, scenario)
+        self.places = residual_places(interface, reported)
+        self._size = max(place.stop for place in self.places.values())
         self.alarms: deque[Alarm] = deque(maxlen=memory)
         self.history: deque[Window] = deque(maxlen=memory)
         self.skipped = self.failed = 0
         self.error = ""
         self._worker: WorkerProcess | None = None
-        self._check: ResidualCheck | None = None
-        judge = None if learn else Judge(self.layout, config, calibration)
-        if aside:
-            self._worker = WorkerProcess(serve, scenario, config, mode, judge, name="residuals")
-            ages = self._await_ages(self._worker)
+        self._comparison: Comparison | None = None
+        self._detector = None if learn else AlarmDetector(self.places, config, calibration)
+        if worker:
+            self._worker = WorkerProcess(_serve, scenario, config, mode, self._detector, name="residuals")
+            estimates = self._await_estimates(self._worker)
         else:
             predictor = Predictor(scenario, period=config.period, values=config.values)
-            ages = predictor.ages
-        variables = runtime.target.variables()
-        addresses = dict.fromkeys(address for group in ages.values() for address in group)
-        sizes = {address: prod(variables[address].shape) for address in addresses}
-        rows = RowLayout(runtime.target.interface, reported, sizes)
+            estimates = predictor.estimates
+        variables = target.variables()
+        sizes = {address: prod(variables[address].shape) for group in estimates.values() for address in group}
+        self._rows = RowLayout(interface, reported, sizes)
         if self._worker is not None:
-            self._worker.post(pickle.dumps(rows))
+            self._worker.post(pickle.dumps(self._rows))
         else:
-            self._check = ResidualCheck(Comparison(predictor, rows, config, mode=mode), judge)
-        self._sampler = Sampler(runtime, rows, ages, mode=mode, horizon=config.horizon)
-        self._rows = rows
+            self._comparison = Comparison(predictor, self._rows, config, mode=mode)
+        self._sampler = Sampler(runtime, self._rows, estimates, mode=mode, horizon=config.horizon)
         self._begin_block()
         self._open = True
         runtime.watch(self)
 
     @staticmethod
-    def _await_ages(worker: WorkerProcess) -> dict[int, tuple[str, ...]]:
-        select.select((worker,), (), (), _START)
+    def _await_estimates(worker: WorkerProcess) -> dict[int, tuple[str, ...]]:
+        select.select((worker,), (), (), _START_TIMEOUT)
         frames = worker.take()
         if not frames:
             worker.kill()
-            raise ResidualError(f"the process that makes the residuals has ended, or said nothing for {_START:g} s")
+            raise ResidualError(f"the worker process has ended, or did not start within {_START_TIMEOUT:g} s")
         answer = pickle.loads(frames[0])
         if isinstance(answer, str):
             worker.close()
             raise ValueError(answer)
-        ages: dict[int, tuple[str, ...]] = answer
-        return ages
+        estimates: dict[int, tuple[str, ...]] = answer
+        return estimates
 
     # -- in the loop
 
     def __call__(self, cycle: Cycle) -> None:
-        """A watcher's: takes down one cycle."""
+        """Take one cycle, as a watcher of the runtime."""
         if not self._open:
             return
         if self._filled and any(change.kind == SWITCH for change in cycle.changes):
             self._begin_block()
-        if self._filled == 0 and not self._sampler.listens():
+        if self._filled == 0 and not self._sampler.fed_by_machine():
             return
         self._filled += self._sampler.fill(self._block[self._filled :], cycle)
         if self._filled >= self.config.horizon:
-            self._pass_on()
+            self._send_block()
 
     def _begin_block(self) -> None:
         # A cycle brings no more rows than it has signals.
         self._block: Array = self._rows.empty(self.config.horizon + len(self._rows.sense))
         self._filled = 0
 
-    def _pass_on(self) -> None:
+    def _send_block(self) -> None:
         block = self._block[: self._filled]
-        if self._check is not None:
-            self._absorb(self._check.take(block))
+        if self._comparison is not None:
+            self._take_report(_checked(self._comparison, self._detector, block))
         elif self._worker is not None:
             if self._filled:
                 self._worker.post(block.tobytes())
-            for frame in self._worker.take():
-                self._absorb(pickle.loads(frame))
+            self._take_reports(self._worker)
         self._begin_block()
 
-    def _absorb(self, report: Report) -> None:
+    def _take_reports(self, worker: WorkerProcess) -> None:
+        for frame in worker.take():
+            self._take_report(pickle.loads(frame))
+
+    def _take_report(self, report: ResidualReport) -> None:
         self.history.extend(report.windows)
         self.skipped, self.failed, self.error = report.skipped, report.failed, report.error
         for alarm in report.alarms:
@@ -185,65 +184,89 @@ class ResidualMonitor:
                 if (known.signal, known.entry, known.began) == (alarm.signal, alarm.entry, alarm.began):
                     self.alarms[k] = alarm
 
-    # -- what is known
+    # -- results
 
     @property
     def running(self) -> bool:
-        """Whether residuals are being made; False once the process that does is gone."""
+        """Return whether residuals are being computed; False once the worker process is gone."""
         return self._open and (self._worker is None or self._worker.alive)
 
     @property
     def dropped(self) -> int:
-        """Windows that the process did not take, for it is gone, or far too slow."""
+        """Return the number of windows that the worker process did not take, because it is gone or far too slow."""
         return self._worker.dropped if self._worker is not None else 0
 
     @property
     def newest(self) -> dict[str, Array] | None:
-        """The newest residuals, measured less predicted, by signal; None before the first."""
+        """Return the newest residuals, measured less predicted, by signal; None before the first."""
         if not self.history:
             return None
         residual = self.history[-1].residual
-        return {name: residual[place] for name, place in self.layout.places.items()}
+        return {name: residual[place] for name, place in self.places.items()}
 
     def arrays(self) -> dict[str, Array]:
-        """The windows that are remembered, the oldest first: ``time``, shape (n,), in seconds; by signal the residuals,
-        (n, entries); and, unless it learns, ``statistic``, of all entries of all signals, (n, size of `layout`)."""
+        """Return the windows that are kept, the oldest first.
+
+        Returns:
+            ``time``, of shape (n,), in seconds; by signal the residuals, (n, entries); and, unless it learns,
+            ``statistic`` of all entries of all signals, (n, all entries).
+        """
         windows = list(self.history)
-        residuals = np.array([window.residual for window in windows]).reshape(-1, self.layout.size)
+        residuals = np.array([window.residual for window in windows]).reshape(-1, self._size)
         table = {"time": np.array([window.time for window in windows])}
-        table |= {name: residuals[:, place] for name, place in self.layout.places.items()}
-        judged = [window.statistic for window in windows if window.statistic is not None]
-        return table | {"statistic": np.array(judged)} if judged else table
+        table |= {name: residuals[:, place] for name, place in self.places.items()}
+        statistics = [window.statistic for window in windows if window.statistic is not None]
+        return table | {"statistic": np.array(statistics)} if statistics else table
 
     def active(self) -> list[Alarm]:
-        """The alarms that last."""
+        """Return the alarms that have not ended."""
         return [alarm for alarm in self.alarms if alarm.ended == inf]
 
     def calibrate(self) -> Calibration:
-        """What the windows that are remembered say of nominal operation.
+        """Return the calibration from the windows that are kept, if they are of nominal operation.
 
         Raises:
-            CalibrationError: they are too few.
+            CalibrationError: There are too few windows.
         """
         residuals = (window.residual for window in self.history)
-        return calibrate(residuals, self.layout.places, horizon=self.config.horizon, period=self.config.period)
+        return calibrate(residuals, self.places, horizon=self.config.horizon, period=self.config.period)
 
     def close(self) -> None:
-        """Ends it, with all that is known by then told."""
+        """End the monitor after its last results have been taken."""
         if not self._open:
             return
         self._open = False
-        self._pass_on()
+        self._send_block()
         if self._worker is not None:
             self._worker.close()
-            for frame in self._worker.take():
-                self._absorb(pickle.loads(frame))
+            self._take_reports(self._worker)
 
-    def __enter__(self) -> ResidualMonitor:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _check(runtime: Runtime, mode: str, config: ResidualConfig, scenario: Scenario) -> None:
+    if mode not in (SHADOW, TWIN):
+        raise ValueError(f"mode must be {SHADOW} or {TWIN}, not {mode!r}")
+    signals = _sizes(runtime.target.interface)
+    if _sizes(scenario.interface()) != signals:
+        raise ValueError(
+            f"{scenario.name()} has other signals than {', '.join(signals)} of the loop's target: "
+            "ResidualConfig.scenario needs the same interface"
+        )
+    if config.period != runtime.period:
+        raise ValueError(
+            f"ResidualConfig.period, {config.period} s, must be the period of the loop, {runtime.period} s"
+        )
+    missing = [s.name for s in runtime.target.interface.act if s.name not in runtime.bridge.reported]
+    if mode == SHADOW and missing:
+        raise ValueError(
+            f"a shadow needs to know what acts on the machine, which does not report {', '.join(missing)}: name a "
+            "reported signal in the scenario's protocol"
+        )
 
 
 def _sizes(interface: Interface) -> dict[str, int | None]:
@@ -252,3 +275,178 @@ def _sizes(interface: Interface) -> dict[str, int | None]:
         for side, signals in (("sense", interface.sense), ("act", interface.act))
         for signal in signals
     }
+
+
+class Sampler:
+    """Fills rows with what happened in the cycles of a loop.
+
+    Args:
+        runtime: The loop, whose context is read after its steps.
+        layout: Layout of the rows.
+        estimates: By age of a belief, in periods, the addresses of its estimates, which are read once per horizon.
+        mode: ``shadow`` or ``twin``.
+        horizon: Length of a window in periods.
+    """
+
+    def __init__(
+        self, runtime: Runtime, layout: RowLayout, estimates: Mapping[int, Iterable[str]], *, mode: str, horizon: int
+    ) -> None:
+        self._runtime = runtime
+        self._layout = layout
+        self._twin = mode == TWIN
+        self._horizon = horizon
+        reader = runtime.target.reader
+        self._estimates = [
+            (age, [(layout.estimates[address], reader(address)) for address in addresses])
+            for age, addresses in estimates.items()
+        ]
+        self._sensed = runtime.bridge.sensed
+        self._reported = [(name, runtime.bridge.reported[name]) for name in layout.reported]
+        self._counts = dict.fromkeys(layout.reported, 0)
+        self._first = np.nan
+        self._last_error = ""
+
+    def fed_by_machine(self) -> bool:
+        """Return whether the machine alone feeds the DPS, so that its belief is about the machine."""
+        target = self._runtime.target
+        if not isinstance(target, VirtualTestbed):
+            return not self._runtime.idle
+        return set(target.positions(self._runtime.context)["sense"].values()) == {REAL}
+
+    def fill(self, rows: Array, cycle: Cycle) -> int:
+        """Fill empty rows with the new values of a cycle.
+
+        Args:
+            rows: Rows of NaN, at least one for each sensor signal.
+            cycle: The cycle.
+
+        Returns:
+            The number of rows: 0 without a new sample, several if some of its samples are older than others.
+        """
+        if not cycle.fed:
+            return 0
+        groups = self._by_index(cycle)
+        for row, index in zip(rows, sorted(groups), strict=False):
+            row[INDEX], row[TIME] = index, cycle.time
+            for name in groups[index]:
+                row[self._layout.sense[name]] = cycle.fed[name]
+        try:
+            self._fill_answer(rows[len(groups) - 1], max(groups), cycle)
+            self._last_error = ""
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            # Its window will lack these values. An error that repeats itself in every cycle is logged once.
+            if str(error) != self._last_error:
+                self._last_error = str(error)
+                _log.warning("the DPS raised %s when its estimates were read: %s", type(error).__name__, error)
+        return len(groups)
+
+    def _by_index(self, cycle: Cycle) -> dict[int, list[str]]:
+        """Return the new signals by the index of their samples.
+
+        A signal without a time of its own counts as new as the newest one that has it.
+        """
+        times = {name: self._sensed[name].sent for name in cycle.fed}
+        if any(map(isnan, times.values())):
+            known = [received.sent for received in self._sensed.values() if not isnan(received.sent)]
+            if not known:
+                return {cycle.number: list(times)}
+            times = {name: max(known) if isnan(sent) else sent for name, sent in times.items()}
+        oldest = min(times.values())
+        if not self._first <= oldest:  # also at first, when it is NaN, and when the sender's time was set back
+            self._first = oldest
+        groups: dict[int, list[str]] = {}
+        for name, sent in times.items():
+            groups.setdefault(round((sent - self._first) / self._runtime.period), []).append(name)
+        return groups
+
+    def _fill_answer(self, row: Array, index: int, cycle: Cycle) -> None:
+        """Fill in the DPS's actuator commands and estimates, and the reported actuator commands."""
+        for name, received in self._reported:
+            if received.count != self._counts[name]:
+                self._counts[name] = received.count
+                row[self._layout.reported[name]] = received.value
+        for name, place in self._layout.actuation.items():
+            command = cycle.verdict.commands.get(name) if self._twin else self._runtime.command(name)
+            if command is not None:
+                row[place] = command
+        for age, estimates in self._estimates:
+            if (index - age) % self._horizon == 0:
+                for place, read in estimates:
+                    row[place] = np.ravel(read(self._runtime.context))
+
+
+# -- in the worker process
+
+
+@dataclass
+class ResidualReport:
+    """The results since the last report.
+
+    Attributes:
+        windows: the windows.
+        alarms: alarms that began or ended.
+        skipped, failed, error: see `Comparison`.
+    """
+
+    windows: list[Window] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+    skipped: int = 0
+    failed: int = 0
+    error: str = ""
+
+
+def _checked(comparison: Comparison, detector: AlarmDetector | None, rows: Array) -> ResidualReport:
+    """Return the results of further rows, of shape (n, width of a `RowLayout`), in order."""
+    windows, alarms = comparison.take(rows), []
+    if detector:
+        for k, window in enumerate(windows):
+            alarms += detector.take(window)
+            windows[k] = window._replace(statistic=detector.statistic)
+    return ResidualReport(windows, alarms, comparison.skipped, comparison.failed, comparison.error)
+
+
+def _serve(
+    connection: FrameConnection, scenario: Scenario, config: ResidualConfig, mode: str, detector: AlarmDetector | None
+) -> None:
+    """Run the worker process of a monitor.
+
+    It sends the estimates that the predictor needs, or why there is no predictor; receives the layout of the rows, and
+    then rows; and sends reports.
+    """
+    try:
+        predictor = Predictor(scenario, period=config.period, values=config.values)
+    except ValueError as error:
+        connection.send(pickle.dumps(str(error)))
+        return
+    connection.send(pickle.dumps(predictor.estimates))
+    layout: RowLayout = pickle.loads(connection.receive())
+    comparison = Comparison(predictor, layout, config, mode=mode)
+    pending, dropped, reported, ended = ResidualReport(), 0, 0, False
+    while not ended:
+        blocks, ended = _waiting_blocks(connection)
+        dropped += max(0, len(blocks) - _MAX_WAITING)
+        for block in blocks[-_MAX_WAITING:]:
+            report = _checked(comparison, detector, np.frombuffer(block).reshape(-1, layout.width))
+            report.windows = pending.windows + report.windows
+            report.skipped += dropped
+            pending = report
+            # Windows without a result are reported as well.
+            without = report.skipped + report.failed
+            if report.alarms or len(report.windows) + without - reported >= _REPORT_WINDOWS:
+                connection.send(pickle.dumps(report))
+                pending = ResidualReport(skipped=report.skipped, failed=report.failed, error=report.error)
+                reported = without
+    connection.send(pickle.dumps(pending))
+
+
+def _waiting_blocks(connection: FrameConnection) -> tuple[list[bytes], bool]:
+    """Return all blocks that have arrived, at least one unless the connection has ended, and whether it has."""
+    blocks: list[bytes] = []
+    try:
+        blocks.append(connection.receive())
+        while True:
+            blocks.append(connection.receive(0.0))
+    except TimeoutError:
+        return blocks, False
+    except EOFError:
+        return blocks, True
