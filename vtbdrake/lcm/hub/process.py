@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import logging
-import os
 import queue
 import signal
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
 from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.control.realtime import RealTime
 from vtbdrake.lcm.hub.routing import HubStatistics
 from vtbdrake.lcm.hub.server import HubConfig, HubServer, listen
 from vtbdrake.lcm.hub.tcpq import address_name
@@ -27,21 +26,23 @@ _MAX_LOG = 1000
 
 
 class HubError(RuntimeError):
-    """A hub that does not start, or does not run any more."""
+    """The process of a hub does not start, or has ended."""
 
 
 class Hub:
-    """A hub in a process of its own, which ends with `close`, and with the process that started it, however that ends.
+    """A hub in a process of its own, which ends with `close`, or with the process that started it.
+
+    ::
 
         with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
             bus = lcm.LCM(hub.url)
 
     Args:
         config: address, protected channels and limits.
-        fields: of the config, in its place or to change it.
+        fields: fields of `HubConfig` that replace those of ``config``.
 
     Raises:
-        ValueError: a field is out of its range.
+        ValueError: A field is out of range.
     """
 
     def __init__(self, config: HubConfig | None = None, **fields: Any) -> None:
@@ -50,11 +51,11 @@ class Hub:
         self._url = ""
 
     def start(self) -> None:
-        """Start the hub; when this returns, clients can connect.
+        """Start the hub and wait until clients can connect.
 
         Raises:
-            HubAddressError: the hub cannot listen at its address.
-            HubError: its process does not start.
+            HubAddressError: The hub cannot listen at its address.
+            HubError: Its process does not start.
         """
         with contextlib.ExitStack() as stack:
             listeners = [stack.enter_context(listener) for listener in listen(self.config)]
@@ -70,25 +71,25 @@ class Hub:
 
     def _running(self) -> ChildProcess:
         if self._child is None:
-            raise HubError("the hub does not run: start it, or use it in a with statement")
+            raise HubError("the hub is not running; start it, or use it in a with statement")
         return self._child
 
     @property
     def url(self) -> str:
-        """The address for clients, ``tcpq://host:port``.
+        """URL for clients, ``tcpq://host:port``.
 
         Raises:
-            HubError: the hub does not run.
+            HubError: The hub is not running.
         """
         self._running()
         return self._url
 
     @property
     def pid(self) -> int:
-        """The process id of the hub.
+        """Process id of the hub.
 
         Raises:
-            HubError: the hub does not run.
+            HubError: The hub is not running.
         """
         return self._running().pid
 
@@ -96,7 +97,7 @@ class Hub:
         """Return the present statistics.
 
         Raises:
-            HubError: the hub does not answer.
+            HubError: The hub does not answer.
         """
         connection = self._running().connection
         connection.settimeout(_ANSWER_TIMEOUT)
@@ -136,43 +137,31 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, lambda *_: server.stop())
-    if server.config.cpus:
-        _ask_for_processors(server.config.cpus)
-    if server.config.priority:
-        _ask_for_priority(server.config.priority)
-    # The hub makes no cycles.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    with _logging_elsewhere():
+    config = server.config
+    settings = RealTime(
+        priority=config.priority or None,
+        cpus=set(config.cpus) or None,
+        lock_memory=False,
+        awake=False,
+        switch_interval=None,
+        longest_step=None,
+    )
+    with settings, _logging_in_thread():
+        for grant in settings.grants:
+            if not grant.granted:
+                _log.warning("%s", grant)
         ready()
         server.serve_forever()
 
 
-def _ask_for_processors(cpus: Sequence[int]) -> None:
-    try:
-        os.sched_setaffinity(0, cpus)
-    except OSError:
-        _log.warning("the system does not grant the processors %s; the hub runs on any", ", ".join(map(str, cpus)))
-
-
-def _ask_for_priority(priority: int) -> None:
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        _log.warning("the system does not grant SCHED_FIFO (see 'ulimit -r'); the hub runs at an ordinary priority")
-    else:
-        _log.info("runs at SCHED_FIFO %d", priority)
-
-
 @contextlib.contextmanager
-def _logging_elsewhere() -> Iterator[None]:
-    """Within, what is logged is written by another thread: a terminal that takes nothing holds up no message."""
+def _logging_in_thread() -> Iterator[None]:
+    """Write log messages in another thread, so that a blocked terminal does not delay the hub."""
     root = logging.getLogger()
-    waiting: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_LOG)
+    messages: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_LOG)
     handlers = root.handlers[:] or [logging.StreamHandler()]
-    root.handlers[:] = [_DroppingHandler(waiting)]
-    listener = QueueListener(waiting, *handlers)
+    root.handlers[:] = [_DroppingHandler(messages)]
+    listener = QueueListener(messages, *handlers)
     listener.start()
     try:
         yield
