@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
-from vtbdrake.lcm.hub.server import MEBIBYTE
 from vtbdrake.monitoring.live.messages import RESET, SET
 
 if TYPE_CHECKING:
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _DEFAULT = HubConfig()
-_SIZE = click.IntRange(min=1)
+_MEBIBYTE = 1024 * 1024
+_SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
 
 
 def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None) -> Any:
@@ -29,16 +30,22 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     return load_scenario(name)
 
 
+def _option(field: str, kind: Any, metavar: str, text: str) -> Callable[[Any], Any]:
+    """Return the option that sets a field of `HubConfig`."""
+    default = getattr(_DEFAULT, field)
+    if field in _SIZES:
+        default //= _MEBIBYTE
+    name = "--" + field.replace("_", "-")
+    return click.option(name, type=kind, default=default, show_default=True, metavar=metavar, help=text)
+
+
+_POSITIVE = click.IntRange(min=1)
+
+
 @click.command("hub")
 @click.argument("scenario", required=False, callback=_load_scenario)
-@click.option(
-    "--host",
-    default=_DEFAULT.host,
-    show_default=True,
-    metavar="ADDRESS",
-    help="Address to listen on; beyond loopback, every machine that reaches it can connect.",
-)
-@click.option("--port", type=int, default=_DEFAULT.port, show_default=True, metavar="N", help="0: any free port.")
+@_option("host", str, "ADDRESS", "Address to listen on; beyond loopback, every machine that reaches it can connect.")
+@_option("port", int, "N", "0: any free port.")
 @click.option(
     "--protect",
     multiple=True,
@@ -55,61 +62,19 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     help="Name or id of a user that may connect, too. May be repeated.",
 )
 @click.option("--all-users", is_flag=True, help="Let every user of this machine connect.")
-@click.option(
-    "--lease",
-    type=float,
-    default=_DEFAULT.lease,
-    show_default=True,
-    metavar="S",
-    help="Seconds after the owner's last message during which no other client can take over.",
+@_option("lease", float, "S", "Seconds after the owner's last message during which no other client can take over.")
+@_option("max_message", _POSITIVE, "MIB", "Largest message.")
+@_option("max_queue", _POSITIVE, "MIB", "Largest backlog of a client; beyond it, the oldest messages are dropped.")
+@_option(
+    "max_memory",
+    _POSITIVE,
+    "MIB",
+    "Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
 )
-@click.option(
-    "--max-message",
-    type=_SIZE,
-    default=_DEFAULT.max_message // MEBIBYTE,
-    show_default=True,
-    metavar="MIB",
-    help="Largest message.",
-)
-@click.option(
-    "--max-queue",
-    type=_SIZE,
-    default=_DEFAULT.max_queue // MEBIBYTE,
-    show_default=True,
-    metavar="MIB",
-    help="Largest backlog of a client; beyond it, the oldest messages are dropped.",
-)
-@click.option(
-    "--max-memory",
-    type=_SIZE,
-    default=_DEFAULT.max_memory // MEBIBYTE,
-    show_default=True,
-    metavar="MIB",
-    help="Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
-)
-@click.option(
-    "--max-clients",
-    type=click.IntRange(min=1),
-    default=_DEFAULT.max_clients,
-    show_default=True,
-    metavar="N",
-    help="Maximum number of clients at a time.",
-)
-@click.option(
-    "--patience",
-    type=float,
-    default=_DEFAULT.patience,
-    show_default=True,
-    metavar="S",
-    help="Seconds after which a client is disconnected that does not read, or does not complete a message.",
-)
-@click.option(
-    "--priority",
-    type=int,
-    default=_DEFAULT.priority,
-    show_default=True,
-    metavar="N",
-    help="Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",
+@_option("max_clients", _POSITIVE, "N", "Maximum number of clients at a time.")
+@_option("patience", float, "S", "Seconds until a client is disconnected that does not read or complete a message.")
+@_option(
+    "priority", int, "N", "Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it; 0: none."
 )
 @click.option(
     "--cpu",
@@ -119,23 +84,7 @@ def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None)
     metavar="N",
     help="Processor to run on, if the system grants it. May be repeated.",
 )
-def run_hub(
-    scenario: Scenario | None,
-    host: str,
-    port: int,
-    protect: tuple[str, ...],
-    unprotected: bool,
-    users: tuple[str, ...],
-    all_users: bool,
-    lease: float,
-    max_message: int,
-    max_queue: int,
-    max_memory: int,
-    max_clients: int,
-    patience: float,
-    priority: int,
-    cpus: tuple[int, ...],
-) -> None:
+def run_hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP until Ctrl-C, for networks without multicast.
 
     Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on VTB_SET and on
@@ -152,21 +101,8 @@ def run_hub(
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     channels = () if scenario is None else _command_channels(scenario)
     defaults = () if unprotected else (*channels, SET, RESET)
-    config = HubConfig(
-        host=host,
-        port=port,
-        protect=tuple(dict.fromkeys((*protect, *defaults))),
-        users=users,
-        all_users=all_users,
-        lease=lease,
-        max_message=max_message * MEBIBYTE,
-        max_queue=max_queue * MEBIBYTE,
-        max_memory=max_memory * MEBIBYTE,
-        max_clients=max_clients,
-        patience=patience,
-        priority=priority,
-        cpus=cpus,
-    )
+    sizes = {name: fields.pop(name) * _MEBIBYTE for name in _SIZES}
+    config = HubConfig(protect=tuple(dict.fromkeys((*protect, *defaults))), **sizes, **fields)
     server = HubServer(config)
     if not channels and not protect and not unprotected:
         _log.warning(

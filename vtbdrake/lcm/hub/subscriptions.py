@@ -88,6 +88,9 @@ def _chain(pattern: str) -> str | None:
     return "".join([f"^{first}", *(f"(?>.*?{piece})" for piece in between), f".*{last}$"])
 
 
+_EVERYTHING = Pattern(lambda channel: True, 0)
+
+
 class Subscriptions:
     """The subscriptions of one client.
 
@@ -102,7 +105,6 @@ class Subscriptions:
         self._by_pattern: Counter[str] = Counter()  # number of subscriptions
         self._by_channel: Counter[str] = Counter()  # number of subscriptions to this channel alone
         self._patterns: dict[str, Pattern] = {}
-        self._unmatched: set[str] = set()  # patterns that stand for all channels
 
     def add(self, pattern: str) -> str | None:
         """Add a subscription.
@@ -122,38 +124,33 @@ class Subscriptions:
             self._by_channel[channel] += 1
         elif self._by_pattern[pattern] == 1:
             compiled = compile_pattern(pattern)
-            if compiled is not None and self.cost + compiled.cost <= MAX_COST:
-                self._patterns[pattern] = compiled
-                self.cost += compiled.cost
-            else:
-                self._unmatched.add(pattern)
+            if compiled is None or self.cost + compiled.cost > MAX_COST:
                 why = "is too complex" if compiled is None else "exceeds the client's budget for patterns"
                 _log.warning("pattern %r %s: the client receives all messages and filters them itself", pattern, why)
+                compiled = _EVERYTHING
+            self._patterns[pattern] = compiled
+            self.cost += compiled.cost
         return channel
 
     def remove(self, pattern: str) -> str | None:
         """Remove one subscription to a pattern, if there is one; return the same as `add`."""
         channel = literal(pattern)
-        if pattern not in self._by_pattern:
-            return channel
-        self._count -= 1
-        self._by_pattern[pattern] -= 1
-        if channel is not None:
-            self._by_channel[channel] -= 1
-        if not self._by_pattern[pattern]:
-            del self._by_pattern[pattern]
-            self._unmatched.discard(pattern)
-            if pattern in self._patterns:
-                self.cost -= self._patterns.pop(pattern).cost
+        if pattern in self._by_pattern:
+            self._count -= 1
+            self._by_pattern[pattern] -= 1
+            if channel is not None:
+                self._by_channel[channel] -= 1
+                if not self._by_channel[channel]:
+                    del self._by_channel[channel]
+            if not self._by_pattern[pattern]:
+                del self._by_pattern[pattern]
+                self.cost -= self._patterns.pop(pattern, _EVERYTHING).cost
         return channel
 
     def match(self, channel: str) -> bool:
         """Return whether the client receives the messages of a channel."""
-        return (
-            bool(self._unmatched)
-            or self._by_channel.get(channel, 0) > 0
-            or any(pattern.matches(channel) for pattern in self._patterns.values())
-        )
+        patterns = self._patterns.values()
+        return channel in self._by_channel or any(pattern.matches(channel) for pattern in patterns)
 
     def __len__(self) -> int:
         return self._count
