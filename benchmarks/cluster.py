@@ -13,8 +13,8 @@ from benchmarks.parallel import climber_task
 from diagrams.space_climber import SpaceClimberScenario
 from diagrams.space_climber.payload import HORIZON, MASS
 from vtbdrake.rollout import RolloutTask
-from vtbdrake.rollout.blob import Blobs
 from vtbdrake.rollout.cluster import DaskExecutor
+from vtbdrake.rollout.pickled_task import TaskPickler
 
 WORKERS = 2
 SIZES = (100, 10, 1000)
@@ -55,7 +55,7 @@ def cluster_projection(rollouts: int = 16, tasks: int = 400) -> list[Benchmark]:
     note = (
         f"rollout {spread(t_r)}; transfer per task {spread(1e3 * t_x, unit='ms')}, with a result of {size} bytes; "
         f"per task {1e3 * scheduler:.2f} ms of the scheduler's processor and {1e3 * client:.2f} ms of the client's; "
-        f"the task itself is sent once, {len(Blobs().get(task).content)} bytes; saturated by "
+        f"the task itself is sent once, {len(TaskPickler().pickle(task).content)} bytes; saturated by "
         f"{costs['t_r'] / costs['t_s']:.0f} workers"
     )
     rows = []

@@ -136,7 +136,7 @@ def test_a_rollout_with_which_workers_are_lost_fails_alone(cluster, tmp_path):
     with DaskExecutor(cluster.client) as executor:
         results = dict(executor.run(task, points))
     assert [results[index].failed for index in range(5)] == [False, False, True, False, False]
-    assert "its workers died, time and again" in results[2].message
+    assert "its workers died again and again" in results[2].message
 
 
 def test_a_closed_executor_leaves_no_processes_on_the_workers(cluster):

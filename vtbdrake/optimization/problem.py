@@ -17,8 +17,8 @@ from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, grid
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
 from vtbdrake.rollout.arguments import all_of, as_number, as_whole
-from vtbdrake.rollout.blob import pack
 from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.pickled_task import pack
 from vtbdrake.rollout.runner import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed

@@ -1,4 +1,4 @@
-"""Rollouts on a Dask cluster: a scheduler and its workers, be they processes, SLURM jobs, pods or hosts behind SSH."""
+"""Rollouts on a Dask cluster: a scheduler with workers, such as processes, SLURM jobs, pods or hosts behind SSH."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from functools import partial
 from math import inf
 from typing import Any
 
-from vtbdrake.rollout.blob import Blob, Blobs, pack, unpack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
+from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, unpack
 from vtbdrake.rollout.runner import failed
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
-from vtbdrake.rollout.worker import answer
 from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
 
 try:
@@ -30,32 +29,31 @@ except ModuleNotFoundError as error:
 _log = logging.getLogger(__name__)
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
-# How many tasks the workers are told about at a time.
+# The number of tasks that the workers keep.
 _TASKS = 16
-# How often the cluster is asked for its size, in seconds: it may grow while it works.
+# The period in seconds at which the size of the cluster is read: it may grow while it works.
 _SIZE_PERIOD = 5.0
 
 
 class DaskExecutor(Executor):
     """Rollouts on a Dask cluster, whose workers need the same vtbdrake and what the problem imports.
 
-    A task is told to all workers once, also to those that come later. Each thread of a worker has its rollouts run in a
-    process of its own (see `ProcessExecutor`), which builds the testbed once and keeps it. So a rollout that crashes or
-    hangs costs two such processes, and is a failed result with the reasons; it costs no worker. When a worker itself is
-    lost, Dask runs its rollouts elsewhere. A rollout with which more workers were lost than
-    ``distributed.scheduler.allowed-failures`` is tried again when no other runs, for it may have been the neighbour of
-    the one at fault; when that fails too, it is a failed result. With no worker left, it waits for new ones, as one
-    does for a queue of jobs.
+    A task is sent once to every worker, also to those that join later. Each thread of a worker runs its rollouts in a
+    child process (see `ProcessExecutor`), which builds the testbed once and keeps it. So a rollout that crashes or
+    hangs costs two such processes and becomes a failed result; it costs no Dask worker. When a Dask worker is lost,
+    Dask runs its rollouts elsewhere. A rollout that was running when more workers than
+    ``distributed.scheduler.allowed-failures`` were lost is tried again alone, because another one may be at fault; if
+    that fails too, it is a failed result. Without any worker left, the executor waits for new ones.
 
     Args:
-        client: of the cluster, and left open; or the address of its scheduler; left out, that in the environment
-            variable ``DASK_SCHEDULER_ADDRESS``.
-        time_limit: in seconds of wall time for one rollout, from when its testbed is there.
-        in_flight: how many rollouts the cluster is given at a time; twice its threads if left out.
+        client: a client of the cluster, which stays open, or the address of the scheduler; by default the address in
+            the environment variable ``DASK_SCHEDULER_ADDRESS``.
+        time_limit: the wall time for one rollout, in seconds, without building its testbed.
+        in_flight: the number of rollouts that the cluster has at a time; by default twice its threads.
 
     Raises:
-        ValueError: no scheduler is known.
-        WorkerError: none answers.
+        ValueError: no scheduler is given.
+        WorkerError: the scheduler does not answer.
     """
 
     def __init__(
@@ -71,8 +69,8 @@ class DaskExecutor(Executor):
         self._limit = in_flight
         self._threads = 0
         self._counted = -inf
-        self._blobs = Blobs()
-        self._told: OrderedDict[str, str] = OrderedDict()
+        self._pickler = TaskPickler()
+        self._sent: OrderedDict[str, str] = OrderedDict()
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
         """See `Executor.run`.
@@ -80,7 +78,7 @@ class DaskExecutor(Executor):
         Raises:
             WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
         """
-        name = self._tell(self._blobs.get(task))
+        name = self._send(self._pickler.pickle(task))
         waiting = deque(range(len(points)))
         suspects: deque[int] = deque()
         tried: set[int] = set()
@@ -104,7 +102,7 @@ class DaskExecutor(Executor):
                     suspects.append(index)
                     _log.warning("rollout %d is tried again, alone: %s", index, error)
                 elif isinstance(error, KilledWorker):
-                    message = f"its workers died, time and again, also when no other rollout ran: {error}"
+                    message = f"its workers died again and again, also while no other rollout ran: {error}"
                     yield index, failed(points[index], message)
                 elif error is not None:
                     raise error
@@ -117,26 +115,26 @@ class DaskExecutor(Executor):
     def _submit(self, name: str, index: int, point: Parameters) -> Future[bytes]:
         key = f"rollout-{uuid.uuid4().hex}"
         try:
-            return self._client.submit(roll_on_dask, name, index, pack(point), self._time_limit, key=key, pure=False)
+            return self._client.submit(run_on_dask, name, index, pack(point), self._time_limit, key=key, pure=False)
         except ClosedClientError as error:
             raise _given_up(error) from error
 
-    def _tell(self, blob: Blob) -> str:
-        """The name under which the workers know the task; sent once."""
-        if blob.digest not in self._told:
-            name = f"vtbdrake-{blob.digest}-{uuid.uuid4().hex}"
+    def _send(self, task: PickledTask) -> str:
+        """Send the task to the workers, unless they have it, and return its name there."""
+        if task.digest not in self._sent:
+            name = f"vtbdrake-{task.digest}-{uuid.uuid4().hex}"
             try:
-                self._client.register_plugin(TaskPlugin(blob), name=name)
+                self._client.register_plugin(TaskPlugin(task), name=name)
             except Exception as error:
                 raise WorkerError(
-                    f"the Dask workers do not take the problem ({type(error).__name__}: {error}): they need the same "
+                    f"the Dask workers cannot read the problem ({type(error).__name__}: {error}): they need the same "
                     "vtbdrake as this process"
                 ) from error
-            self._told[blob.digest] = name
-            if len(self._told) > _TASKS:
-                self._client.unregister_worker_plugin(self._told.popitem(last=False)[1])
-        self._told.move_to_end(blob.digest)
-        return self._told[blob.digest]
+            self._sent[task.digest] = name
+            if len(self._sent) > _TASKS:
+                self._client.unregister_worker_plugin(self._sent.popitem(last=False)[1])
+        self._sent.move_to_end(task.digest)
+        return self._sent[task.digest]
 
     def _room(self) -> int:
         if self._limit is not None:
@@ -151,9 +149,9 @@ class DaskExecutor(Executor):
 
     def close(self) -> None:
         if self._client.status == "running":
-            for name in self._told.values():
+            for name in self._sent.values():
                 self._client.unregister_worker_plugin(name)
-        self._told.clear()
+        self._sent.clear()
         if self._own:
             self._client.close()
 
@@ -176,7 +174,7 @@ def _given_up(error: BaseException) -> WorkerError:
 
 
 def _error(outcome: Any) -> BaseException | None:
-    """What went wrong, on Dask's side or in the rollout. The status of a future may change after its outcome came."""
+    """Return the error in Dask or in the rollout. (The status of a future may change after its outcome arrived.)"""
     if isinstance(outcome, BaseException):
         return _given_up(outcome)
     error = outcome[1] if isinstance(outcome, tuple) else pickle.loads(outcome)[1]
@@ -184,10 +182,10 @@ def _error(outcome: Any) -> BaseException | None:
 
 
 class TaskPlugin(WorkerPlugin):
-    """Brings a task to every worker of a cluster, also to those that come later or are started again."""
+    """Brings a task to every worker of a cluster, also to those that join later or are restarted."""
 
-    def __init__(self, blob: Blob) -> None:
-        self.blob = blob
+    def __init__(self, task: PickledTask) -> None:
+        self.task = task
 
     def setup(self, worker: Any) -> None:
         _children.users += 1
@@ -199,36 +197,36 @@ class TaskPlugin(WorkerPlugin):
 
 
 class _Children:
-    """The processes in which the threads of this Dask worker have their rollouts run, one each.
+    """The child processes that run the rollouts of this Dask worker, one for each of its threads.
 
     Attributes:
-        users: how many tasks the worker knows.
+        users: the number of tasks that the worker knows.
     """
 
     def __init__(self) -> None:
         self.users = 0
-        self._of: dict[tuple[int, float], ProcessExecutor] = {}
+        self._executors: dict[tuple[int, float], ProcessExecutor] = {}
 
     def get(self, time_limit: float) -> ProcessExecutor:
         key = (threading.get_ident(), time_limit)
-        if key not in self._of:
-            self._of[key] = ProcessExecutor(1, time_limit=time_limit)
-        return self._of[key]
+        if key not in self._executors:
+            self._executors[key] = ProcessExecutor(1, time_limit=time_limit)
+        return self._executors[key]
 
     def close(self) -> None:
-        while self._of:
-            self._of.popitem()[1].close()
+        while self._executors:
+            self._executors.popitem()[1].close()
 
 
 _children = _Children()
 
 
-def roll_on_dask(name: str, index: int, point: bytes, time_limit: float) -> bytes:
-    """One rollout on a worker, of the task that it knows by ``name``; the answer is that of `worker.answer`."""
+def run_on_dask(name: str, index: int, point: bytes, time_limit: float) -> bytes:
+    """Run one rollout of the task called ``name`` on a Dask worker; return what `answer` returns."""
     plugin: Any = get_worker().plugins[name]
-    return answer(index, partial(_roll, plugin.blob, point, time_limit))
+    return answer(index, partial(_roll, plugin.task, point, time_limit))
 
 
-def _roll(blob: Blob, point: bytes, time_limit: float) -> RolloutResult:
-    ((_, result),) = _children.get(time_limit).run_blob(blob, [unpack(point)])
+def _roll(task: PickledTask, point: bytes, time_limit: float) -> RolloutResult:
+    ((_, result),) = _children.get(time_limit).run_pickled(task, [unpack(point)])
     return result

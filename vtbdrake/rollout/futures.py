@@ -1,4 +1,4 @@
-"""Rollouts on any pool that speaks `concurrent.futures`: the standard library's, loky's, mpi4py's, Ray's."""
+"""Rollouts on any pool with the interface of `concurrent.futures`: the standard library's, loky's, mpi4py's, Ray's."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import concurrent.futures
 import logging
 import pickle
 import queue
-from collections import deque
+import threading
+from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
 
-from vtbdrake.rollout.blob import Blob, Blobs, pack, run_blob
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
-from vtbdrake.rollout.runner import failed
+from vtbdrake.rollout.pickled_task import KEPT_TASKS, PickledTask, TaskPickler, answer, pack, unpack
+from vtbdrake.rollout.runner import Runners, Testbeds, failed
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
-from vtbdrake.rollout.worker import answer
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 _log = logging.getLogger(__name__)
@@ -24,21 +24,21 @@ _Future = concurrent.futures.Future[bytes]
 
 
 class FuturesExecutor(Executor):
-    """Rollouts on a `concurrent.futures.Executor` that the user brings, and closes.
+    """Rollouts on a `concurrent.futures.Executor` of the user, who also closes it.
 
     Each of its processes builds a testbed once and keeps it; each of its threads has a Context. A pool breaks when one
-    of its processes is killed, and does not say by which rollout. If it is one of processes on this computer (the
-    standard library's, loky's) and has no initializer, a `ProcessExecutor` of as many workers runs what it had and what
-    it has not begun, so that the rollout at fault fails alone. With other pools, the rollouts that it had are failed
-    results, and a `WorkerError` ends the others. Any other error of the pool is raised as itself.
+    of its processes is killed, and does not say by which rollout. If its processes run on this computer (the standard
+    library's, loky's) and it has no initializer, a `ProcessExecutor` with as many workers runs all that is not
+    finished, so that only the rollout at fault fails. With other pools, the rollouts under way fail, and a
+    `WorkerError` ends the others. Any other error of the pool is raised unchanged.
 
     Ray has no such pool of its own: one is a subclass of `concurrent.futures.Executor` whose ``submit(fn, *args)``
     returns ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` says how many run at a time.
 
     Args:
-        pool: where the rollouts run.
-        in_flight: how many rollouts it is given at a time; twice its workers if left out, so that none waits. An
-            interruption takes back what has not begun; what runs goes on to its end.
+        pool: the pool that runs the rollouts.
+        in_flight: the number of rollouts that the pool has at a time; by default twice its workers, so that none waits.
+            An interruption takes back what has not begun; what runs goes on to its end.
     """
 
     def __init__(self, pool: concurrent.futures.Executor, *, in_flight: int | None = None) -> None:
@@ -46,7 +46,7 @@ class FuturesExecutor(Executor):
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
         self._pool = pool
         self._in_flight = in_flight if in_flight is not None else 2 * _workers(pool)
-        self._blobs = Blobs()
+        self._pickler = TaskPickler()
         self._rescue: ProcessExecutor | None = None
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
@@ -55,7 +55,7 @@ class FuturesExecutor(Executor):
         Raises:
             WorkerError: the task cannot be sent to another process, or the pool takes no more work.
         """
-        blob = self._blobs.get(task)
+        pickled = self._pickler.pickle(task)
         waiting = deque(range(len(points)))
         flying: dict[_Future, int] = {}
         landed: queue.SimpleQueue[_Future] = queue.SimpleQueue()
@@ -64,9 +64,9 @@ class FuturesExecutor(Executor):
         try:
             while True:
                 while trouble is None and waiting and len(flying) < self._in_flight:
-                    packed = pack(points[waiting[0]])
+                    point = pack(points[waiting[0]])
                     try:
-                        future = self._pool.submit(roll, blob, waiting[0], packed)
+                        future = self._pool.submit(run_in_pool, pickled, waiting[0], point)
                     except RuntimeError as error:  # It is broken, or was shut down.
                         trouble = error
                     else:
@@ -97,7 +97,7 @@ class FuturesExecutor(Executor):
             raise WorkerError(f"the pool {name} takes no more rollouts: {trouble}") from trouble
 
     def _replaceable(self) -> bool:
-        """Whether processes of ours can do what the pool's did."""
+        """Return whether processes of our own can do what the pool's did."""
         local = isinstance(self._pool, ProcessPoolExecutor) or "loky" in type(self._pool).__module__.split(".")
         return local and getattr(self._pool, "_initializer", None) is None
 
@@ -117,7 +117,7 @@ class FuturesExecutor(Executor):
 
 
 def _workers(pool: concurrent.futures.Executor) -> int:
-    """How many workers the pool has: mpi4py says so, the standard library and loky know it."""
+    """Return the number of workers: public in mpi4py, private in the standard library and loky."""
     return int(getattr(pool, "num_workers", None) or getattr(pool, "_max_workers", None) or cores())
 
 
@@ -132,6 +132,28 @@ def _result(future: _Future) -> RolloutResult:
     return result
 
 
-def roll(blob: Blob, index: int, point: bytes) -> bytes:
-    """One rollout in a worker of any pool; the answer is that of `worker.answer`."""
-    return answer(index, partial(run_blob, blob, point))
+class _Worker:
+    """What a process of the pool keeps: the tasks used last, by digest, and their runners."""
+
+    def __init__(self) -> None:
+        self._runners = Runners(Testbeds())
+        self._tasks: OrderedDict[str, RolloutTask] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def run(self, pickled: PickledTask, point: bytes) -> RolloutResult:
+        with self._lock:
+            if pickled.digest not in self._tasks:
+                self._tasks[pickled.digest] = unpack(pickled.content)
+                if len(self._tasks) > KEPT_TASKS:
+                    self._tasks.popitem(last=False)
+            self._tasks.move_to_end(pickled.digest)
+            task = self._tasks[pickled.digest]
+        return self._runners.run(task, unpack(point))
+
+
+_worker = _Worker()
+
+
+def run_in_pool(task: PickledTask, index: int, point: bytes) -> bytes:
+    """Run one rollout in a worker of the pool; return what `answer` returns."""
+    return answer(index, partial(_worker.run, task, point))

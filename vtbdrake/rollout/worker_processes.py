@@ -1,47 +1,222 @@
-"""Worker processes, each with a testbed that it builds once and keeps."""
+"""Rollouts in worker processes, which keep their testbeds: how workers are fed, timed and restarted; what they run."""
 
 from __future__ import annotations
 
 import logging
+import os
 import pickle
+import resource
+import socket
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from vtbdrake.child_process import ChildProcess, StartError
+from vtbdrake.child_process import ChildProcess, StartError, report_ready
 from vtbdrake.rollout.arguments import as_number
-from vtbdrake.rollout.blob import Blob, Blobs, pack
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
-from vtbdrake.rollout.runner import KEPT, Testbeds, failed
+from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, unpack
+from vtbdrake.rollout.runner import KEPT, Runners, Testbeds, failed
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
-from vtbdrake.rollout.worker import BEGUN, GROWN, main
 
 _log = logging.getLogger(__name__)
 
-# A worker whose last rollout took less than this, in seconds, is given its next one ahead, so that it need not wait for
-# it. Where rollouts are longer this gains nothing, and one that stands behind a very long one would come late.
+# A worker whose last rollout took less than this, in seconds, gets its next one ahead, so that it need not wait for it.
+# Longer rollouts gain nothing from it, and one that waits behind a very long one would come late.
 _BRIEF = 0.1
-# A point of at most so many bytes fits into what a socket holds: to send it does not wait for the worker to read it.
+# A message of at most so many bytes fits into the buffer of a socket: sending it does not wait for the worker.
 _SMALL = 1 << 16
+# What a worker sends besides its answers: the rollout with a time limit begins; its memory has grown too much.
+_BEGUN, _GROWN = b"B", b"G"
+
+
+class ProcessExecutor(Executor):
+    """Processes that keep their testbed from rollout to rollout; for testbeds with systems in Python.
+
+    A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
+    more by another worker, and then counts as failed. A worker that is killed while it starts costs nothing. Where
+    rollouts are short, a worker gets the next one before it has finished the last. A worker whose memory has grown by
+    ``growth`` is replaced between two rollouts, because every testbed that is built, for another value of a scenario's
+    field, leaves memory behind.
+
+    Args:
+        workers: the number of processes; by default the number of cores.
+        time_limit: the wall time for one rollout, in seconds.
+        kept: the number of testbeds that each process keeps, for points with different scenario fields.
+        growth: the number of bytes by which the memory of a process may grow after its first rollout.
+    """
+
+    def __init__(
+        self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT, growth: float = 1e9
+    ) -> None:
+        self._count = checked_workers(workers)
+        self._time_limit = checked_time_limit(time_limit)
+        self._growth = as_number("the growth of a worker's memory", growth)
+        if not self._growth > 0.0:
+            raise ValueError(f"the growth of a worker's memory must be positive, not {growth} bytes")
+        self._kept = Testbeds(kept=kept).kept
+        self._pickler = TaskPickler()
+        self._workers: list[_Worker] = []
+        self._running = False
+        self._starts_lost = 0  # The number of workers in a row that were killed before they were ready.
+
+    def start(self, rollouts: int) -> None:
+        """Start the workers that so many rollouts need, without waiting until they are ready, which takes a second.
+
+        `run` starts those that are missing.
+        """
+        while len(self._workers) < min(self._count, rollouts):
+            self._workers.append(_Worker(self._kept, self._growth))
+
+    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        """See `Executor.run`.
+
+        Raises:
+            WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
+        """
+        yield from self.run_pickled(self._pickler.pickle(task), points)
+
+    def run_pickled(self, task: PickledTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        """Run one rollout per point, of a task that is pickled already; see `run`."""
+        if self._running:
+            raise WorkerError(
+                "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
+                "second executor"
+            )
+        self._running = True
+        try:
+            yield from self._run(task.content, points)
+        finally:
+            self._running = False
+
+    def _run(self, task: bytes, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+        waiting = deque(range(len(points)))
+        losses: dict[int, str] = {}
+        error: BaseException | None = None
+        self.start(len(points))
+        try:
+            self._hand_out(task, waiting, points)
+            left = len(points)
+            while left:
+                finished: list[tuple[int, RolloutResult]] = []
+                replies = self._replies()
+                if not self._workers:
+                    raise WorkerError("the executor was closed while it had rollouts to run")
+                for worker, index, reply in replies:
+                    if isinstance(reply, RolloutResult):
+                        finished.append((index, reply))
+                    elif isinstance(reply, str):
+                        # The rollout that it had not begun is not at fault.
+                        waiting.extendleft(job for job in worker.jobs if job != index)
+                        self._replace(worker)
+                        if index in losses:
+                            finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
+                        else:
+                            _log.warning("rollout %d is tried again: %s", index, reply)
+                            losses[index] = reply
+                            waiting.append(index)
+                    else:
+                        error = error or reply
+                if error is None:
+                    # Workers go on while the caller uses what is finished.
+                    self._hand_out(task, waiting, points)
+                left -= len(finished)
+                yield from finished
+                if error is not None:
+                    raise error
+        finally:
+            # After an error or an interruption, nobody needs the rollouts under way.
+            for worker in [worker for worker in self._workers if worker.jobs]:
+                self._workers.remove(worker)
+                worker.kill()
+
+    def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
+        """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
+        for idle in [worker for worker in self._workers if not worker.jobs]:
+            worker = self._replace(idle) if waiting and idle.grown else idle
+            while waiting and not self._give(worker, task, waiting, points):
+                worker = self._replace(worker)  # It died while it was idle or starting.
+        for worker in self._workers:
+            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
+                # `_replies` notices a worker that has died.
+                self._give(worker, task, waiting, points)
+
+    def _give(self, worker: _Worker, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> bool:
+        """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
+        index = waiting[0]
+        kind = b"R" if self._time_limit == inf else b"L"
+        message = kind + pickle.dumps((index, pack(points[index])))
+        if worker.jobs and len(message) > _SMALL:
+            return True
+        waiting.popleft()
+        try:
+            worker.give(task, index, message)
+        except (OSError, StartError) as error:
+            worker.jobs.pop()
+            waiting.appendleft(index)
+            if isinstance(error, StartError):
+                self._starts_lost += 1
+                # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
+                if (worker.child.exit_code or 0) >= 0 or self._starts_lost > self._count:
+                    raise WorkerError(str(error)) from error
+            return False
+        self._starts_lost = 0
+        return True
+
+    def _replies(self) -> list[tuple[_Worker, int, Any]]:
+        """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
+        busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
+        if not busy:
+            return []
+        first = min(worker.deadline for worker in busy.values())
+        ready = wait(list(busy), None if first == inf else max(0.0, first - time.monotonic()))
+        replies: list[tuple[_Worker, int, Any]] = []
+        for connection, worker in busy.items():
+            index = worker.jobs[0]
+            if connection in ready:
+                try:
+                    message = connection.recv_bytes()
+                    if message == _BEGUN:
+                        worker.begin(self._time_limit)
+                    elif message == _GROWN:
+                        worker.grown = True
+                    else:
+                        reply = pickle.loads(message)
+                        worker.finish(*reply)
+                        replies.append((worker, index, reply[1]))
+                except (EOFError, OSError):
+                    code = worker.child.wait()
+                    replies.append((worker, index, f"its worker process died (exit code {code})"))
+            elif time.monotonic() >= worker.deadline:
+                replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))
+        return replies
+
+    def _replace(self, worker: _Worker) -> _Worker:
+        worker.kill()
+        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth)
+        return new
+
+    def close(self) -> None:
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
 
 
 class _Worker:
     """A worker process and the rollouts that it was given."""
 
     def __init__(self, kept: int, growth: float) -> None:
-        # At once, without grace: its rollout may hang.
-        self.child = ChildProcess(main, kept, growth, name="a worker process", grace=0.0)
+        # Without grace: its rollout may hang.
+        self.child = ChildProcess(_run_worker, kept, growth, name="a worker process", grace=0.0)
         self.connection: Connection | None = None  # None until the worker is ready.
         self._task: bytes | None = None
-        # The rollout that it runs, and one that was given ahead.
-        self.jobs: deque[int] = deque()
+        self.jobs: deque[int] = deque()  # The rollout that it runs, and one that was given ahead.
         self.deadline = inf
-        self.brief = False
-        # True when its memory has grown so much that another worker should replace it.
-        self.grown = False
+        self.brief = False  # True after a short rollout.
+        self.grown = False  # True when its memory has grown so much that it must be replaced.
 
     def give(self, task: bytes, index: int, message: bytes) -> None:
         # Before anything is sent: a worker that was interrupted here must not count as idle.
@@ -73,181 +248,8 @@ class _Worker:
             self.connection.close()
 
 
-class ProcessExecutor(Executor):
-    """Processes that keep their testbed from rollout to rollout; for testbeds with systems in Python.
-
-    A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
-    more by another worker, and is then a failed result. One that is killed while it starts costs nothing. Where
-    rollouts are short, a worker is given the next one before it has finished the last. A worker whose memory has grown
-    by ``growth`` is replaced between two rollouts: every testbed that is built, for another value of a scenario's
-    field, leaves memory behind.
-
-    Args:
-        workers: how many; the number of cores if left out.
-        time_limit: in seconds of wall time for one rollout.
-        kept: how many testbeds each process keeps, for points with different scenario fields.
-        growth: by how many bytes the memory of a process may grow after its first rollout.
-    """
-
-    def __init__(
-        self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT, growth: float = 1e9
-    ) -> None:
-        self._count = checked_workers(workers)
-        self._time_limit = checked_time_limit(time_limit)
-        self._growth = as_number("the growth of a worker's memory", growth)
-        if not self._growth > 0.0:
-            raise ValueError(f"the growth of a worker's memory must be positive, not {growth} bytes")
-        self._kept = Testbeds(kept=kept).kept
-        self._blobs = Blobs()
-        self._workers: list[_Worker] = []
-        self._running = False
-        # How many workers in a row were lost before they were ready.
-        self._starts_lost = 0
-
-    def start(self, rollouts: int) -> None:
-        """Start the workers that so many rollouts need, without waiting until they are ready.
-
-        `run` does so, too; but they take a second, in which one may have other things to do.
-        """
-        while len(self._workers) < min(self._count, rollouts):
-            self._workers.append(_Worker(self._kept, self._growth))
-
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """See `Executor.run`.
-
-        Raises:
-            WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
-        """
-        yield from self.run_blob(self._blobs.get(task), points)
-
-    def run_blob(self, blob: Blob, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point, of a task that is pickled already; see `run`."""
-        if self._running:
-            raise WorkerError(
-                "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
-                "second executor"
-            )
-        self._running = True
-        try:
-            yield from self._run(blob.content, points)
-        finally:
-            self._running = False
-
-    def _run(self, blob: bytes, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        waiting = deque(range(len(points)))
-        losses: dict[int, str] = {}
-        error: BaseException | None = None
-        self.start(len(points))
-        try:
-            self._hand_out(blob, waiting, points)
-            left = len(points)
-            while left:
-                finished: list[tuple[int, RolloutResult]] = []
-                replies = self._replies()
-                if not self._workers:
-                    raise WorkerError("the executor was closed while it had rollouts to run")
-                for worker, index, reply in replies:
-                    if isinstance(reply, RolloutResult):
-                        finished.append((index, reply))
-                    elif isinstance(reply, str):
-                        # What it had not begun is as good as new.
-                        waiting.extendleft(job for job in worker.jobs if job != index)
-                        self._replace(worker)
-                        if index in losses:
-                            finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
-                        else:
-                            _log.warning("rollout %d is tried again: %s", index, reply)
-                            losses[index] = reply
-                            waiting.append(index)
-                    else:
-                        error = error or reply
-                if error is None:
-                    # Workers go on while the caller looks at what is finished.
-                    self._hand_out(blob, waiting, points)
-                left -= len(finished)
-                yield from finished
-                if error is not None:
-                    raise error
-        finally:
-            # After an error or an interruption, what still works works for nothing.
-            for worker in [worker for worker in self._workers if worker.jobs]:
-                self._workers.remove(worker)
-                worker.kill()
-
-    def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
-        """A rollout for every worker that is idle; then, as long as there are enough for all, the next ones ahead."""
-        for idle in [worker for worker in self._workers if not worker.jobs]:
-            worker = self._replace(idle) if waiting and idle.grown else idle
-            while waiting and not self._give(worker, task, waiting, points):
-                worker = self._replace(worker)  # It died while it was idle, or was killed while it started.
-        for worker in self._workers:
-            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
-                # One that has died is found by its reply.
-                self._give(worker, task, waiting, points)
-
-    def _give(self, worker: _Worker, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> bool:
-        """Gives the next one, unless the worker has died; one that is large is not given ahead."""
-        index = waiting[0]
-        kind = b"R" if self._time_limit == inf else b"L"
-        message = kind + pickle.dumps((index, pack(points[index])))
-        if worker.jobs and len(message) > _SMALL:
-            return True
-        waiting.popleft()
-        try:
-            worker.give(task, index, message)
-        except (OSError, StartError) as error:
-            worker.jobs.pop()
-            waiting.appendleft(index)
-            if isinstance(error, StartError):
-                self._starts_lost += 1
-                # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
-                if (worker.child.exit_code or 0) >= 0 or self._starts_lost > self._count:
-                    raise WorkerError(str(error)) from error
-            return False
-        self._starts_lost = 0
-        return True
-
-    def _replies(self) -> list[tuple[_Worker, int, Any]]:
-        """What came in: worker, index, and a result, an exception to raise or, as a string, how the worker was lost."""
-        busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
-        if not busy:
-            return []
-        first = min(worker.deadline for worker in busy.values())
-        ready = wait(list(busy), None if first == inf else max(0.0, first - time.monotonic()))
-        replies: list[tuple[_Worker, int, Any]] = []
-        for connection, worker in busy.items():
-            index = worker.jobs[0]
-            if connection in ready:
-                try:
-                    message = connection.recv_bytes()
-                    if message == BEGUN:
-                        worker.begin(self._time_limit)
-                    elif message == GROWN:
-                        worker.grown = True
-                    else:
-                        reply = pickle.loads(message)
-                        worker.finish(*reply)
-                        replies.append((worker, index, reply[1]))
-                except (EOFError, OSError):
-                    code = worker.child.wait()
-                    replies.append((worker, index, f"its worker process died (exit code {code})"))
-            elif time.monotonic() >= worker.deadline:
-                replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))
-        return replies
-
-    def _replace(self, worker: _Worker) -> _Worker:
-        worker.kill()
-        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth)
-        return new
-
-    def close(self) -> None:
-        for worker in self._workers:
-            worker.kill()
-        self._workers.clear()
-
-
 def checked_time_limit(time_limit: float) -> float:
-    """In seconds.
+    """Return a time limit in seconds as a float.
 
     Raises:
         ValueError: it is not positive.
@@ -256,3 +258,60 @@ def checked_time_limit(time_limit: float) -> float:
     if not time_limit > 0.0:
         raise ValueError(f"the time limit must be positive, not {time_limit} s")
     return time_limit
+
+
+# -- in the worker process
+
+
+def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
+    """Run rollouts on request until the connection closes.
+
+    A task (T) has no answer. A rollout (R) has one, from `answer`. A rollout with a time limit (L) has `_BEGUN` before
+    it, unless its testbed cannot be built. Once, `_GROWN` comes before an answer.
+
+    Args:
+        parent: the connection to the executor.
+        kept: the number of testbeds to keep.
+        growth: the number of bytes by which the memory may grow after the first rollout.
+    """
+    report_ready(parent)
+    connection = Connection(parent.detach())
+    runners = Runners(Testbeds(kept=kept))
+    load: Callable[[], RolloutTask] | None = None
+    limit = inf
+    while True:
+        try:
+            message = connection.recv_bytes()
+            kind, content = message[:1], message[1:]
+            if kind == b"T":
+                # The same object each time, as its runner is known by it. One that cannot be read raises each time.
+                load = cache(partial(unpack, content))
+                continue
+            index, point = pickle.loads(content)
+            assert load is not None, "a worker got a rollout before its task"
+            begin = partial(connection.send_bytes, _BEGUN) if kind == b"L" else None
+            reply = answer(index, partial(_rollout, runners, load, point, begin))
+            if limit == inf:
+                limit = _memory() + growth
+            elif _memory() > limit:
+                connection.send_bytes(_GROWN)
+                limit = growth = inf
+            connection.send_bytes(reply)
+        except (EOFError, OSError):
+            return
+
+
+def _rollout(
+    runners: Runners, load: Callable[[], RolloutTask], point: bytes, begin: Callable[[], Any] | None
+) -> RolloutResult:
+    return runners.run(load(), unpack(point), begin=begin)
+
+
+def _memory() -> float:
+    """Return how much memory this process holds, in bytes; without /proc, the most that it ever held."""
+    try:
+        with open("/proc/self/statm", "rb") as file:
+            return float(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        # Not used on Linux, where a process inherits the maximum of the one that started it.
+        return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

@@ -1,0 +1,127 @@
+"""Tasks, points and results as bytes, for rollouts in other processes."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vtbdrake.pickling import dumps
+from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.task import RolloutResult, RolloutTask
+
+KEPT_TASKS = 16
+
+
+@dataclass(frozen=True)
+class PickledTask:
+    """A pickled task.
+
+    Attributes:
+        content: the bytes, which `unpack` reads.
+        digest: a digest of the content.
+    """
+
+    content: bytes
+    digest: str
+
+
+class TaskPickler:
+    """Pickles tasks, and keeps the bytes of those used last."""
+
+    def __init__(self) -> None:
+        self._pickled: OrderedDict[int, tuple[RolloutTask, PickledTask]] = OrderedDict()
+
+    def pickle(self, task: RolloutTask) -> PickledTask:
+        """Return the pickled task. A task is known by its identity.
+
+        Raises:
+            WorkerError: it cannot be pickled.
+        """
+        if id(task) not in self._pickled:
+            self._pickled[id(task)] = (task, _pickle(task))
+            if len(self._pickled) > KEPT_TASKS:
+                self._pickled.popitem(last=False)
+        self._pickled.move_to_end(id(task))
+        return self._pickled[id(task)][1]
+
+
+def _pickle(task: RolloutTask) -> PickledTask:
+    try:
+        content = dumps(task)
+    except Exception as error:
+        raise WorkerError(
+            f"the problem cannot be sent to another process ({type(error).__name__}: {error}): use executor='threads' "
+            "or 'serial', keep what cannot be pickled out of its quality function and scenario, or move the class or "
+            "function that holds it from the notebook or script into a module"
+        ) from error
+    return PickledTask(content, hashlib.blake2b(content, digest_size=16).hexdigest())
+
+
+def pack(point: Mapping[str, Any]) -> bytes:
+    """Return a point (address -> value) as bytes, which `unpack` reads.
+
+    Raises:
+        WorkerError: a value cannot be pickled.
+    """
+    try:
+        return dumps(dict(point))
+    except Exception:
+        for address, value in point.items():
+            try:
+                dumps(value)
+            except Exception as error:
+                raise WorkerError(
+                    f"{address} = {value!r} cannot be sent to another process ({type(error).__name__}: {error}): vary "
+                    "a value that pickles, or use executor='threads' or 'serial'"
+                ) from error
+        raise
+
+
+def unpack(content: bytes) -> Any:
+    """Return what was pickled in another process.
+
+    Raises:
+        WorkerError: this process cannot import what the content needs.
+    """
+    try:
+        return pickle.loads(content)
+    except Exception as error:
+        raise WorkerError(
+            f"a worker process cannot read what it was sent ({type(error).__name__}: {error}): it needs the same "
+            "modules as the main process, in the same versions"
+        ) from error
+
+
+def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
+    """Run a rollout and return the pickled pair of its index and its result, or the exception that it raised.
+
+    What cannot be pickled, or not be read again, becomes an exception that says so.
+    """
+    outcome: RolloutResult | BaseException
+    try:
+        outcome = rollout()
+    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        outcome = error
+    try:
+        reply = _dumps((index, outcome))
+        if isinstance(outcome, BaseException):
+            pickle.loads(reply)  # Some exceptions pickle but cannot be read again.
+        if not isinstance(outcome, SystemExit):  # It would end the main program.
+            return reply
+    except Exception as error:
+        if isinstance(outcome, RolloutResult):
+            remedy = "record vectors, or use executor='serial'"
+            outcome = TypeError(f"a result cannot be sent from a worker process ({error}): {remedy}")
+            return pickle.dumps((index, outcome))
+    return pickle.dumps((index, RuntimeError(f"{type(outcome).__name__}: {outcome}")))
+
+
+def _dumps(reply: tuple[int, Any]) -> bytes:
+    try:
+        return pickle.dumps(reply)
+    except Exception:  # Of a class that the main program defines.
+        return dumps(reply)
