@@ -14,10 +14,10 @@ from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import JOINTS
 from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.cycle import Cycle
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess

@@ -17,7 +17,7 @@ from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.arm import Arm
 from diagrams.manipulator.motions import CIRCLE
 from diagrams.manipulator.safety import CONTINUITY
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import vtbdrake.child_process as _child_process  # noqa: F401  It notes the directory to which sys.path refers.
 
 if TYPE_CHECKING:
-    from vtbdrake.control.guard import Guards
+    from vtbdrake.control.guards import Guards
     from vtbdrake.control.realtime import RealTime
     from vtbdrake.control.runtime import Runtime
     from vtbdrake.deployment import Deployment
@@ -78,7 +78,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.guard": ("Guards",),
+    "control.guards": ("Guards",),
     "lcm.hub": ("Hub",),
     "lcm.bridge": ("LcmBridge",),
     "monitoring.live.client": ("LiveClient", "watch"),

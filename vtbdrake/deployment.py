@@ -13,7 +13,7 @@ from typing import Any, Self
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import check_continuity
 from vtbdrake.lcm.protocol import Protocol, protocol_of

@@ -14,8 +14,8 @@ from diagrams.manipulator.scenario import ManipulatorScenario
 from diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
@@ -149,4 +149,4 @@ class _Real:
         self._bridge.close()
 
     def _take_down(self, cycle: Cycle) -> None:
-        self.commands.append(cycle.verdict.commands["joint_torque"].copy())
+        self.commands.append(cycle.verdict.actuation["joint_torque"].copy())

@@ -17,9 +17,9 @@ from diagrams.manipulator.safety import CARRY
 from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.text import table
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.bridge import LcmBridge
@@ -110,7 +110,7 @@ class Demo:
         loop = self._deployment().runtime(self.testbed, self.bridge, context=simulated.context)
         self._switch(loop, "shadow")
         loop.run(seconds=1.0)
-        command = loop.command("joint_torque")
+        command = loop.actuator_command("joint_torque")
         print(f"shadow  the DPS feels the machine and commands the simulated arm; it would command {_torque(command)}")
         print(f"        sent to the machine so far: {self.bridge.sent['joint_torque'].count} commands")
         return loop
@@ -170,7 +170,7 @@ class Demo:
         birth.start()
         # The reference is where the arm is, wherever the machine will be.
         loop.target.write(loop.context, {"u.motion": float(FOLLOW)})
-        loop.run(until=lambda: not birth.is_alive() and not _doubts(loop), seconds=60.0)
+        loop.run(until=lambda: not birth.is_alive() and not _sensor_faults(loop), seconds=60.0)
         birth.join()
         loop.run(seconds=0.1)
         print("  the machine is started again: its sensors are fresh, the arm floats")
@@ -238,16 +238,16 @@ def _release(loop: Runtime) -> None:
     loop.reset()
 
 
-def _doubts(loop: Runtime) -> list[str]:
+def _sensor_faults(loop: Runtime) -> list[str]:
     return [
         reason
         for name, seen in loop.bridge.sensed.items()
-        for reason in loop.guards.doubts(name, loop.clock.now(), seen)
+        for reason in loop.guards.sensor_faults(name, loop.clock.now(), seen)
     ]
 
 
 def _last_sent(loop: Runtime) -> np.ndarray:
-    return np.array(loop.guards.commands["joint_torque"].last_sent)
+    return np.array(loop.guards.limiters["joint_torque"].last_sent)
 
 
 def _torque(values: np.ndarray) -> str:

@@ -25,7 +25,7 @@ class ScriptedBridge(Bridge):
     def __init__(self, interface: Interface, clock: Clock, sensors: Callable[[float], Mapping[str, Any]]) -> None:
         self.interface = interface
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
-        self.commanded = {}
+        self.commands = {}
         self.sent: list[tuple[float, dict[str, Any]]] = []
         self.sensors = sensors
         self.up = True
@@ -51,10 +51,10 @@ class ScriptedBridge(Bridge):
             reception.value, reception.arrived, reception.count = np.asarray(value), now, reception.count + 1
         return len(values)
 
-    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+    def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         if not self.up:
-            return tuple(commands)
-        self.sent.append((self._clock.now(), {name: np.array(value) for name, value in commands.items()}))
+            return tuple(actuation)
+        self.sent.append((self._clock.now(), {name: np.array(value) for name, value in actuation.items()}))
         return ()
 
 

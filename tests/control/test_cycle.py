@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vtbdrake.control.cycle import time_after, times_after
+from vtbdrake.control.stepping import time_after, times_after
 
 
 @pytest.mark.parametrize("start", [0.0, 0.3, 0.1 + 0.2, 0.3 + 1e-12, 0.30037, 7.0, 12345.678, -0.5])

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from vtbdrake.control.kernels import Bins, Box, Freshness, Passage, ReceivedSignal, finite, found
+from vtbdrake.control.kernels import Bins, Bounds, RateLimiter, ReceivedSignal, StalenessMonitor, finite, found
 
 NOT_VECTORS: list[Any] = [
     None,
@@ -34,14 +34,14 @@ NOT_VECTORS: list[Any] = [
 @pytest.mark.parametrize("value", NOT_VECTORS)
 def test_only_plain_arrays_of_doubles_are_looked_at(value: Any) -> None:
     assert not finite(value, 2)
-    assert not Box([-9.0, -9.0], [9.0, 9.0]).contains(value)
-    assert Passage([(9.0, 9.0, -9.0, 9.0)] * 2).advance(value, np.zeros(2), np.zeros(2)) is None
+    assert not Bounds([-9.0, -9.0], [9.0, 9.0]).contains(value)
+    assert RateLimiter([(9.0, 9.0, -9.0, 9.0)] * 2).advance(value, np.zeros(2), np.zeros(2)) is None
 
 
 def test_arrays_that_cannot_be_written_can_be_looked_at() -> None:
     value = np.ones(2)
     value.flags.writeable = False
-    assert finite(value, 2) and Box([0.0, 0.0], [1.0, 1.0]).contains(value)
+    assert finite(value, 2) and Bounds([0.0, 0.0], [1.0, 1.0]).contains(value)
 
 
 @given(st.lists(st.floats(), min_size=3, max_size=3))
@@ -52,11 +52,11 @@ def test_a_vector_is_finite_as_numpy_says(entries: list[float]) -> None:
 @given(*[st.lists(st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf]), min_size=3, max_size=3)] * 3)
 def test_a_box_contains_what_numpy_says(lower: list[float], entries: list[float], upper: list[float]) -> None:
     inside = np.all((np.array(lower) <= entries) & (np.array(entries) <= upper))
-    assert Box(lower, upper).contains(np.array(entries)) == inside
+    assert Bounds(lower, upper).contains(np.array(entries)) == inside
 
 
 def test_what_passes_leaves_its_step_and_what_does_not_leaves_nothing() -> None:
-    passage = Passage([(0.5, 0.3, -1.0, 1.0)] * 2)
+    passage = RateLimiter([(0.5, 0.3, -1.0, 1.0)] * 2)
     sent, step = np.array([0.1, 0.2]), np.array([0.05, 0.0])
     command = np.array([0.3, 0.1])
     passed = passage.advance(command, sent, step)
@@ -69,15 +69,15 @@ def test_what_passes_leaves_its_step_and_what_does_not_leaves_nothing() -> None:
 
 def test_limits_that_do_not_belong_together_are_refused() -> None:
     with pytest.raises(ValueError, match="as many lower limits as upper ones, not 3 and 1"):
-        Box([0.0] * 3, [1.0])
+        Bounds([0.0] * 3, [1.0])
     with pytest.raises(ValueError, match="values to unpack"):
-        Passage([(1.0, 1.0, 0.0)])
+        RateLimiter([(1.0, 1.0, 0.0)])
 
 
 # -- ages and histograms
 
 
-class Examined(Freshness):
+class Examined(StalenessMonitor):
     """Finds fault with values below 0."""
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ def test_only_a_reception_has_an_age() -> None:
     nothing: Any = None
     with pytest.raises(TypeError, match="of its ReceivedSignal, not of None"):
         Examined().check(0.0, nothing)
-    with pytest.raises(TypeError, match="Freshness"):
+    with pytest.raises(TypeError, match="StalenessMonitor"):
         found(0.0, {"a": nothing}, {"a": ReceivedSignal()})
 
 

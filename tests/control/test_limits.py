@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vtbdrake.control.limits import AbstractGuard, CommandFault, CommandGuard
+from vtbdrake.control.limits import CommandFault, CommandLimiter, PassThrough
 from vtbdrake.testbed import Signal
 
 T = 1e-3
@@ -21,8 +21,8 @@ def signal(size: int = 1, **limits: object) -> Signal:
     return Signal("joint_position", size=size, unit="rad", idle=0.0, **limits)
 
 
-def guard(start: float | None = 0.0, **limits: object) -> CommandGuard:
-    made = CommandGuard(signal(**limits), period=T)
+def guard(start: float | None = 0.0, **limits: object) -> CommandLimiter:
+    made = CommandLimiter(signal(**limits), period=T)
     if start is not None:
         made.start_from([start])
     return made
@@ -173,7 +173,7 @@ def test_hold_after_motion_brakes_at_the_limit_of_acceleration() -> None:
 
 
 def test_entries_have_limits_of_their_own() -> None:
-    one = CommandGuard(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
+    one = CommandLimiter(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
     one.start_from([0.0, 0.5, 0.0])
     assert one.limit([1.0, -1.0, 2.0]).tolist() == [1e-3, 0.5 - 2e-3, 0.5]
 
@@ -233,7 +233,7 @@ def test_released_guard_forgets_what_was_sent() -> None:
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 def test_entry_that_is_not_finite_is_a_fault_and_changes_nothing(bad: float) -> None:
-    one = CommandGuard(signal(2, rate=1.0), period=T)
+    one = CommandLimiter(signal(2, rate=1.0), period=T)
     one.start_from([0.0, 0.0])
     with pytest.raises(CommandFault, match="not finite") as caught:
         one.limit([1.0, bad])
@@ -242,7 +242,7 @@ def test_entry_that_is_not_finite_is_a_fault_and_changes_nothing(bad: float) -> 
 
 
 def test_large_finite_entries_are_finite() -> None:
-    one = CommandGuard(signal(2, lower=-1.0, upper=1.0), period=T)
+    one = CommandLimiter(signal(2, lower=-1.0, upper=1.0), period=T)
     assert one.limit([1.7e308, 1.7e308]).tolist() == [1.0, 1.0]
 
 
@@ -250,7 +250,7 @@ def test_large_finite_entries_are_finite() -> None:
     "bad", [[0.0], [0.0, 0.0, 0.0], 0.0, [[0.0, 0.0]], None, "ab", [0.0, "x"], [[0.0], [1.0, 2.0]]]
 )
 def test_command_of_another_size_is_a_fault(bad: object) -> None:
-    one = CommandGuard(signal(2), period=T)
+    one = CommandLimiter(signal(2), period=T)
     with pytest.raises(CommandFault) as caught:
         one.limit(bad)
     assert caught.value.kind == "size"
@@ -259,19 +259,19 @@ def test_command_of_another_size_is_a_fault(bad: object) -> None:
 @pytest.mark.parametrize("period", [0.0, -1.0, nan, inf])
 def test_period_must_be_positive(period: float) -> None:
     with pytest.raises(ValueError, match="positive period"):
-        CommandGuard(signal(), period=period)
+        CommandLimiter(signal(), period=period)
 
 
 def test_limits_that_leave_no_step_are_refused() -> None:
     with pytest.raises(ValueError, match="leave no step"):
-        CommandGuard(signal(acceleration=1e-300), period=T)
+        CommandLimiter(signal(acceleration=1e-300), period=T)
 
 
 def test_abstract_signal_has_no_limits_but_remembers() -> None:
     picture = Signal("lamp", model_value="off", idle="off")
     with pytest.raises(ValueError, match="abstract"):
-        CommandGuard(picture, period=T)
-    one = AbstractGuard(picture)
+        CommandLimiter(picture, period=T)
+    one = PassThrough(picture)
     assert one.limit("on") == "on" and one.last_sent == "on"
     with pytest.raises(CommandFault):
         one.limit(None)

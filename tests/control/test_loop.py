@@ -24,7 +24,7 @@ from drake import lcmt_iiwa_command
 from pydrake.systems.framework import BasicVector, Context, System
 
 from tests.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.lcm.bridge import LcmBridge

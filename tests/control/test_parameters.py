@@ -7,7 +7,7 @@ import sys
 import numpy as np
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 
-from vtbdrake.control.parameters import parameters_at_hand
+from vtbdrake.control.stepping import numeric_parameters
 
 
 class _Two(LeafSystem):
@@ -33,14 +33,14 @@ def _values(vectors: list[BasicVector]) -> list[list[float]]:
 def test_all_parameters_below_a_diagram_are_at_hand() -> None:
     whole, part, _ = _nested()
     context = whole.CreateDefaultContext()
-    assert _values(parameters_at_hand(whole, context)) == [[10.0], [11.0, 12.0], [1.0], [2.0, 3.0]]
-    assert _values(parameters_at_hand(part, context)) == [[1.0], [2.0, 3.0]]
+    assert _values(numeric_parameters(whole, context)) == [[10.0], [11.0, 12.0], [1.0], [2.0, 3.0]]
+    assert _values(numeric_parameters(part, context)) == [[1.0], [2.0, 3.0]]
 
 
 def test_a_system_is_given_the_object_that_is_held() -> None:
     whole, part, system = _nested()
     context = whole.CreateDefaultContext()
-    held = parameters_at_hand(part, context)
+    held = numeric_parameters(part, context)
     assert system.GetMyContextFromRoot(context).get_numeric_parameter(1) is held[1]
     assert system.GetMyContextFromRoot(context.Clone()).get_numeric_parameter(1) is not held[1]
 
@@ -48,7 +48,7 @@ def test_a_system_is_given_the_object_that_is_held() -> None:
 def test_what_is_written_is_seen() -> None:
     whole, _, system = _nested()
     context, other = whole.CreateDefaultContext(), whole.CreateDefaultContext()
-    held = parameters_at_hand(whole, context)
+    held = numeric_parameters(whole, context)
     system.GetMyMutableContextFromRoot(context).get_mutable_numeric_parameter(1).SetFromVector([5.0, 6.0])
     assert held[3].value().tolist() == [5.0, 6.0]
     context.SetTimeStateAndParametersFrom(other)
@@ -59,7 +59,7 @@ def test_what_is_written_is_seen() -> None:
 def test_to_ask_again_and_again_keeps_nothing() -> None:
     whole, _, system = _nested()
     context = whole.CreateDefaultContext()
-    held = parameters_at_hand(whole, context)
+    held = numeric_parameters(whole, context)
     own = system.GetMyContextFromRoot(context)
     before = sys.getrefcount(own), sys.getrefcount(held[3])
     for _ in range(100):

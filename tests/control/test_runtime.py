@@ -9,7 +9,7 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import SwitchRefusedError
@@ -60,7 +60,7 @@ def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
     context.SetTime(start)
     clock = SimulatedClock()
     runtime = Runtime(dps, ScriptedBridge(dps.interface, clock, still), period=PERIOD, context=context, clock=clock)
-    runtime.begin()
+    runtime.start_dps()
     ticks = []
     runtime.run(cycles=3000, until=lambda: ticks.append(dps.read(context, "dps.ticks")))
     assert set(np.diff(ticks)) == {1.0}
@@ -107,7 +107,7 @@ def test_in_shadow_the_dps_listens_and_nothing_is_sent():
     runtime.switch("shadow")
     runtime.run(cycles=50)
     assert bridge.sent == []
-    assert np.array_equal(runtime.command("velocity"), 5.0 * (TARGET - [0.05, 0.0]))
+    assert np.array_equal(runtime.actuator_command("velocity"), 5.0 * (TARGET - [0.05, 0.0]))
 
 
 def test_in_twin_the_simulated_world_gets_the_command_too():
@@ -367,21 +367,21 @@ def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
 
 def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
     class Contended(ScriptedBridge):
-        hindrance = None
+        blocked_reason = None
 
     scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
     bridge = Contended(scenario.interface(), clock, still)
     runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
     runtime.write({"u.target": TARGET})
     runtime.cycle()
-    bridge.hindrance = "it belongs to somebody else"
+    bridge.blocked_reason = "it belongs to somebody else"
     assert "belongs to somebody else" in refusal(runtime)
-    bridge.hindrance = None
+    bridge.blocked_reason = None
     runtime.switch("real")
     runtime.run(cycles=2)
-    bridge.hindrance = "it belongs to somebody else"
+    bridge.blocked_reason = "it belongs to somebody else"
     runtime.run(cycles=1)
-    bridge.hindrance = None
+    bridge.blocked_reason = None
     runtime.run(cycles=2)
     assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True, True, False, False, False]
     assert runtime.guards.latched[0].kind == "not ready"
@@ -389,21 +389,21 @@ def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
 
 def test_a_second_publisher_of_commands_is_an_alarm_and_blocks_the_switch_to_real_but_not_the_way_on(caplog):
     class Contended(ScriptedBridge):
-        foreign, contention = 0, None
+        foreign, competing_publisher = 0, None
 
     scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
     bridge = Contended(scenario.interface(), clock, still)
     runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
     runtime.cycle()
-    bridge.foreign, bridge.contention = 3, "somebody else commands"
+    bridge.foreign, bridge.competing_publisher = 3, "somebody else commands"
     runtime.run(cycles=5)
     assert refusal(runtime) == "somebody else commands"
     assert runtime.prepare("shadow").reasons == ()
     assert (runtime.statistics.foreign, "ALARM" in caplog.text) == (0, False), "there is only one"
-    bridge.contention = None
+    bridge.competing_publisher = None
     runtime.switch("real")
     runtime.run(cycles=5)
-    bridge.foreign, bridge.contention = 4, "somebody else commands"
+    bridge.foreign, bridge.competing_publisher = 4, "somebody else commands"
     runtime.run(cycles=5)
     assert runtime.guards.latched == () and len(bridge.sent) == 10
     assert runtime.prepare("real").reasons == ()
@@ -580,7 +580,7 @@ def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
     runtime.switch("real")
     runtime.write({"u.target": [0.1, 0.1]})
     runtime.cycle()
-    runtime.guards.fault("told", runtime.clock.now(), {})
+    runtime.guards.latch("told", runtime.clock.now(), {})
     runtime.reset()
     runtime.cycle()
     switch, write = cycles[1].changes
@@ -594,14 +594,14 @@ def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
 
 def test_commands_u_that_come_by_the_bridge_reach_the_dps_and_those_that_the_dps_refuses_are_counted():
     runtime, bridge, _ = make()
-    bridge.commanded["target"] = ReceivedSignal()
+    bridge.commands["target"] = ReceivedSignal()
     runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
-    bridge.commanded["target"].value, bridge.commanded["target"].count = np.array([0.3, 0.2]), 1
+    bridge.commands["target"].value, bridge.commands["target"].count = np.array([0.3, 0.2]), 1
     runtime.cycle()
     assert np.array_equal(runtime.target.read(runtime.context, "u.target"), [0.3, 0.2])
-    bridge.commanded["target"].value, bridge.commanded["target"].count = np.array([np.nan, 0.2]), 2
+    bridge.commands["target"].value, bridge.commands["target"].count = np.array([np.nan, 0.2]), 2
     done = runtime.cycle()
-    assert done.changes == () and bridge.commanded["target"].rejected == {"refused": 1}
+    assert done.changes == () and bridge.commands["target"].rejected == {"refused": 1}
     assert np.array_equal(runtime.target.read(runtime.context, "u.target"), [0.3, 0.2])
 
 

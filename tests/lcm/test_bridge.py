@@ -350,11 +350,11 @@ def test_second_publisher_of_commands_is_heard_on_a_hub_and_speaks_against_comma
         arm.publish({"position": np.zeros(7)})
         peer.hear(2)
         arm.poll(0.1)
-        assert (arm.foreign, arm.contention) == (0, None)
+        assert (arm.foreign, arm.competing_publisher) == (0, None)
         peer.lcm.publish("IIWA_COMMAND", b"foreign")
         assert wait(arm, lambda: arm.foreign == 1)
-        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.contention or "")
-        assert wait(arm, lambda: arm.contention is None)
+        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
+        assert wait(arm, lambda: arm.competing_publisher is None)
         assert arm.foreign == 1
 
 
@@ -370,10 +370,10 @@ def test_second_publisher_that_a_hub_refuses_is_an_alarm_too() -> None:
             return arm.foreign > 0
 
         assert wait(arm, is_noticed)
-        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.contention or "")
+        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
         assert [data for channel, data in intruder.heard if channel == "IIWA_COMMAND"].count(b"foreign") == 0
-        assert wait(arm, lambda: arm.contention is None)
-        assert arm.hindrance is None
+        assert wait(arm, lambda: arm.competing_publisher is None)
+        assert arm.blocked_reason is None
 
 
 def test_own_and_earlier_refusals_are_not_foreign() -> None:
@@ -403,8 +403,8 @@ def test_on_a_protected_channel_the_hub_tells_who_commands() -> None:
         listener.open()
         in_step(listener, Peer(hub.url))
         commander.publish({"position": np.zeros(7)})
-        assert wait(listener, lambda: listener.foreign == 1 and listener.hindrance is not None)
-        assert listener.contention is None
+        assert wait(listener, lambda: listener.foreign == 1 and listener.blocked_reason is not None)
+        assert listener.competing_publisher is None
 
 
 def test_own_messages_that_come_back_late_are_not_foreign() -> None:
@@ -505,8 +505,8 @@ def test_bridge_whose_commands_the_hub_refuses_counts_and_logs_it(caplog: pytest
         wait(first, lambda: hub.statistics().protected["IIWA_COMMAND"].owner is not None)
         assert wait(second, both_publish)
         assert first.sent["position"].withheld == {}
-        assert first.hindrance is None
-        assert second.hindrance == "the hub protects IIWA_COMMAND for somebody else"
+        assert first.blocked_reason is None
+        assert second.blocked_reason == "the hub protects IIWA_COMMAND for somebody else"
         [record] = [record for record in caplog.records if "refused by the hub" in record.message]
         assert hub.statistics().protected["IIWA_COMMAND"].owner in record.message
 
@@ -538,6 +538,6 @@ def test_commands_u_come_over_lcm_too(hub: Hub, user_types: ModuleType) -> None:
             message = user_types.point_t()
             message.x, message.y = x, 0.25
             peer.lcm.publish("GOAL", message.encode())
-        assert wait(arm, lambda: arm.commanded["goal"].rejected == {"limits": 1})
-        np.testing.assert_array_equal(arm.commanded["goal"].value, [0.5, 0.25, 0.0])
-        assert list(arm.commanded) == ["goal"]
+        assert wait(arm, lambda: arm.commands["goal"].rejected == {"limits": 1})
+        np.testing.assert_array_equal(arm.commands["goal"].value, [0.5, 0.25, 0.0])
+        assert list(arm.commands) == ["goal"]

@@ -9,9 +9,9 @@ import numpy as np
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.cycle import Cycle
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.testbed import DpsAlone
 
 
@@ -55,4 +55,4 @@ class Servo:
     @property
     def commands(self) -> np.ndarray:
         """Of the DPS, (n, 2); NaN where it had none."""
-        return np.array([cycle.commands.get("velocity", [np.nan, np.nan]) for cycle in self.cycles])
+        return np.array([cycle.actuation.get("velocity", [np.nan, np.nan]) for cycle in self.cycles])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vtbdrake.control.cycle import Change
+from vtbdrake.control.stepping import Change
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.log_format import decode_changes, encode_changes
 

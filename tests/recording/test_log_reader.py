@@ -18,7 +18,7 @@ import pytest
 from tests.control.scripted import PERIOD
 from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.cycle import Change
+from vtbdrake.control.stepping import Change
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log

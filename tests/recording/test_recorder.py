@@ -36,7 +36,7 @@ def test_every_cycle_is_recorded_to_the_last_bit(tmp_path: Path) -> None:
     assert log.now.tolist() == [cycle.now for cycle in cycles]
     assert log.ok.tolist() == [cycle.verdict.ok for cycle in cycles]
     assert np.array_equal(log.actuation["velocity"], servo.commands, equal_nan=True)
-    sent = [cycle.verdict.commands.get("velocity", [np.nan, np.nan]) for cycle in cycles]
+    sent = [cycle.verdict.actuation.get("velocity", [np.nan, np.nan]) for cycle in cycles]
     assert np.array_equal(log.sent["velocity"], sent, equal_nan=True)
     assert (log.sources["position"] != 0).tolist() == ["position" in cycle.fed for cycle in cycles]
     for i, cycle in enumerate(cycles):

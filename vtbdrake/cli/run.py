@@ -28,7 +28,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.text import number, write_whole
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError

@@ -21,7 +21,7 @@ cdef inline double* entries_of(object value, Py_ssize_t size) noexcept:
 cdef void* zeros(Py_ssize_t count, size_t size) except NULL
 
 
-cdef class Box:
+cdef class Bounds:
     cdef Py_ssize_t size
     cdef double* lower
     cdef double* upper

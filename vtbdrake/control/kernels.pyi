@@ -5,16 +5,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from vtbdrake.control.ranges import Range
-    from vtbdrake.control.watchdog import Fault
+    from vtbdrake.control.limits import ValueRange
+    from vtbdrake.control.sensor_monitor import Fault
 
 def finite(value: Any, size: int) -> bool: ...
 
-class Box:
+class Bounds:
     def __init__(self, lower: Sequence[float], upper: Sequence[float]) -> None: ...
     def contains(self, value: Any) -> bool: ...
 
-class Passage:
+class RateLimiter:
     def __init__(self, limits: Sequence[tuple[float, float, float, float]]) -> None: ...
     def advance(
         self, command: Any, sent: NDArray[np.float64], step: NDArray[np.float64]
@@ -26,16 +26,22 @@ class ReceivedSignal:
     sent: float
     count: int
     rejected: dict[str, int]
-    range: Range | None
+    range: ValueRange | None
     def __init__(
-        self, value: Any = None, *, arrived: float = ..., sent: float = ..., count: int = 0, range: Range | None = None
+        self,
+        value: Any = None,
+        *,
+        arrived: float = ...,
+        sent: float = ...,
+        count: int = 0,
+        range: ValueRange | None = None,
     ) -> None: ...
     def age(self, now: float) -> float: ...
     def reject(self, reason: str) -> None: ...
     def accept(self, value: Any, arrived: float, sent: float) -> None: ...
 
-class Freshness:
-    trusted: Range | None
+class StalenessMonitor:
+    trusted: ValueRange | None
     @property
     def max_age(self) -> float: ...
     @property
@@ -48,11 +54,13 @@ class Freshness:
     def accept(self, value: Any, arrived: float) -> None: ...
     def examine(self, now: float, reception: ReceivedSignal) -> Fault | None: ...
 
-class Reach:
+class JumpBounds:
     def __init__(self, rate: Sequence[float], tolerance: Sequence[float]) -> None: ...
     def contains(self, before: Any, value: Any, seconds: float) -> bool: ...
 
-def found(now: float, watches: Mapping[str, Freshness], receptions: Mapping[str, ReceivedSignal]) -> list[Fault]: ...
+def found(
+    now: float, watches: Mapping[str, StalenessMonitor], receptions: Mapping[str, ReceivedSignal]
+) -> list[Fault]: ...
 
 class Bins:
     @property

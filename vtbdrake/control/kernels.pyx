@@ -39,7 +39,7 @@ def finite(value, Py_ssize_t size):
     return True
 
 
-cdef class Box:
+cdef class Bounds:
     """Lower and upper limits of a vector, by entry."""
 
     def __cinit__(self, lower, upper):
@@ -66,8 +66,8 @@ cdef class Box:
         return entries is not NULL and self.holds(entries)
 
 
-cdef class Passage:
-    """Limits (step, change, lower, upper) of each entry of a command; see `CommandGuard`, which names w and f."""
+cdef class RateLimiter:
+    """Limits (step, change, lower, upper) of each entry of a command; see `CommandLimiter`, which names w and f."""
 
     cdef Py_ssize_t size
     cdef double* limits
@@ -122,7 +122,7 @@ cdef class ReceivedSignal:
         count: how many were accepted.
         rejected: how many were not, by the reason: ``fingerprint``, ``truncated``, ``trailing``, ``size``, ``not
             finite``, ``limits``, ``out of order``, ``ahead of time``, ...
-        range: the `Range` that the bridge checks every value against before it accepts it; None if it leaves that to
+        range: the `ValueRange` that the bridge checks every value against before it accepts it; None if it leaves that to
             others.
     """
 
@@ -156,8 +156,8 @@ cdef class ReceivedSignal:
         self.count += 1
 
 
-cdef class Freshness:
-    """Looks at a sensor signal's age in every cycle, and has each of its values examined once; `Watchdog` says how.
+cdef class StalenessMonitor:
+    """Looks at a sensor signal's age in every cycle, and has each of its values examined once; `SensorMonitor` says how.
 
     Args:
         max_age: in seconds.
@@ -203,7 +203,7 @@ cdef class Freshness:
         self.fault = None
 
 
-cdef class Reach:
+cdef class JumpBounds:
     """How far the entries of a sensor signal may be from its last accepted sample.
 
     Args:
@@ -240,10 +240,10 @@ cdef class Reach:
 
 
 def found(double now, dict watches, receptions):
-    """What `Freshness.check` finds at the time ``now``, with those of ``watches`` whose receptions are given, by name."""
+    """What `StalenessMonitor.check` finds at the time ``now``, with those of ``watches`` whose receptions are given, by name."""
     faults = []
     for name, reception in receptions.items():
-        fault = (<Freshness?>watches[name]).check(now, reception)
+        fault = (<StalenessMonitor?>watches[name]).check(now, reception)
         if fault is not None:
             faults.append(fault)
     return faults

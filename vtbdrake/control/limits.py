@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.control.kernels import Passage, finite
+from vtbdrake.control.kernels import Bounds, RateLimiter, finite
 from vtbdrake.testbed import Signal
 
 # What stands for "no limit" of a range. Its square is still finite, so that no arithmetic of limits overflows.
@@ -17,6 +17,8 @@ _FAR = 1e150
 
 # Of the magnitude of a command: a difference that only comes from how the command was computed is no limiting.
 _ROUNDING = 1e-12
+
+_LARGEST = float(np.finfo(float).max)
 
 NOT_STARTED = "has a limit of its rate or acceleration, but no start: say what it departs from"
 
@@ -46,7 +48,7 @@ class LimitCount:
     largest: float = 0.0
 
 
-class CommandGuard:
+class CommandLimiter:
     """Keeps the commands of a vector actuator signal within its limits.
 
     With the period T, the command c, what was sent last s and the step before it x, the step that is sent, w = s' - s,
@@ -103,7 +105,7 @@ class CommandGuard:
         # s and x of above, and what they were before the last command.
         self._state, self._state_before = np.zeros((2, self._size)), np.zeros((2, self._size))
         self._sent, self._step_before = self._state
-        self._passage = Passage(self._limits)
+        self._passage = RateLimiter(self._limits)
 
     @property
     def last_sent(self) -> NDArray[np.float64] | None:
@@ -198,15 +200,15 @@ class CommandGuard:
 
 
 def _longest_step(d: float, a: float) -> float:
-    """The step w with f(w) = d; see `CommandGuard`."""
+    """The step w with f(w) = d; see `CommandLimiter`."""
     if d <= a:
         return d
     m = (sqrt(1.0 + 8.0 * d / a) - 1.0) // 2.0
     return d / (m + 1.0) + 0.5 * a * m
 
 
-class AbstractGuard:
-    """Stands for `CommandGuard` where the actuator signal is abstract: it remembers what was sent, no more."""
+class PassThrough:
+    """Stands for `CommandLimiter` where the actuator signal is abstract: it remembers what was sent, no more."""
 
     needs_start = False
 
@@ -240,3 +242,49 @@ class AbstractGuard:
     def send(self, command: Any) -> Any:
         self._sent_before, self.last_sent = self.last_sent, command
         return command
+
+
+class ValueRange:
+    """What a signal's values can be: arrays of its size, finite and within its limits, or objects of its type.
+
+    Attributes:
+        lower, upper: of a vector signal, by entry, finite: so what is infinite is not within them.
+        box: of both.
+    """
+
+    def __init__(self, signal: Signal) -> None:
+        self._size = signal.size
+        self._type: type | None = None
+        self.lower: list[float] = []
+        self.upper: list[float] = []
+        if signal.size is None:
+            self._type = type(signal.abstract_value().get_value())
+        else:
+            self.lower = np.maximum(signal.vector(signal.lower), -_LARGEST).tolist()
+            self.upper = np.minimum(signal.vector(signal.upper), _LARGEST).tolist()
+            self.box = Bounds(self.lower, self.upper)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ValueRange) and self._shape() == other._shape()
+
+    def __hash__(self) -> int:
+        return hash((self._size, self._type))
+
+    def check(self, value: Any) -> str:
+        """Why ``value`` is not one of this signal (``type``, ``size``, ``limits``, ``not finite``); empty if it is."""
+        if self._type is not None:
+            return "" if isinstance(value, self._type) else "type"
+        if self.box.contains(value):
+            return ""
+        try:
+            entries = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            return "type"
+        if entries.shape != (self._size,):
+            return "size"
+        if self.box.contains(entries):
+            return ""
+        return "limits" if np.isfinite(entries).all() else "not finite"
+
+    def _shape(self) -> tuple[Any, ...]:
+        return self._size, self._type, self.lower, self.upper

@@ -15,12 +15,11 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, WallClock
-from vtbdrake.control.cycle import RESET, Cycle
-from vtbdrake.control.guard import Guards
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
-from vtbdrake.control.stepped import Stepped
-from vtbdrake.control.switching import Preparation, SwitchRefusedError, check_continuity, jumps, prepare
+from vtbdrake.control.stepping import RESET, Cycle, Stepped
+from vtbdrake.control.switching import Preparation, SwitchRefusedError, check_continuity, discontinuities, prepare
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -101,7 +100,7 @@ class Runtime(Stepped):
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
         _check_made_for(self.guards, self.statistics, target.interface, period)
-        self.guards.departures = {name: sensor for name, (sensor, _) in self.continuity.items()}
+        self.guards.measured_by = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.ready = ready
         self.cycles = 0
         self.pace = pace
@@ -112,7 +111,7 @@ class Runtime(Stepped):
         self._foreign = bridge.foreign
         self._told_foreign = -inf
         self.slow_parts = SlowParts(
-            slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.changed
+            slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.note_change
         )
 
     def close(self) -> None:
@@ -152,7 +151,7 @@ class Runtime(Stepped):
         if seconds is not None and isnan(seconds):
             raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
         self._stop.clear()
-        self.look()
+        self.read_switches()
         begin = self.clock.now()
         deadline, done = begin, 0
         try:
@@ -233,26 +232,26 @@ class Runtime(Stepped):
         self.slow_parts.receive()
         active = self.active
         fed = self.clock.now()
-        error, commands = self.step()
+        error, actuation = self.step()
         stepped = self.clock.now()
         verdict = self.guards.check(
             # As old as its samples are when it leaves, so old is a command: a long step makes them stale.
             stepped,
             self.watched,
-            commands,
+            actuation,
             active,
             error=error,
             missed=self.statistics.run + self._passed(lateness, stepped - begin),
-            not_ready=self.not_ready() if active else None,
+            blocked=self.blocked_reason() if active else None,
             others=self.bridge.sensed,
         )
-        self.guards.withheld(self.bridge.publish(verdict.commands) if verdict.commands else ())
+        self.guards.note_unsent(self.bridge.publish(verdict.actuation) if verdict.actuation else ())
         self.slow_parts.send()
         if self.bridge.foreign != self._foreign:
             self._tell_foreign()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
-        changes, new = self.news()
-        done = Cycle(self.cycles, self.time, now, changes, new, commands, verdict)
+        changes, new = self.take_record()
+        done = Cycle(self.cycles, self.time, now, changes, new, actuation, verdict)
         self.cycles += 1
         for watcher in self._watchers[:]:
             try:
@@ -278,20 +277,20 @@ class Runtime(Stepped):
         self.statistics.foreign += new
         if now - self._told_foreign >= _TELL_EVERY:
             self._told_foreign = now
-            who = self.bridge.contention or "somebody else publishes commands"
+            who = self.bridge.competing_publisher or "somebody else publishes commands"
             _log.error("ALARM: %s (heard so far: %d)", who, self.statistics.foreign)
 
     def send_fallback(self, reason: str) -> None:
         """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""
-        verdict = self.guards.fault(reason, self.clock.now(), self.watched)
+        verdict = self.guards.latch(reason, self.clock.now(), self.watched)
         # The guards know what was on real in the last cycle, and give nothing for a signal that has not been commanded.
-        farewell = {name: command for name, command in verdict.commands.items() if name in self.active}
+        farewell = {name: command for name, command in verdict.actuation.items() if name in self.active}
         if farewell:
             self.bridge.publish(farewell)
 
-    def not_ready(self) -> str | None:
+    def blocked_reason(self) -> str | None:
         """Why the machine is not to be commanded at present: it is not ready, or somebody else commands it."""
-        return self.bridge.hindrance or self.ready()
+        return self.bridge.blocked_reason or self.ready()
 
     # -- switches
 
@@ -376,7 +375,7 @@ class Runtime(Stepped):
                 future.set_result(action())
             except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
                 future.set_exception(error)
-        self.look()
+        self.read_switches()
 
     def reset(self) -> None:
         """Releases the latch of the guards; the DPS's commands go out again from the next cycle on.
@@ -385,11 +384,11 @@ class Runtime(Stepped):
             SwitchRefusedError: what they latched for is still there, or a command would not continue what is measured,
                 as at a switch to real.
         """
-        against = jumps(self, self.guards.driven)
+        against = discontinuities(self, self.guards.driven)
         reasons = self.guards.reset(self.clock.now(), self.watched, against)
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
-        self.changed(RESET, {})
+        self.note_change(RESET, {})
 
 
 def _check_made_for(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:
@@ -400,7 +399,7 @@ def _check_made_for(guards: Guards, statistics: LoopStatistics, interface: Inter
     for what, its in (("guards", guards.period), ("statistics", statistics.period)):
         if its != period:
             raise ValueError(f"the {what} of this loop are made for a period of {its} s, and it has {period} s")
-    sides = (("actuator", guards.commands, interface.act), ("sensor", guards.watchdogs, interface.sense))
+    sides = (("actuator", guards.limiters, interface.act), ("sensor", guards.monitors, interface.sense))
     for side, guarded, signals in sides:
         names = [signal.name for signal in signals]
         if set(guarded) != set(names):

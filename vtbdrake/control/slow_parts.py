@@ -12,9 +12,9 @@ from typing import Any
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.clock import Clock
-from vtbdrake.control.cycle import RESULT as CHANGE
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
 from vtbdrake.control.statistics import Histogram
+from vtbdrake.control.stepping import RESULT as CHANGE
 from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.cycle import SWITCH
+from vtbdrake.control.stepping import SWITCH
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
 from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM
 from vtbdrake.testbed.testbed import MODES, check_mode
@@ -78,16 +78,16 @@ def prepare(
         heard += [name for name in runtime.watched if senses.get(name) != SIM]
         heard += [runtime.continuity[name][0] for name in becoming if name in runtime.continuity]
     for name in dict.fromkeys(heard):
-        reasons += runtime.guards.doubts(name, now, runtime.bridge.sensed[name])
+        reasons += runtime.guards.sensor_faults(name, now, runtime.bridge.sensed[name])
     if commanding:
         reasons += [f"the guards are latched ({fault.reason}): reset them first" for fault in runtime.guards.latched]
-        not_ready = runtime.not_ready()
-        if not_ready is not None:
-            reasons.append(f"the machine is not ready: {not_ready}")
-        contention = runtime.bridge.contention
-        if becoming and contention is not None:
-            reasons.append(contention)
-        reasons += jumps(runtime, becoming)
+        blocked = runtime.blocked_reason()
+        if blocked is not None:
+            reasons.append(f"the machine is not ready: {blocked}")
+        competing = runtime.bridge.competing_publisher
+        if becoming and competing is not None:
+            reasons.append(competing)
+        reasons += discontinuities(runtime, becoming)
 
     def perform() -> None:
         _throw(runtime, senses, acts)
@@ -129,7 +129,7 @@ def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, f
             raise ValueError(f"the largest difference of {name} from {sensor} is a number from 0 on, not {limit}")
 
 
-def jumps(runtime: Runtime, names: Iterable[str]) -> list[str]:
+def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
     """Return what speaks against commanding actuator signals: commands that would not continue what is measured."""
     found = []
     for name in names:
@@ -146,7 +146,7 @@ def jumps(runtime: Runtime, names: Iterable[str]) -> list[str]:
             found.append(f"nothing is measured of {sensor}, from which the command {name} departs")
             continue
         try:
-            command = runtime.command(name)
+            command = runtime.actuator_command(name)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             found.append(f"the command {name} cannot be computed: {type(error).__name__}: {error}")
             continue
@@ -164,17 +164,17 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
         if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
             # Within its limits, the command departs from what is measured; one that goes out goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
-    runtime.changed(
+    runtime.note_change(
         SWITCH,
         {f"sense.{name}": position for name, position in senses.items()}
         | {f"act.{name}": position for name, position in acts.items()},
     )
     if isinstance(target, DpsAlone):
-        runtime.begin()
+        runtime.start_dps()
         return
     runtime.feed()
     throw(target, context, senses, acts)
-    runtime.look()
+    runtime.read_switches()
 
 
 def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:

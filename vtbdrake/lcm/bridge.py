@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal
-from vtbdrake.control.ranges import Range
-from vtbdrake.control.reported import reported_signals
+from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
+from vtbdrake.control.limits import ValueRange
 from vtbdrake.lcm.connections import Handler, LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
@@ -107,12 +106,12 @@ class LcmBridge(Bridge):
         self.channels = {name: map.channel for map in sense for name in map.signals}
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.reported = {name: ReceivedSignal() for name in carriers}
-        self.commanded = {name: ReceivedSignal() for map in commands for name in map.signals}
+        self.commands = {name: ReceivedSignal() for map in commands for name in map.signals}
         self.sent = {signal.name: SentSignal() for signal in interface.act}
         received = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
         self._readers = [ChannelReader(map, _signals(published, map), received, reorder_window) for map in sense]
         self._readers += [
-            ChannelReader(map, _signals(interface.commands, map), self.commanded, reorder_window) for map in commands
+            ChannelReader(map, _signals(interface.commands, map), self.commands, reorder_window) for map in commands
         ]
         self._writers = [ChannelWriter(map, _signals(interface.act, map), self.sent) for map in act]
 
@@ -146,7 +145,7 @@ class LcmBridge(Bridge):
         return self._link.connected
 
     @property
-    def hindrance(self) -> str | None:
+    def blocked_reason(self) -> str | None:
         if not self._foreign.blocked:
             return None
         return f"the hub protects {', '.join(sorted(self._foreign.blocked))} for somebody else"
@@ -156,7 +155,7 @@ class LcmBridge(Bridge):
         return sum(self._foreign.heard.values()) + self._foreign.refused
 
     @property
-    def contention(self) -> str | None:
+    def competing_publisher(self) -> str | None:
         found = self._foreign.recent(FOREIGN_TIMEOUT)
         if not found:
             return None
@@ -252,7 +251,7 @@ class ChannelReader:
         self.channel = map.channel
         self.clock_jumps = 0
         self._decode = map.decoder(signals)
-        self._signals = [(signal.name, received[signal.name], Range(signal)) for signal in signals]
+        self._signals = [(signal.name, received[signal.name], ValueRange(signal)) for signal in signals]
         for _, received_signal, range in self._signals:
             received_signal.range = range
         self._reorder_window = reorder_window
@@ -340,7 +339,7 @@ class ChannelWriter:
         self.channel = map.channel
         self.named: list[str] = []
         self._encode = map.encoder(signals)
-        self._ranges = {signal.name: Range(signal) for signal in signals}
+        self._ranges = {signal.name: ValueRange(signal) for signal in signals}
         self._sent = sent
 
     def message(self, actuation: Mapping[str, Any], utime: int) -> bytes | None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.control import watchdog
 from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.control.sensor_monitor import LatencyMonitor
 from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine.brake import HoldingBrake
@@ -110,7 +110,7 @@ class Machine:
         self._accepted: dict[str, float] = dict.fromkeys(self._receptions, -inf)
         self._counts = dict.fromkeys(self._receptions, 0)
         self._commands: dict[str, Any] = dict.fromkeys(self._receptions)
-        self._delays: dict[str, watchdog.Delay] = {}
+        self._delays: dict[str, LatencyMonitor] = {}
         self._patience = whole_cycles(config.timeout, config.period)
         self._silent: list[str] = []
 
@@ -149,7 +149,7 @@ class Machine:
         does, so not in lock-step; a sender that does not tell the time is not late.
         """
         wanted = refuse and self.config.max_delay < inf
-        self._delays = {name: watchdog.Delay(self.config.max_delay) for name in self._receptions} if wanted else {}
+        self._delays = {name: LatencyMonitor(self.config.max_delay) for name in self._receptions} if wanted else {}
 
     # -- cycles
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.reported import reported_signals
+from vtbdrake.control.bridge import reported_signals
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.faults import Packet

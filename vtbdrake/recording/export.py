@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.control.stepping import RESET, RESULT, SWITCH, WRITE, Change
 from vtbdrake.recording.log_reader import ControlLog
 from vtbdrake.state.archive import whole_file
 

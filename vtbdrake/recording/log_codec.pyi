@@ -2,8 +2,8 @@ import mmap
 
 import numpy as np
 
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.recording.log_format import CycleLayout
 
 class CycleWriter:

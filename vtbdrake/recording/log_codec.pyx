@@ -124,9 +124,9 @@ cdef class CycleWriter:
         for name, value in fed.items():
             self._put_sensed(message, name, value)
         memset(message + self.act, 0, self.num_act)
-        for name, value in cycle.commands.items():
+        for name, value in cycle.actuation.items():
             self._put_actuation(message, self.actuation[name], value, _COMMANDED)
-        for name, value in verdict.commands.items():
+        for name, value in verdict.actuation.items():
             self._put_actuation(message, self.sent[name], value, _SENT)
         put_uint32(message + self.frame_size, <uint32_t>(before + size))
         return PyBytes_FromStringAndSize(message, size - 4)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vtbdrake.control.cycle import Change
+from vtbdrake.control.stepping import Change
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed, load_scenario

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vtbdrake.control.cycle import Change
+from vtbdrake.control.stepping import Change
 from vtbdrake.lcm.maps import decode
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change

@@ -14,8 +14,8 @@ from typing import Self
 
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end

@@ -15,9 +15,17 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerT
 from pydrake.systems.primitives import Demultiplexer, TrajectorySource, VectorLogSink
 from pydrake.trajectories import DiscreteTimeTrajectory
 
-from vtbdrake.control.boundary import RealPorts
-from vtbdrake.control.cycle import RESET, RESULT, SWITCH, WRITE, Change, time_after, times_after
-from vtbdrake.control.parameters import parameters_at_hand
+from vtbdrake.control.stepping import (
+    RESET,
+    RESULT,
+    SWITCH,
+    WRITE,
+    Change,
+    RealPorts,
+    numeric_parameters,
+    time_after,
+    times_after,
+)
 from vtbdrake.control.switching import throw
 from vtbdrake.lcm.maps import Decoder
 from vtbdrake.lcm.protocol import protocol_of
@@ -184,7 +192,7 @@ class _Replay:
         target.write(context, values)
         self._simulator = self._new_simulator()
         # Keep alive: stops pydrake from wrapping the parameters anew in every step.
-        self._parameters = parameters_at_hand(target.diagram, context)
+        self._parameters = numeric_parameters(target.diagram, context)
         self._ports = RealPorts(target, context)
         self._slow_parts = slow_parts(target.diagram)
         self._idle, self._steps = header.idle, header.steps

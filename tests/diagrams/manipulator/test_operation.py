@@ -73,7 +73,7 @@ def test_the_motion_is_chosen_over_lcm() -> None:
         bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
         bridge.open()
         runtime = Runtime(testbed, bridge, clock=SimulatedClock())
-        speaker, reception = lcm.LCM(hub.url), bridge.commanded["motion"]
+        speaker, reception = lcm.LCM(hub.url), bridge.commands["motion"]
 
         def say(utime: int, motion: float) -> None:
             message = lcmt_scope()

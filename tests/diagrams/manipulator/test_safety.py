@@ -14,7 +14,7 @@ from diagrams.manipulator.safety import CARRY, DISAGREEMENT, SLIP, FloatInPlace
 from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, NoCommand, Sample
-from vtbdrake.control.guard import Guards, Verdict
+from vtbdrake.control.guards import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal, WorldAlone
 
 HOME = np.array(Arm().home)
@@ -108,7 +108,7 @@ def test_interface_without_the_arms_positions_is_refused() -> None:
 
 @pytest.fixture(autouse=True)
 def quiet(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    with caplog.at_level(logging.CRITICAL, logger="vtbdrake.control.guard"):
+    with caplog.at_level(logging.CRITICAL, logger="vtbdrake.control.guards"):
         yield
 
 
@@ -123,7 +123,7 @@ class GuardedArm:
         interface = SCENARIO.interface()
         deployment = SCENARIO.deployment()
         self.guards = Guards(interface, T, **deployment.guards)
-        self.guards.departures = {name: sensor for name, (sensor, _) in deployment.continuity.items()}
+        self.guards.measured_by = {name: sensor for name, (sensor, _) in deployment.continuity.items()}
         self.context = WORLD.default_context()
         self.simulator = WORLD.simulator(self.context)
         self.simulator.Initialize()
@@ -147,9 +147,9 @@ class GuardedArm:
         for name, value in self.heard({name: self.measured(name) for name in self.receptions}).items():
             self.receptions[name].accept(np.array(value), now, now)
         verdict = self.guards.check(now, self.receptions, {"joint_torque": gravity(self.pose)}, **options)
-        self.guards.withheld(())
-        if "joint_torque" in verdict.commands:
-            WORLD.command(self.context, "joint_torque", verdict.commands["joint_torque"])
+        self.guards.note_unsent(())
+        if "joint_torque" in verdict.actuation:
+            WORLD.command(self.context, "joint_torque", verdict.actuation["joint_torque"])
         self.cycles += 1
         self.simulator.AdvanceTo(self.cycles * T)
         return verdict
@@ -168,9 +168,9 @@ def test_arm_whose_sensors_fall_silent_is_carried_and_then_left_to_its_brakes() 
     verdicts = arm.run(round((CARRY - T) / T))
     assert arm.guards.latched[0].kind == "stale"
     assert np.abs(arm.pose - before).max() < 0.01
-    np.testing.assert_allclose(verdicts[-1].commands["joint_torque"], gravity(before), atol=0.5)
+    np.testing.assert_allclose(verdicts[-1].actuation["joint_torque"], gravity(before), atol=0.5)
     arm.run(10)
-    assert arm.cycle().commands == {}
+    assert arm.cycle().actuation == {}
 
 
 @pytest.mark.parametrize("signal", ["joint_position", "joint_velocity", "joint_torque_measured", "wrench"])
@@ -202,7 +202,7 @@ def test_false_positions_within_range_do_not_move_the_arm_that_floats(spoof: str
         "joint_position": SPOOFS[spoof](arm.cycles, measured["joint_position"]),
     }
     for verdict in arm.run(round(CARRY / T) - 10):
-        np.testing.assert_allclose(verdict.commands["joint_torque"], gravity(before), atol=1.0)
+        np.testing.assert_allclose(verdict.actuation["joint_torque"], gravity(before), atol=1.0)
     assert np.abs(arm.pose - before).max() < 0.01
     assert any(fault.kind == "jump" for fault in arm.guards.log)
 
@@ -223,7 +223,7 @@ def test_arm_that_really_is_elsewhere_is_believed_by_a_reset_only() -> None:
     arm.run(50)
     assert "jumps" in arm.reset()[0]
     arm.run(200)
-    assert arm.cycle().commands == {}
+    assert arm.cycle().actuation == {}
     assert arm.reset() == ()
     assert arm.cycle().ok
 
@@ -234,6 +234,6 @@ def test_arm_that_was_not_commanded_for_long_departs_from_the_measured_torque() 
     arm.run(round(CARRY / T) + 100)
     # Its brakes hold it: no torque acts.
     arm.heard = lambda measured: {**measured, "joint_torque_measured": np.zeros(7)}
-    sent = arm.cycle().commands["joint_torque"]
+    sent = arm.cycle().actuation["joint_torque"]
     assert (np.abs(sent) <= np.array(Arm().torque_rates) * T * (1 + 1e-9)).all()
     assert np.abs(sent).max() > 0.0

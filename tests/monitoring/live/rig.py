@@ -12,8 +12,8 @@ import numpy as np
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.testbed import DpsAlone
 

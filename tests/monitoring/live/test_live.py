@@ -180,15 +180,15 @@ def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:
         [(k, change)] = [(k, change) for k, cycle in enumerate(rig.cycles) for change in cycle.changes[:1] if k > 1]
         assert change == ("write", {"dps.gain": 3.0, "u.target": [0.2, -0.1]})
         position = np.array(rig.cycles[k].fed["position"])
-        assert np.array_equal(rig.cycles[k].commands["velocity"], 3.0 * (np.array([0.2, -0.1]) - position))
-        assert not np.array_equal(rig.cycles[k - 1].commands["velocity"], rig.cycles[k].commands["velocity"])
+        assert np.array_equal(rig.cycles[k].actuation["velocity"], 3.0 * (np.array([0.2, -0.1]) - position))
+        assert not np.array_equal(rig.cycles[k - 1].actuation["velocity"], rig.cycles[k].actuation["velocity"])
 
 
 def test_what_is_read_is_what_is_there(shared: Rig) -> None:
     found = shared.during(asked, shared.url, "get", ["dps.gain", "u.target", "u.target[1]", "real.act.velocity"])
     assert (found["dps.gain"], found["u.target[1]"]) == (5.0, 0.0)
     assert np.array_equal(found["u.target"], [0.0, 0.0])
-    assert any(np.array_equal(found["real.act.velocity"], cycle.commands.get("velocity")) for cycle in shared.cycles)
+    assert any(np.array_equal(found["real.act.velocity"], cycle.actuation.get("velocity")) for cycle in shared.cycles)
 
 
 @pytest.mark.parametrize(
@@ -307,7 +307,7 @@ def test_a_latch_is_released_from_outside_once_its_cause_is_over(hub: Hub) -> No
 
 def test_values_watched_are_those_of_their_cycle(shared: Rig) -> None:
     seen = shared.during(watched, shared.url, ["dps.velocity", "real.act.velocity", "dps.ticks"], 50)
-    by_time = {cycle.time: cycle.commands for cycle in shared.cycles}
+    by_time = {cycle.time: cycle.actuation for cycle in shared.cycles}
     for t, values in seen:
         assert np.array_equal(values["dps.velocity"], by_time[t]["velocity"])
         assert np.array_equal(values["real.act.velocity"], by_time[t]["velocity"])

@@ -7,10 +7,9 @@ from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal
+from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.guard import Guards
-from vtbdrake.control.reported import reported_signals
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.lcm.protocol import protocol_of
@@ -28,7 +27,7 @@ class Ear(Bridge):
         carriers = reported_signals(self.interface, protocol.reported)
         self.sensed = {signal.name: ReceivedSignal() for signal in self.interface.sense}
         self.reported = {name: ReceivedSignal() for name in carriers}
-        self.commanded = {}
+        self.commands = {}
         self.heard: deque[tuple[str, bytes]] = deque()
         signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
         receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
@@ -54,8 +53,8 @@ class Ear(Bridge):
             self._inlets[channel].take(channel, data)
         return count
 
-    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
-        raise AssertionError("who only listens commands nothing")
+    def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
+        raise AssertionError("who only listens actuation nothing")
 
 
 class Line(Ear):
@@ -89,10 +88,10 @@ class Line(Ear):
                 ear.heard.append(told)
         return super().poll()
 
-    def publish(self, commands: Mapping[str, Any]) -> Collection[str]:
+    def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         self._utime += 1
         for outlet in self._outlets:
-            data = outlet.message(commands, self._utime)
+            data = outlet.message(actuation, self._utime)
             assert data is not None
             self.machine.receive(outlet.channel, data)
         return ()
@@ -109,10 +108,10 @@ def loop(
     if not begin:
         return runtime
     if isinstance(target, DpsAlone):
-        runtime.begin()
+        runtime.start_dps()
     for signal in target.interface.act:
         if guards.needs_start(signal.name):
-            guards.start(signal.name, runtime.command(signal.name))
+            guards.start(signal.name, runtime.actuator_command(signal.name))
     return runtime
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.cycle import Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.monitoring.live.desk import VALUES, attend, text_frame, values_record

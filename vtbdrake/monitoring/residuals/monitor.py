@@ -13,8 +13,8 @@ from typing import Self
 
 import numpy as np
 
-from vtbdrake.control.cycle import SWITCH, Cycle
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import SWITCH, Cycle
 from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, calibrate
 from vtbdrake.monitoring.residuals.comparison import (
@@ -366,7 +366,7 @@ class Sampler:
                 self._counts[name] = received.count
                 row[self._layout.reported[name]] = received.value
         for name, place in self._layout.actuation.items():
-            command = cycle.verdict.commands.get(name) if self._twin else self._runtime.command(name)
+            command = cycle.verdict.actuation.get(name) if self._twin else self._runtime.actuator_command(name)
             if command is not None:
                 row[place] = command
         for age, estimates in self._estimates:

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
 from vtbdrake.control.kernels import found
-from vtbdrake.control.limits import NOT_STARTED, AbstractGuard, CommandFault, CommandGuard
-from vtbdrake.control.watchdog import Fault, Watchdog
+from vtbdrake.control.limits import NOT_STARTED, CommandFault, CommandLimiter, PassThrough
+from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
 from vtbdrake.testbed import Interface, Signal
 
 _log = logging.getLogger(__name__)
@@ -28,12 +28,12 @@ class Verdict(NamedTuple):
     """What the guards made of a cycle.
 
     Attributes:
-        commands: what is to be sent, by actuator signal.
+        actuation: what is to be sent, by actuator signal.
         ok: whether these are the DPS's commands, limited; else they are the fallbacks'.
         faults: what is wrong in this cycle; a latch can outlast it.
     """
 
-    commands: dict[str, Any]
+    actuation: dict[str, Any]
     ok: bool
     faults: tuple[Fault, ...]
 
@@ -53,8 +53,8 @@ class Guards:
     Fallbacks go on when the machine is gone: they get the sensor signals that are still fresh, and the last accepted
     sample of each with its age. `Brake` turns into `Zero` when its velocity is stale.
 
-    A command that did not leave does not count (see `withheld`). From `start` until a first command has left, commands
-    depart in every cycle from what `departures` measures then, since the machine is free to move meanwhile. So they do
+    A command that did not leave does not count (see `note_unsent`). From `start` until a first one has left, commands
+    depart in every cycle from what `measured_by` measures then, since the machine is free to move meanwhile. So they do
     after more than `MOST_UNSENT` commands in a row that did not leave, or as long a silence of a fallback or of the
     loop itself. Until what is measured is fresh, nothing is sent. A pause of the loop counts if it is longer than the
     `max_age` of what is measured, too: in lock-step, where that is infinite, time stands still in it.
@@ -63,17 +63,17 @@ class Guards:
         interface: of the DPS.
         period: of the loop, in seconds.
         fallback: by actuator signal; see `default_fallback` for the others.
-        jump_tolerance, max_delay: by sensor signal; see `Watchdog`.
+        jump_tolerance, max_delay: by sensor signal; see `SensorMonitor`.
         max_missed: more deadlines missed in a row are a fault. So are more commands in a row that did not leave, but
             of those never more than `MOST_UNSENT` are allowed.
         log_size: how many faults `log` keeps.
 
     Attributes:
         period: of the loop whose cycles they judge, in seconds.
-        commands: the guard of each actuator signal, with its counts.
-        watchdogs: of each sensor signal.
+        limiters: the limiter of each actuator signal, with its counts.
+        monitors: of each sensor signal.
         log: the newest faults, each once while it lasts.
-        departures: actuator signal -> sensor signal that measures what acts there; the `Runtime` takes it from its
+        measured_by: actuator signal -> sensor signal that measures what acts there; the `Runtime` takes it from its
             continuity. Without one, commands go on from the last one that left.
 
     Raises:
@@ -97,15 +97,15 @@ class Guards:
         _refuse_unknown("max_delay", max_delay, interface.sense)
         if isnan(max_missed) or max_missed < 0:
             raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
-        self.commands: dict[str, CommandGuard | AbstractGuard] = {
-            s.name: CommandGuard(s, period=period) if s.is_vector else AbstractGuard(s) for s in interface.act
+        self.limiters: dict[str, CommandLimiter | PassThrough] = {
+            s.name: CommandLimiter(s, period=period) if s.is_vector else PassThrough(s) for s in interface.act
         }
-        self.watchdogs = {
-            s.name: Watchdog(s, jump_tolerance=jump_tolerance.get(s.name), max_delay=max_delay.get(s.name))
+        self.monitors = {
+            s.name: SensorMonitor(s, jump_tolerance=jump_tolerance.get(s.name), max_delay=max_delay.get(s.name))
             for s in interface.sense
         }
         self.log: deque[Fault] = deque(maxlen=log_size)
-        self.departures: Mapping[str, str] = {}
+        self.measured_by: Mapping[str, str] = {}
         self._fallbacks = {
             s.name: chain(fallback.get(s.name) or default_fallback(s), s, interface=interface) for s in interface.act
         }
@@ -141,7 +141,7 @@ class Guards:
 
     def needs_start(self, name: str) -> bool:
         """Whether an actuator signal has a limit of its rate or acceleration, which counts from somewhere."""
-        return self.commands[name].needs_start
+        return self.limiters[name].needs_start
 
     def start(self, name: str, value: Any) -> None:
         """Lets the commands of an actuator signal depart from ``value``, at rest.
@@ -151,60 +151,60 @@ class Guards:
         Raises:
             ValueError: it has another size or is not finite.
         """
-        self.commands[name].start_from(value)
+        self.limiters[name].start_from(value)
         self._departing |= {name}
 
-    def doubts(self, name: str, now: float, reception: ReceivedSignal) -> list[str]:
+    def sensor_faults(self, name: str, now: float, reception: ReceivedSignal) -> list[str]:
         """What is wrong with a sensor signal now."""
-        fault = self.watchdogs[name].check(now, reception)
+        fault = self.monitors[name].check(now, reception)
         return [fault.reason] if fault else []
 
     def check(
         self,
         now: float,
         receptions: Mapping[str, ReceivedSignal],
-        commands: Mapping[str, Any],
+        actuation: Mapping[str, Any],
         active: Collection[str] | None = None,
         *,
         error: BaseException | None = None,
         missed: int = 0,
-        not_ready: str | None = None,
+        blocked: str | None = None,
         others: Mapping[str, ReceivedSignal] = MappingProxyType({}),
     ) -> Verdict:
-        """Judge one cycle. What it returns counts as sent, unless `withheld` says otherwise before the next one.
+        """Judge one cycle. What it returns counts as sent, unless `note_unsent` says otherwise before the next one.
 
         Args:
             now: the time on the clock of `ReceivedSignal.arrived`, in seconds.
             receptions: of the sensor signals that are on real; no others are watched.
-            commands: of the DPS, by actuator signal.
-            active: the actuator signals that are on real, each once; by default those of ``commands``, and those of the
-                cycle before if the DPS raised.
+            actuation: commands of the DPS, by actuator signal.
+            active: the actuator signals that are on real, each once; by default those of ``actuation``, or if the DPS
+                raised, those of the cycle before.
             error: what the DPS raised, if it did.
             missed: how many deadlines were missed in a row, up to now.
-            not_ready: why the machine is not ready, if it is not.
+            blocked: why the machine is not ready, if it is not.
             others: receptions of sensor signals that are not on real: fallbacks may use them.
         """
         if self._unconfirmed:
-            self.withheld(())
+            self.note_unsent(())
         self._unconfirmed = True
-        driven = self._activate(active if active is not None else self._active if error else commands)
-        causes = self._whole(now, error, missed, not_ready)
+        driven = self._activate(active if active is not None else self._active if error else actuation)
+        causes = self._whole(now, error, missed, blocked)
         causes += self._depart_anew(now, receptions, others)
         wanted = []
         if error is None:
             for name in driven:
-                guard: Any = self.commands[name]
+                guard: Any = self.limiters[name]
                 try:
-                    if name not in commands:
+                    if name not in actuation:
                         raise CommandFault("missing", "is missing")
                     if guard.needs_start and not guard.has_start:
                         raise CommandFault("not started", NOT_STARTED)
-                    wanted.append((name, guard, guard.checked(commands[name])))
+                    wanted.append((name, guard, guard.checked(actuation[name])))
                 except CommandFault as problem:
                     causes.append(Fault(now, name, problem.kind, f"the command {name} {problem}"))
-        doubts = found(now, self.watchdogs, receptions)
-        if causes or doubts or self._faults:
-            self._note(causes, doubts)
+        sensor_faults = found(now, self.monitors, receptions)
+        if causes or sensor_faults or self._faults:
+            self._note(causes, sensor_faults)
             if self._faults and driven and not self._latched:
                 self._latch(self._faults)
             if not driven:
@@ -215,7 +215,7 @@ class Guards:
         self._silent = frozenset()
         return Verdict({name: guard.send(values) for name, guard, values in wanted}, True, self._faults)
 
-    def withheld(self, names: Collection[str]) -> None:
+    def note_unsent(self, names: Collection[str]) -> None:
         """Take note of which commands of the last verdict did not leave: those do not count as sent.
 
         Args:
@@ -225,13 +225,13 @@ class Guards:
         if not names and not self._unsent and not self._silent and not self._departing:
             return
         for name in names:
-            self.commands[name].take_back()
+            self.limiters[name].take_back()
         self._held_back = frozenset(names)
         left = frozenset(self._active) - self._held_back - self._silent
         self._unsent = {name: self._unsent.get(name, 0) + 1 for name in self._active if name not in left}
         self._departing -= left
 
-    def fault(self, reason: str, now: float, receptions: Mapping[str, ReceivedSignal]) -> Verdict:
+    def latch(self, reason: str, now: float, receptions: Mapping[str, ReceivedSignal]) -> Verdict:
         """Latches because somebody says so, whether or not anything is on real; the verdict is that of a cycle."""
         self._depart_anew(now, receptions)
         told = Fault(now, None, "told", reason)
@@ -253,8 +253,8 @@ class Guards:
         Returns:
             Why it stays; empty if it was released.
         """
-        doubts = found(now, self.watchdogs, receptions)
-        lasting = [doubt for doubt in doubts if not (doubt.kind == "jump" and self._steady(doubt))]
+        sensor_faults = found(now, self.monitors, receptions)
+        lasting = [doubt for doubt in sensor_faults if not (doubt.kind == "jump" and self._steady(doubt))]
         reasons = (*(fault.reason for fault in (*self._causes, *lasting)), *against)
         if not reasons:
             self._accept_steady()
@@ -266,12 +266,12 @@ class Guards:
         names = tuple(names)
         if names != self._active:
             for name in set(self._active) - set(names):
-                self.commands[name].release()
+                self.limiters[name].release()
                 self._departing -= {name}
             self._active = names
         return names
 
-    def _whole(self, now: float, error: BaseException | None, missed: int, not_ready: str | None) -> list[Fault]:
+    def _whole(self, now: float, error: BaseException | None, missed: int, blocked: str | None) -> list[Fault]:
         """The faults that are not about one signal."""
         faults = []
         if error is not None:
@@ -279,8 +279,8 @@ class Guards:
         if missed > self._max_missed:
             reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
             faults.append(Fault(now, None, "missed", reason))
-        if not_ready is not None:
-            faults.append(Fault(now, None, "not ready", f"the machine is not ready: {not_ready}"))
+        if blocked is not None:
+            faults.append(Fault(now, None, "not ready", f"the machine is not ready: {blocked}"))
         return faults
 
     def _lapsed(self, pause: float) -> frozenset[str]:
@@ -288,7 +288,7 @@ class Guards:
         return frozenset(
             name
             for name in self._active
-            if name in self.departures and pause > self.watchdogs[self.departures[name]].max_age
+            if name in self.measured_by and pause > self.monitors[self.measured_by[name]].max_age
         )
 
     def _depart_anew(
@@ -308,30 +308,30 @@ class Guards:
             unsent = count > self._most_unsent
             if unsent and name in self._held_back:
                 causes.append(Fault(now, name, "not sent", f"the last {count} commands {name} could not be sent"))
-            guard = self.commands[name]
-            sensor = self.departures.get(name)
+            guard = self.limiters[name]
+            sensor = self.measured_by.get(name)
             if not guard.needs_start or sensor is None:
                 continue
             if not unsent and name not in self._departing:
                 continue
             reception = receptions.get(sensor) or others.get(sensor)
-            if reception is not None and self.watchdogs[sensor].check(now, reception) is None:
+            if reception is not None and self.monitors[sensor].check(now, reception) is None:
                 guard.start_from(reception.value)
             else:
                 guard.release()
         return causes
 
     def _steady(self, jump: Fault) -> bool:
-        return jump.signal is not None and self.watchdogs[jump.signal].steady
+        return jump.signal is not None and self.monitors[jump.signal].steady
 
     def _accept_steady(self) -> None:
-        for watchdog in self.watchdogs.values():
-            watchdog.accept_steady()
+        for monitor in self.monitors.values():
+            monitor.accept_steady()
 
-    def _note(self, causes: list[Fault], doubts: list[Fault]) -> None:
+    def _note(self, causes: list[Fault], sensor_faults: list[Fault]) -> None:
         """Logs the faults that the cycle before did not have."""
         known = {(fault.signal, fault.kind) for fault in self._faults}
-        self._faults, self._causes = (*causes, *doubts), tuple(causes)
+        self._faults, self._causes = (*causes, *sensor_faults), tuple(causes)
         self.log.extend(fault for fault in self._faults if (fault.signal, fault.kind) not in known)
 
     def _latch(self, faults: tuple[Fault, ...]) -> None:
@@ -347,17 +347,17 @@ class Guards:
         sensed = {
             name: reception.value
             for name, reception in receptions.items()
-            if self.watchdogs[name].check(now, reception) is None
+            if self.monitors[name].check(now, reception) is None
         }
         known = {
-            name: Sample(watchdog.value, now - watchdog.arrived)
-            for name, watchdog in self.watchdogs.items()
-            if watchdog.arrived > -inf
+            name: Sample(monitor.value, now - monitor.arrived)
+            for name, monitor in self.monitors.items()
+            if monitor.arrived > -inf
         }
         commands = {
             name: self._fallback_command(name, now, sensed, known, dt)
             for name in self._active
-            if self.commands[name].has_start
+            if self.limiters[name].has_start
         }
         sent = {name: command for name, command in commands.items() if command is not NO_COMMAND}
         self._silent = frozenset(self._active) - frozenset(sent)
@@ -366,7 +366,7 @@ class Guards:
     def _fallback_command(
         self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float
     ) -> Any:
-        guard: Any = self.commands[name]
+        guard: Any = self.limiters[name]
         last_sent = guard.last_sent
         for fallback in self._fallbacks[name]:
             try:

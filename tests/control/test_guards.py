@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
-from vtbdrake.control.guard import Guards, Verdict
+from vtbdrake.control.guards import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal
 
 T = 1e-3
@@ -28,7 +28,7 @@ LAMP = Signal("lamp", model_value="off", idle="off")
 
 @pytest.fixture(autouse=True)
 def quiet(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    with caplog.at_level(logging.CRITICAL, logger="vtbdrake.control.guard"):
+    with caplog.at_level(logging.CRITICAL, logger="vtbdrake.control.guards"):
         yield
 
 
@@ -64,8 +64,8 @@ def test_without_a_fault_the_limited_commands_go_out() -> None:
     loop = Loop(TORQUE, POSITION)
     verdict = loop.cycle({"torque": [0.05, 4.0], "position": [1e-6]})
     assert verdict.ok and not verdict.faults
-    assert {name: c.tolist() for name, c in verdict.commands.items()} == {"torque": [0.05, 0.1], "position": [1e-6]}
-    assert loop.guards.commands["torque"].counts["rate"].count == 1
+    assert {name: c.tolist() for name, c in verdict.actuation.items()} == {"torque": [0.05, 0.1], "position": [1e-6]}
+    assert loop.guards.limiters["torque"].counts["rate"].count == 1
 
 
 FAULTS: list[tuple[dict[str, Any], dict[str, Any], tuple[str | None, str]]] = [
@@ -76,7 +76,7 @@ FAULTS: list[tuple[dict[str, Any], dict[str, Any], tuple[str | None, str]]] = [
     ({}, {"active": ["torque"]}, ("torque", "missing")),
     ({}, {"error": ZeroDivisionError("at cycle 2")}, (None, "raised")),
     ({"torque": [0.1, 0.1]}, {"missed": 11}, (None, "missed")),
-    ({"torque": [0.1, 0.1]}, {"not_ready": "its brakes are closed"}, (None, "not ready")),
+    ({"torque": [0.1, 0.1]}, {"blocked": "its brakes are closed"}, (None, "not ready")),
 ]
 
 
@@ -89,10 +89,10 @@ def test_fault_brings_the_fallback_in_the_same_cycle_and_latches(
         loop.cycle({"torque": [1.0, 1.0]})
     verdict = loop.cycle(commands, **options)
     assert not verdict.ok and kinds(verdict) == [expected]
-    assert verdict.commands["torque"] == pytest.approx([0.4, 0.4])
+    assert verdict.actuation["torque"] == pytest.approx([0.4, 0.4])
     after = loop.cycle({"torque": [1.0, 1.0]})
     assert not after.ok and not after.faults
-    assert after.commands["torque"] == pytest.approx([0.3, 0.3])
+    assert after.actuation["torque"] == pytest.approx([0.3, 0.3])
     assert [(fault.signal, fault.kind) for fault in loop.guards.latched] == [expected]
 
 
@@ -146,9 +146,9 @@ def test_reset_that_is_refused_does_not_accept_a_level_that_a_sensor_jumped_to()
     for _ in range(200):
         loop.cycle({"torque": [nan, 0.0]})
         assert loop.reset() != ()
-    assert loop.guards.watchdogs["velocity"].value.tolist() == [0.0, 0.0]
+    assert loop.guards.monitors["velocity"].value.tolist() == [0.0, 0.0]
     assert loop.guards.reset(loop.now, loop.receptions, ("somebody is in the cell",))[-1] == "somebody is in the cell"
-    assert loop.guards.watchdogs["velocity"].value.tolist() == [0.0, 0.0]
+    assert loop.guards.monitors["velocity"].value.tolist() == [0.0, 0.0]
 
 
 def test_sensor_that_is_not_on_real_is_not_watched() -> None:
@@ -160,15 +160,15 @@ def test_fault_of_one_signal_brings_the_fallbacks_of_all() -> None:
     loop = Loop(TORQUE, POSITION)
     loop.cycle({"torque": [1.0, 1.0], "position": [5e-5]})
     verdict = loop.cycle({"torque": [1.0, 1.0], "position": [nan]})
-    assert verdict.commands["torque"] == pytest.approx([0.0, 0.0], abs=1e-12)
-    assert verdict.commands["position"] == pytest.approx([5e-5])
+    assert verdict.actuation["torque"] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert verdict.actuation["position"] == pytest.approx([5e-5])
 
 
 def test_command_of_a_faulty_cycle_leaves_no_trace_in_the_limits() -> None:
     loop = Loop(TORQUE, POSITION, fallback={"torque": Hold()})
     loop.cycle({"torque": [0.1, 0.1], "position": [0.0]})
     verdict = loop.cycle({"torque": [0.2, 0.2], "position": [nan]})
-    assert verdict.commands["torque"].tolist() == [0.1, 0.1]
+    assert verdict.actuation["torque"].tolist() == [0.1, 0.1]
 
 
 def test_reset_is_refused_while_the_cause_persists() -> None:
@@ -178,12 +178,12 @@ def test_reset_is_refused_while_the_cause_persists() -> None:
     assert not loop.cycle({"torque": [0.05, 0.0]}).ok
     assert loop.reset() == ()
     verdict = loop.cycle({"torque": [0.05, 0.0]})
-    assert verdict.ok and verdict.commands["torque"].tolist() == [0.05, 0.0]
+    assert verdict.ok and verdict.actuation["torque"].tolist() == [0.05, 0.0]
 
 
 def test_reset_looks_at_the_sensors_anew() -> None:
     loop = Loop(TORQUE)
-    loop.cycle({"torque": [0.0, 0.0]}, not_ready="it is off")
+    loop.cycle({"torque": [0.0, 0.0]}, blocked="it is off")
     loop.cycle({"torque": [0.0, 0.0]})
     assert loop.guards.reset(loop.now + 1.0, loop.receptions) == (
         "sensor signal velocity is stale: 1000.0 ms old, 20 allowed",
@@ -196,7 +196,7 @@ def test_reset_names_all_causes() -> None:
     loop = Loop(TORQUE)
     loop.silent = True
     loop.receptions["velocity"].count = 0
-    loop.cycle({"torque": [0.0]}, missed=20, not_ready="it is off")
+    loop.cycle({"torque": [0.0]}, missed=20, blocked="it is off")
     assert loop.reset() == (
         "20 deadlines were missed in a row, 10 are allowed",
         "the machine is not ready: it is off",
@@ -212,14 +212,14 @@ def test_commands_after_a_reset_depart_from_the_fallback() -> None:
     loop.cycle({}, error=RuntimeError("once"))
     loop.cycle({"torque": [2.0, 2.0]})
     assert loop.reset() == ()
-    assert loop.cycle({"torque": [2.0, 2.0]}).commands["torque"] == pytest.approx([1.9, 1.9])
+    assert loop.cycle({"torque": [2.0, 2.0]}).actuation["torque"] == pytest.approx([1.9, 1.9])
 
 
 def test_dps_that_keeps_raising_keeps_the_signals_on_real_on_the_fallback() -> None:
     loop = Loop(TORQUE)
     for _ in range(3):
         loop.cycle({"torque": [1.0, 1.0]})
-    sent = [loop.cycle({}, error=SystemExit(1)).commands["torque"][0] for _ in range(4)]
+    sent = [loop.cycle({}, error=SystemExit(1)).actuation["torque"][0] for _ in range(4)]
     assert sent == pytest.approx([0.2, 0.1, 0.0, 0.0], abs=1e-12)
     assert loop.reset() == ("the DPS raised SystemExit: 1",)
 
@@ -228,14 +228,14 @@ def test_while_nothing_is_on_real_faults_are_told_but_nothing_goes_out_or_latche
     loop = Loop(TORQUE)
     loop.receptions["velocity"].value = np.array([nan, 0.0])
     verdict = loop.cycle({})
-    assert (verdict.commands, verdict.ok) == ({}, True)
+    assert (verdict.actuation, verdict.ok) == ({}, True)
     assert kinds(verdict) == [("velocity", "implausible")]
 
 
 def test_latch_outlasts_a_switch_to_sim() -> None:
     loop = Loop(TORQUE)
     loop.cycle({"torque": [nan, 0.0]})
-    assert loop.cycle({}).commands == {}
+    assert loop.cycle({}).actuation == {}
     assert loop.guards.latched
 
 
@@ -243,7 +243,7 @@ def test_limited_signal_that_was_not_started_is_not_sent() -> None:
     loop = Loop(TORQUE, start=False)
     assert loop.guards.needs_start("torque")
     verdict = loop.cycle({"torque": [0.0, 0.0]})
-    assert kinds(verdict) == [("torque", "not started")] and verdict.commands == {}
+    assert kinds(verdict) == [("torque", "not started")] and verdict.actuation == {}
     loop.guards.start("torque", [0.0, 0.0])
     loop.cycle({"torque": [0.0, 0.0]})
     assert loop.reset() == ()
@@ -267,9 +267,9 @@ def test_brake_brakes_while_its_velocity_is_fresh_and_fades_to_zero_after() -> N
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
     loop.receptions["velocity"].value = np.array([2.0, -2.0])
     verdict = loop.cycle({"torque": [nan, nan]})
-    assert verdict.commands["torque"] == pytest.approx([-0.1, 0.1])
+    assert verdict.actuation["torque"] == pytest.approx([-0.1, 0.1])
     loop.silent = True
-    sent = [loop.cycle({"torque": [0.0, 0.0]}).commands["torque"][0] for _ in range(25)]
+    sent = [loop.cycle({"torque": [0.0, 0.0]}).actuation["torque"][0] for _ in range(25)]
     assert sent[:18] == pytest.approx([-0.1] * 18) and sent[-1] == 0.0
     assert [fault.kind for fault in loop.guards.log] == ["not finite", "stale", "fallback"]
 
@@ -304,21 +304,21 @@ def test_fallback_gets_what_the_machine_senses_though_the_dps_listens_to_the_sim
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
     sensed = {"velocity": ReceivedSignal(value=np.array([2.0, -2.0]), arrived=T, count=1)}
     verdict = loop.guards.check(T, {}, {"torque": [nan, nan]}, others=sensed)
-    assert verdict.commands["torque"] == pytest.approx([-0.1, 0.1])
+    assert verdict.actuation["torque"] == pytest.approx([-0.1, 0.1])
 
 
 def test_silent_fallback_sends_nothing_and_the_next_command_departs_from_what_is_measured() -> None:
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": Silence()})
-    loop.guards.departures = {"torque": "acting"}
+    loop.guards.measured_by = {"torque": "acting"}
     loop.receptions["acting"].value = np.array([3.0, -3.0])
     loop.cycle({"torque": [0.0, 0.0]})
-    assert loop.cycle({"torque": [nan, 0.0]}).commands == {}
+    assert loop.cycle({"torque": [nan, 0.0]}).actuation == {}
     for _ in range(20):
-        loop.guards.withheld(())
-        assert loop.cycle({"torque": [0.0, 0.0]}).commands == {}
+        loop.guards.note_unsent(())
+        assert loop.cycle({"torque": [0.0, 0.0]}).actuation == {}
     assert loop.reset() == ()
-    assert loop.cycle({"torque": [0.0, 0.0]}).commands["torque"] == pytest.approx([2.9, -2.9])
+    assert loop.cycle({"torque": [0.0, 0.0]}).actuation["torque"] == pytest.approx([2.9, -2.9])
 
 
 # -- commands that did not leave
@@ -328,23 +328,23 @@ def test_command_that_did_not_leave_counts_for_nothing() -> None:
     loop = Loop(TORQUE, POSITION)
     for _ in range(3):
         loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]})
-        loop.guards.withheld(("torque",))
+        loop.guards.note_unsent(("torque",))
     verdict = loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]})
-    assert verdict.commands["torque"] == pytest.approx([0.1, 0.1])
-    assert verdict.commands["position"].item() > 50.0 * T**2
-    loop.guards.withheld(())
-    assert loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]}).commands["torque"] == pytest.approx([0.2, 0.2])
+    assert verdict.actuation["torque"] == pytest.approx([0.1, 0.1])
+    assert verdict.actuation["position"].item() > 50.0 * T**2
+    loop.guards.note_unsent(())
+    assert loop.cycle({"torque": [1.0, 1.0], "position": [1e-3]}).actuation["torque"] == pytest.approx([0.2, 0.2])
 
 
 def test_commands_that_cannot_be_sent_for_long_are_a_fault_until_one_is() -> None:
     loop = Loop(TORQUE)
     for _ in range(11):
         assert loop.cycle({"torque": [1.0, 1.0]}).ok
-        loop.guards.withheld(("torque",))
+        loop.guards.note_unsent(("torque",))
     verdict = loop.cycle({"torque": [1.0, 1.0]})
     assert kinds(verdict) == [("torque", "not sent")]
     assert loop.reset() == ("the last 11 commands torque could not be sent",)
-    loop.guards.withheld(())
+    loop.guards.note_unsent(())
     loop.cycle({"torque": [1.0, 1.0]})
     assert loop.reset() == ()
 
@@ -354,57 +354,57 @@ def test_first_command_after_an_outage_departs_from_what_is_measured_or_from_wha
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
     if measures:
-        loop.guards.departures = {"torque": "acting"}
+        loop.guards.measured_by = {"torque": "acting"}
     for _ in range(20):
         loop.cycle({"torque": [2.0, 2.0]})
-        loop.guards.withheld(())
+        loop.guards.note_unsent(())
     for _ in range(50):
         loop.cycle({"torque": [9.0, 9.0]})
-        loop.guards.withheld(("torque",))
+        loop.guards.note_unsent(("torque",))
     loop.receptions["acting"].value = np.array([-5.0, 1.0])
     expected = [-5.0, 1.0] if measures else [2.0, 2.0]
-    assert loop.cycle({"torque": [9.0, 9.0]}).commands["torque"] == pytest.approx(expected)
+    assert loop.cycle({"torque": [9.0, 9.0]}).actuation["torque"] == pytest.approx(expected)
 
 
 def test_after_an_outage_nothing_is_sent_until_what_it_departs_from_is_fresh() -> None:
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor)
-    loop.guards.departures = {"torque": "acting"}
+    loop.guards.measured_by = {"torque": "acting"}
     loop.cycle({"torque": [0.1, 0.1]})
     loop.silent = True
     for _ in range(40):
-        loop.guards.withheld(tuple(loop.cycle({"torque": [0.1, 0.1]}).commands))
-    assert loop.cycle({"torque": [0.1, 0.1]}).commands == {}
-    loop.guards.withheld(())
+        loop.guards.note_unsent(tuple(loop.cycle({"torque": [0.1, 0.1]}).actuation))
+    assert loop.cycle({"torque": [0.1, 0.1]}).actuation == {}
+    loop.guards.note_unsent(())
     loop.silent = False
     loop.receptions["acting"].value = np.array([4.0, 4.0])
-    assert loop.cycle({"torque": [0.1, 0.1]}).commands["torque"] == pytest.approx([3.9, 3.9])
+    assert loop.cycle({"torque": [0.1, 0.1]}).actuation["torque"] == pytest.approx([3.9, 3.9])
 
 
 @pytest.mark.parametrize("wanted", [[0.0, 0.0], [nan, 0.0]])
 def test_until_a_first_command_leaves_it_departs_from_what_is_measured(wanted: list[float]) -> None:
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()}, start=False)
-    loop.guards.departures = {"torque": "acting"}
+    loop.guards.measured_by = {"torque": "acting"}
     loop.guards.start("torque", [1.0, 1.0])
     for measured in (2.0, 3.0, 4.0):
         loop.receptions["acting"].value = np.array([measured, measured])
-        sent = loop.cycle({"torque": wanted}).commands["torque"]
+        sent = loop.cycle({"torque": wanted}).actuation["torque"]
         assert abs(sent - measured).max() <= RATE * T + 1e-12
-        loop.guards.withheld(("torque",))
+        loop.guards.note_unsent(("torque",))
     loop.cycle({"torque": [0.0, 0.0]})
-    loop.guards.withheld(())
+    loop.guards.note_unsent(())
     loop.receptions["acting"].value = np.array([9.0, 9.0])
-    assert loop.cycle({"torque": wanted}).commands["torque"].max() <= 4.0
+    assert loop.cycle({"torque": wanted}).actuation["torque"].max() <= 4.0
 
 
 def test_first_command_that_did_not_leave_is_nothing_to_hold() -> None:
     free = Signal("free", size=1, unit="rad", idle=0.0)
     loop = Loop(free, start=False)
     for _ in range(3):
-        assert loop.cycle({"free": [0.7]}).commands["free"].tolist() == [0.7]
-        loop.guards.withheld(("free",))
-    assert loop.cycle({"free": [nan]}).commands == {}
+        assert loop.cycle({"free": [0.7]}).actuation["free"].tolist() == [0.7]
+        loop.guards.note_unsent(("free",))
+    assert loop.cycle({"free": [nan]}).actuation == {}
 
 
 @pytest.mark.parametrize("max_age", [0.02, inf])
@@ -414,15 +414,15 @@ def test_after_a_pause_of_the_loop_commands_depart_from_what_is_measured_unless_
 ) -> None:
     sensor = Signal("acting", size=2, unit="N m", max_age=max_age)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
-    loop.guards.departures = {"torque": "acting"}
+    loop.guards.measured_by = {"torque": "acting"}
     for _ in range(20):
         loop.cycle({"torque": [2.0, 2.0]})
-        loop.guards.withheld(())
+        loop.guards.note_unsent(())
     loop.now += 0.5
     # The machine has braked by itself.
     loop.receptions["acting"].value = np.array([-5.0, 1.0])
     start = [-5.0, 1.0] if max_age < inf else [2.0, 2.0]
-    sent = loop.cycle({"torque": commands}).commands["torque"]
+    sent = loop.cycle({"torque": commands}).actuation["torque"]
     assert abs(sent - start).max() <= RATE * T + 1e-9
 
 
@@ -430,21 +430,21 @@ def test_after_a_pause_of_the_loop_commands_depart_from_what_is_measured_unless_
 def test_farewell_after_a_pause_departs_from_what_is_measured_or_is_left_out(fresh: bool) -> None:
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": Hold()})
-    loop.guards.departures = {"torque": "acting"}
+    loop.guards.measured_by = {"torque": "acting"}
     for _ in range(20):
         loop.cycle({"torque": [2.0, 2.0]})
-        loop.guards.withheld(())
+        loop.guards.note_unsent(())
     loop.now += 0.5
     if fresh:
         loop.receptions["acting"] = ReceivedSignal(value=np.array([-5.0, 1.0]), arrived=loop.now, count=99)
-    commands = loop.guards.fault("the time is up", loop.now, loop.receptions).commands
+    commands = loop.guards.latch("the time is up", loop.now, loop.receptions).actuation
     assert [command.tolist() for command in commands.values()] == ([[-5.0, 1.0]] if fresh else [])
 
 
 def test_fallback_is_limited_like_any_command() -> None:
     loop = Loop(POSITION, fallback={"position": FallbackController(lambda *_: [100.0], otherwise=Hold())})
     loop.cycle({"position": [nan]})
-    sent = [loop.cycle({"position": [0.0]}).commands["position"].item() for _ in range(3000)]
+    sent = [loop.cycle({"position": [0.0]}).actuation["position"].item() for _ in range(3000)]
     assert max(np.diff(sent)) == pytest.approx(1.0 * T)
     assert max(abs(np.diff(sent, 2))) <= 50.0 * T**2 * (1 + 1e-9)
     assert sent[-1] == 1.0
@@ -459,7 +459,7 @@ def test_fallback_controller_that_fails_is_stood_in_for_and_logged_once(function
     loop = Loop(TORQUE, fallback={"torque": FallbackController(function, otherwise=Zero())})
     for _ in range(3):
         loop.cycle({"torque": [1.0, 1.0]})
-    sent = [loop.cycle({}, error=RuntimeError("x")).commands["torque"][0] for _ in range(2)]
+    sent = [loop.cycle({}, error=RuntimeError("x")).actuation["torque"][0] for _ in range(2)]
     assert sent == pytest.approx([0.2, 0.1])
     assert [fault.kind for fault in loop.guards.log] == ["raised", "fallback"]
 
@@ -471,7 +471,7 @@ def test_last_command_stays_if_every_fallback_fails() -> None:
 
     loop = Loop(TORQUE, fallback={"torque": Broken()})
     loop.cycle({"torque": [0.1, 0.1]})
-    assert loop.cycle({"torque": [nan, nan]}).commands["torque"].tolist() == [0.1, 0.1]
+    assert loop.cycle({"torque": [nan, nan]}).actuation["torque"].tolist() == [0.1, 0.1]
 
 
 def test_fallback_learns_how_much_time_has_passed() -> None:
@@ -514,9 +514,9 @@ def test_fallback_is_told_once_per_latch_that_it_takes_over() -> None:
 def test_fault_that_is_told_latches_and_gives_the_fallback_commands() -> None:
     loop = Loop(TORQUE)
     loop.cycle({"torque": [0.1, 0.1]})
-    verdict = loop.guards.fault("interrupted", loop.now + T, loop.receptions)
+    verdict = loop.guards.latch("interrupted", loop.now + T, loop.receptions)
     assert not verdict.ok and kinds(verdict) == [(None, "told")]
-    assert verdict.commands["torque"].tolist() == [0.0, 0.0]
+    assert verdict.actuation["torque"].tolist() == [0.0, 0.0]
     assert [str(fault) for fault in loop.guards.latched] == ["interrupted"]
     assert loop.reset() == ()
 
@@ -534,15 +534,15 @@ def test_log_has_each_fault_once_while_it_lasts_and_is_bounded() -> None:
 
 def test_doubts_are_what_is_wrong_with_a_sensor_now() -> None:
     loop = Loop(TORQUE)
-    assert loop.guards.doubts("velocity", 0.0, loop.receptions["velocity"]) == []
-    assert loop.guards.doubts("velocity", 0.0, ReceivedSignal()) == ["sensor signal velocity has never arrived"]
+    assert loop.guards.sensor_faults("velocity", 0.0, loop.receptions["velocity"]) == []
+    assert loop.guards.sensor_faults("velocity", 0.0, ReceivedSignal()) == ["sensor signal velocity has never arrived"]
 
 
 def test_abstract_actuator_signal_passes_and_is_held() -> None:
     loop = Loop(LAMP, fallback={"lamp": Hold()})
-    assert loop.cycle({"lamp": "on"}).commands == {"lamp": "on"}
+    assert loop.cycle({"lamp": "on"}).actuation == {"lamp": "on"}
     verdict = loop.cycle({"lamp": None})
-    assert not verdict.ok and verdict.commands == {"lamp": "on"}
+    assert not verdict.ok and verdict.actuation == {"lamp": "on"}
 
 
 @pytest.mark.parametrize(
@@ -589,7 +589,7 @@ def test_whatever_happens_what_goes_out_is_finite_and_within_all_limits(script: 
             elif event == "reset":
                 loop.reset()
             loop.silent = {"silent": True, "loud": False}.get(event, loop.silent)
-            sent = loop.cycle(commands, **options).commands
+            sent = loop.cycle(commands, **options).actuation
             assert (abs(sent["torque"]) <= 10.0).all()
             assert (abs(sent["torque"] - torque) <= RATE * T + 1e-12).all()
             new = sent["position"].item()
@@ -612,8 +612,8 @@ def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_act
     quiet = FallbackController(lambda *_: NO_COMMAND if mute else [8.0, -8.0], otherwise=Hold())
     sensor = Signal("acting", size=2, unit="N m", max_age=0.02)
     loop = Loop(TORQUE, sense=sensor, fallback={"torque": quiet})
-    loop.guards.departures = {"torque": "acting"}
-    acting, lost, on = loop.cycle({"torque": [0.0, 0.0]}).commands["torque"], False, True
+    loop.guards.measured_by = {"torque": "acting"}
+    acting, lost, on = loop.cycle({"torque": [0.0, 0.0]}).actuation["torque"], False, True
     heard = loop.now
     for event, times, pause in script:
         loop.now += pause
@@ -629,8 +629,8 @@ def test_whatever_fails_to_leave_a_command_that_leaves_is_one_step_from_what_act
             options: dict[str, Any] = {"error": RuntimeError("x")} if event == "raise" else {}
             if event == "reset":
                 loop.reset()
-            sent = loop.cycle({"torque": wanted} if on else {}, active=["torque"] if on else [], **options).commands
-            loop.guards.withheld(tuple(sent) if lost else ())
+            sent = loop.cycle({"torque": wanted} if on else {}, active=["torque"] if on else [], **options).actuation
+            loop.guards.note_unsent(tuple(sent) if lost else ())
             if sent and not lost:
                 assert (abs(sent["torque"] - acting) <= RATE * T + 1e-12).all()
                 acting, heard = sent["torque"], loop.now

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.kernels import Freshness, Reach
-from vtbdrake.control.ranges import Range
+from vtbdrake.control.kernels import JumpBounds, StalenessMonitor
+from vtbdrake.control.limits import ValueRange
 from vtbdrake.testbed import Signal
 
 # By how many seconds in one the clocks of two computers may drift apart: NTP's largest correction.
@@ -42,7 +42,7 @@ class Fault:
         return self.reason
 
 
-class Delay:
+class LatencyMonitor:
     """How much longer than the quickest one a message took, by its sender's clock; the clocks' zeros need not agree.
 
     Args:
@@ -67,7 +67,7 @@ class Delay:
         return took - self._least
 
 
-class Watchdog(Freshness):
+class SensorMonitor(StalenessMonitor):
     """Watches one sensor signal: it has to be fresh, and what it says plausible.
 
     A signal that never arrived is stale, whatever its maximum age. A vector is plausible if it has the right size and
@@ -100,9 +100,9 @@ class Watchdog(Freshness):
         self._refused: np.ndarray | None = None
         self._refused_at = self._steady_since = -inf
         self._longest_gap = inf
-        self._delay = None if max_delay is None else Delay(max_delay)
-        self._range = None if signal.size is None else Range(signal)
-        self._reach: Reach | None = None
+        self._delay = None if max_delay is None else LatencyMonitor(max_delay)
+        self._range = None if signal.size is None else ValueRange(signal)
+        self._reach: JumpBounds | None = None
         self._compares = jump_tolerance is not None or self._delay is not None
         if jump_tolerance is not None:
             if signal.size is None:
@@ -112,7 +112,7 @@ class Watchdog(Freshness):
                 raise ValueError(f"the sensor signal {signal.name} may jump: to tell a jump, it needs a finite rate")
             if not (tolerance >= 0.0).all():
                 raise ValueError(f"the jump_tolerance of {signal.name} is not negative, unlike {tolerance.tolist()}")
-            self._reach = Reach(rate.tolist(), tolerance.tolist())
+            self._reach = JumpBounds(rate.tolist(), tolerance.tolist())
 
     def stale(self, now: float, reception: ReceivedSignal) -> Fault:
         name = self.signal.name
@@ -164,7 +164,7 @@ class Watchdog(Freshness):
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
         return Fault(now, name, "implausible", reason)
 
-    def _jump(self, now: float, reception: ReceivedSignal, reach: Reach) -> Fault | None:
+    def _jump(self, now: float, reception: ReceivedSignal, reach: JumpBounds) -> Fault | None:
         value = np.asarray(reception.value, dtype=float)
         if self.value is None:
             return None
@@ -185,7 +185,7 @@ class Watchdog(Freshness):
         )
         return Fault(now, self.signal.name, "jump", reason)
 
-    def _delayed(self, now: float, reception: ReceivedSignal, delay: Delay) -> Fault | None:
+    def _delayed(self, now: float, reception: ReceivedSignal, delay: LatencyMonitor) -> Fault | None:
         more = delay.of(reception)
         if not more > delay.most:
             return None

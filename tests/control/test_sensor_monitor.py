@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.ranges import Range
-from vtbdrake.control.watchdog import Watchdog
+from vtbdrake.control.limits import ValueRange
+from vtbdrake.control.sensor_monitor import SensorMonitor
 from vtbdrake.testbed import Signal
 
 
@@ -21,21 +21,21 @@ def received(value: object, arrived: float = 0.0, count: int = 1) -> ReceivedSig
     return ReceivedSignal(value=value, arrived=arrived, count=count)
 
 
-def kind(watchdog: Watchdog, now: float, reception: ReceivedSignal) -> str | None:
+def kind(watchdog: SensorMonitor, now: float, reception: ReceivedSignal) -> str | None:
     fault = watchdog.check(now, reception)
     return fault and fault.kind
 
 
 @pytest.mark.parametrize("max_age", [0.05, inf])
 def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
-    watchdog = Watchdog(Signal("encoders", size=2, max_age=max_age))
+    watchdog = SensorMonitor(Signal("encoders", size=2, max_age=max_age))
     fault = watchdog.check(7.0, ReceivedSignal())
     assert (fault.kind, fault.signal, fault.time) == ("stale", "encoders", 7.0)
     assert "never arrived" in str(fault)
 
 
 def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
-    watchdog, reception = Watchdog(signal()), received(np.zeros(2), arrived=1.0)
+    watchdog, reception = SensorMonitor(signal()), received(np.zeros(2), arrived=1.0)
     assert kind(watchdog, 1.0499, reception) is None
     fault = watchdog.check(1.0625, reception)
     assert fault.kind == "stale" and fault.reason == "sensor signal encoders is stale: 62.5 ms old, 50 allowed"
@@ -49,14 +49,14 @@ def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
 def test_entry_that_is_not_finite_is_implausible_without_limits_too(bad: float, size: int, place: int) -> None:
     value = np.zeros(size)
     value[place] = bad
-    assert kind(Watchdog(signal(size)), 0.0, received(value)) == "implausible"
+    assert kind(SensorMonitor(signal(size)), 0.0, received(value)) == "implausible"
 
 
 @pytest.mark.parametrize("size", [2, 100])
 def test_entry_beyond_its_limit_is_implausible(size: int) -> None:
     upper = np.ones(size)
     upper[-1] = 2.0
-    watchdog = Watchdog(signal(size, lower=-1.0, upper=upper))
+    watchdog = SensorMonitor(signal(size, lower=-1.0, upper=upper))
     assert kind(watchdog, 0.0, received(upper)) is None
     assert kind(watchdog, 0.0, received(1.001 * upper, count=2)) == "implausible"
     assert kind(watchdog, 0.0, received(np.full(size, -1.001), count=3)) == "implausible"
@@ -64,18 +64,18 @@ def test_entry_beyond_its_limit_is_implausible(size: int) -> None:
 
 @pytest.mark.parametrize("value", [np.zeros(1), np.zeros(3), np.zeros((1, 2))])
 def test_sample_of_another_size_is_implausible(value: np.ndarray) -> None:
-    assert kind(Watchdog(signal()), 0.0, received(value)) == "implausible"
+    assert kind(SensorMonitor(signal()), 0.0, received(value)) == "implausible"
 
 
 def test_implausible_sample_is_a_fault_until_the_next_one() -> None:
-    watchdog, reception = Watchdog(signal(upper=1.0)), received(np.array([0.0, 2.0]))
+    watchdog, reception = SensorMonitor(signal(upper=1.0)), received(np.array([0.0, 2.0]))
     assert [kind(watchdog, now, reception) for now in (0.0, 0.01)] == ["implausible"] * 2
     reception.value, reception.count = np.zeros(2), 2
     assert kind(watchdog, 0.02, reception) is None
 
 
 def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
-    watchdog = Watchdog(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
+    watchdog = SensorMonitor(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
     at = [
         received(np.array([0.0, 0.0]), 0.00, 1),
         received(np.array([0.09, 0.0105]), 0.01, 2),
@@ -89,7 +89,7 @@ def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
 
 
 def test_false_level_is_not_accepted_by_being_repeated() -> None:
-    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 500):
         assert kind(watchdog, 0.001 * k, received(np.full(2, 0.1), 0.001 * k, k)) == "jump"
@@ -98,7 +98,7 @@ def test_false_level_is_not_accepted_by_being_repeated() -> None:
 
 
 def test_samples_among_false_ones_are_accepted() -> None:
-    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     samples = [received(np.full(2, 0.001 * k + (k % 3 == 1)), 0.001 * k, k + 1) for k in range(300)]
     found = [kind(watchdog, r.arrived, r) for r in samples]
     # The very first is taken for true.
@@ -107,7 +107,7 @@ def test_samples_among_false_ones_are_accepted() -> None:
 
 @pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
 def test_level_jumped_to_can_be_accepted_once_it_is_steady(swing: float, accepted: bool) -> None:
-    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.01)
+    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 100):
         watchdog.check(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
@@ -121,40 +121,40 @@ def test_level_jumped_to_can_be_accepted_once_it_is_steady(swing: float, accepte
 
 
 def test_longer_silence_allows_a_larger_change() -> None:
-    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.0)
+    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
     assert kind(watchdog, 0.0, received(np.zeros(2), 0.0, 1)) is None
     assert kind(watchdog, 0.5, received(np.full(2, 0.49), 0.5, 2)) is None
 
 
 def test_jump_is_a_fault_until_the_next_sample() -> None:
-    watchdog = Watchdog(signal(rate=1.0), jump_tolerance=0.0)
+    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
     watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
     jumped = received(np.ones(2), 0.01, 2)
     assert [kind(watchdog, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
 
 
 def test_sample_that_is_not_new_is_no_jump() -> None:
-    watchdog, reception = Watchdog(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
+    watchdog, reception = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
     for now in (0.0, 0.001, 0.002):
         assert kind(watchdog, now, reception) is None
 
 
 def test_abstract_signal_is_watched_for_its_age_only() -> None:
-    watchdog = Watchdog(Signal("picture", model_value="", max_age=0.1))
+    watchdog = SensorMonitor(Signal("picture", model_value="", max_age=0.1))
     assert kind(watchdog, 0.0, received("cat")) is None
     assert kind(watchdog, 0.2, received("cat")) == "stale"
 
 
 def test_value_that_the_bridge_checked_by_other_limits_is_checked_again() -> None:
     wide, narrow = signal(upper=2.0), signal(upper=1.0)
-    sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, range=Range(wide))
-    assert kind(Watchdog(narrow), 0.0, sample) == "implausible"
-    assert kind(Watchdog(wide), 0.0, sample) is None
+    sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, range=ValueRange(wide))
+    assert kind(SensorMonitor(narrow), 0.0, sample) == "implausible"
+    assert kind(SensorMonitor(wide), 0.0, sample) is None
 
 
 def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str | None]:
     """The watchdog's findings for samples of (sent, arrived)."""
-    watchdog = Watchdog(signal(), max_delay=max_delay)
+    watchdog = SensorMonitor(signal(), max_delay=max_delay)
     receptions = [
         ReceivedSignal(value=np.zeros(2), sent=sent, arrived=arrived, count=k + 1)
         for k, (sent, arrived) in enumerate(samples)
@@ -185,13 +185,13 @@ def test_sample_without_a_time_has_no_delay() -> None:
 
 def test_delay_is_positive() -> None:
     with pytest.raises(ValueError, match="positive max_delay"):
-        Watchdog(signal(), max_delay=0.0)
+        SensorMonitor(signal(), max_delay=0.0)
 
 
 def test_jumps_need_a_finite_rate_and_a_vector() -> None:
     with pytest.raises(ValueError, match="finite rate"):
-        Watchdog(signal(), jump_tolerance=0.1)
+        SensorMonitor(signal(), jump_tolerance=0.1)
     with pytest.raises(ValueError, match="abstract"):
-        Watchdog(Signal("picture", model_value=""), jump_tolerance=0.1)
+        SensorMonitor(Signal("picture", model_value=""), jump_tolerance=0.1)
     with pytest.raises(ValueError, match="not negative"):
-        Watchdog(signal(rate=1.0), jump_tolerance=[0.1, -0.1])
+        SensorMonitor(signal(rate=1.0), jump_tolerance=[0.1, -0.1])
