@@ -1,5 +1,7 @@
 """Figure 4: signals, switches, the virtual testbed as a Diagram, scenarios that build one."""
 
+from typing import TYPE_CHECKING, Any
+
 from vtbdrake.testbed.alone import DpsAlone, WorldAlone
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
@@ -9,9 +11,13 @@ from vtbdrake.testbed.slow_part import SlowPart, slow_parts
 from vtbdrake.testbed.switch import Command
 from vtbdrake.testbed.testbed import VirtualTestbed
 
+if TYPE_CHECKING:
+    from vtbdrake.testbed.hardware_sim import HardwareSimScenario
+
 __all__ = [
     "Command",
     "DpsAlone",
+    "HardwareSimScenario",
     "Interface",
     "Scenario",
     "ScenarioError",
@@ -24,3 +30,12 @@ __all__ = [
     "load_scenario",
     "slow_parts",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # It imports far more of Drake than the others.
+    if name == "HardwareSimScenario":
+        from vtbdrake.testbed.hardware_sim import HardwareSimScenario
+
+        return HardwareSimScenario
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -273,8 +273,15 @@ def _changed_fields(owner: Any) -> str:
     shown = []
     for name, value in _values(owner).items():
         if default is None or dict(_flat(value)) != dict(_flat(getattr(default, name))):
-            shown.append(f"{name}={_changed_fields(value) if hasattr(value, '__fields__') else repr(value)}")
+            shown.append(f"{name}={_short(value)}")
     return f"{type(owner).__name__}({', '.join(shown)})"
+
+
+def _short(value: Any) -> str:
+    items = list(value.values()) if isinstance(value, dict) else value
+    if isinstance(items, list) and any(hasattr(item, "__fields__") for item in items):
+        return f"<{len(items)} {type(items[0]).__name__}>"
+    return _changed_fields(value) if hasattr(value, "__fields__") else repr(value)
 
 
 def _drake_types(value: Any) -> Iterator[type]:
@@ -295,7 +302,10 @@ def _reduce_config(config: Any) -> tuple[Any, ...]:
 
 
 def _make_config(kind: type, values: Mapping[str, Any]) -> Any:
-    return kind(**values)
+    config = kind()
+    for name, value in values.items():
+        setattr(config, name, value)
+    return config
 
 
 _SCALARS: dict[str, type] = {"bool": bool, "int": int, "float": float, "str": str}

@@ -1,0 +1,150 @@
+"""Scenarios with the fields of Drake's example ``hardware_sim``, so that its YAML files describe simulated worlds."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import (
+    MakeRenderEngineGl,
+    MakeRenderEngineGltfClient,
+    MakeRenderEngineVtk,
+    RenderEngine,
+    RenderEngineGlParams,
+    RenderEngineGltfClientParams,
+    RenderEngineVtkParams,
+    SceneGraphConfig,
+)
+from pydrake.lcm import DrakeLcmParams
+from pydrake.manipulation import ApplyNamedPositionsAsDefaults, IiwaDriver, SchunkWsgDriver, ZeroForceDriver
+from pydrake.multibody.parsing import (
+    GetScopedFrameByName,
+    ModelDirective,
+    ModelDirectives,
+    ModelInstanceInfo,
+    Parser,
+    ProcessModelDirectives,
+)
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.sensors import CameraConfig, RgbdSensor, RgbdSensorDiscrete
+from pydrake.visualization import VisualizationConfig
+
+from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.scenario import Scenario, ScenarioError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class HardwareSimScenario(Scenario):
+    """A scenario whose world is described like that of Drake's ``examples/hardware_sim``.
+
+    A file of hardware_sim loads as it is: ``load_scenario("package.module:Class@example_scenarios.yaml#Demo")``. A
+    subclass defines `interface` and `make_dps`, and connects the signals to the world::
+
+        def add_world(self, builder):
+            self.add_models(builder)
+            cameras = self.add_cameras(builder)
+            builder.sim_sensor("image", cameras["oracular_view"].GetOutputPort("color_image"))
+            builder.sim_actuator("torque", builder.plant.get_actuation_input_port())
+
+    What connects hardware_sim to LCM, draws it and ends it has other means here: the switches and a bridge replace
+    ``model_drivers`` and ``lcm_buses``, ``build(meshcat=...)`` replaces ``visualization``, and the horizon of a rollout
+    replaces ``simulation_duration``. The world is that of the default values: nothing is drawn with ``random_seed``.
+    These fields are read, kept, and not used.
+
+    Attributes:
+        simulator_config, plant_config, scene_graph_config: as in hardware_sim; the defaults are Drake's.
+        directives: the models, as for `ProcessModelDirectives`.
+        cameras: by any name; ``CameraConfig.name`` is the name in the Diagram.
+        initial_position: positions of joints, by joint, by model instance; they override those of the directives.
+    """
+
+    plant_config: MultibodyPlantConfig = field(default_factory=MultibodyPlantConfig)
+    scene_graph_config: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+    directives: list[ModelDirective] = field(default_factory=list)
+    cameras: dict[str, CameraConfig] = field(default_factory=dict)
+    initial_position: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    random_seed: int = 0
+    simulation_duration: float | None = None
+    lcm_buses: dict[str, DrakeLcmParams] = field(default_factory=dict)
+    model_drivers: dict[str, IiwaDriver | SchunkWsgDriver | ZeroForceDriver] = field(default_factory=dict)
+    visualization: VisualizationConfig = field(default_factory=VisualizationConfig)
+
+    def add_models(self, builder: VirtualTestbedBuilder) -> list[ModelInstanceInfo]:
+        """Add the plant with the models of the directives at their initial positions, and finalize it.
+
+        Returns:
+            The models that the directives have added.
+
+        Raises:
+            ScenarioError: a directive or an initial position does not fit.
+        """
+        if self.model_drivers:
+            _log.info(
+                "model_drivers of %s are not used: the testbed's signals replace them", ", ".join(self.model_drivers)
+            )
+        plant, _ = builder.add_plant(self.plant_config, self.scene_graph_config)
+        try:
+            models = ProcessModelDirectives(ModelDirectives(directives=self.directives), Parser(plant))
+            plant.Finalize()
+            ApplyNamedPositionsAsDefaults(self.initial_position, plant)
+        except RuntimeError as error:
+            raise ScenarioError(f"{type(self).__name__}: the models cannot be added: {error}") from error
+        return list(models)
+
+    def add_cameras(self, builder: VirtualTestbedBuilder) -> dict[str, RgbdSensorDiscrete]:
+        """Add the cameras to the models that `add_models` has added.
+
+        A camera takes an image every ``1 / fps`` seconds, and holds it. Its output ports are ``color_image``,
+        ``depth_image_32f``, ``depth_image_16u``, ``label_image`` and ``body_pose_in_world``.
+
+        Returns:
+            The cameras ``sim.sense.<CameraConfig.name>``, by their keys in ``cameras``.
+
+        Raises:
+            ScenarioError: a camera has an offset or a delay, which `RgbdSensorDiscrete` does not have.
+        """
+        added = {}
+        for key, config in self.cameras.items():
+            if config.capture_offset or config.output_delay:
+                raise ScenarioError(
+                    f"{type(self).__name__}.cameras.{key} has a capture_offset or output_delay: set both to 0, and put "
+                    "a DiscreteTimeDelay behind the camera"
+                )
+            camera = RgbdSensorDiscrete(self._sensor(builder, config), 1.0 / config.fps, config.label)
+            added[key] = builder.add("sense", config.name, camera)
+            assert builder.scene_graph is not None
+            builder.connect(builder.scene_graph.get_query_output_port(), camera.query_object_input_port())
+        return added
+
+    def _sensor(self, builder: VirtualTestbedBuilder, config: CameraConfig) -> RgbdSensor:
+        plant, scene_graph = builder.plant, builder.scene_graph
+        if plant is None or scene_graph is None:
+            raise ScenarioError("cameras need a plant: call add_models first")
+        if not scene_graph.HasRenderer(config.renderer_name):
+            scene_graph.AddRenderer(config.renderer_name, _renderer(config))
+        base = config.X_PB.base_frame
+        parent = GetScopedFrameByName(plant, base) if base else plant.world_frame()
+        X_PB = parent.GetFixedPoseInBodyFrame() @ config.X_PB.GetDeterministicValue()
+        color, depth = config.MakeCameras()
+        return RgbdSensor(plant.GetBodyFrameIdOrThrow(parent.body().index()), X_PB, color, depth)
+
+
+def _renderer(config: CameraConfig) -> RenderEngine:
+    makers = {
+        RenderEngineVtkParams: MakeRenderEngineVtk,
+        RenderEngineGlParams: MakeRenderEngineGl,
+        RenderEngineGltfClientParams: MakeRenderEngineGltfClient,
+    }
+    chosen = config.renderer_class
+    if isinstance(chosen, str):
+        named = {f"RenderEngine{name}": globals()[f"RenderEngine{name}Params"] for name in ("Vtk", "Gl", "GltfClient")}
+        if chosen not in ("", *named):
+            raise ScenarioError(f"the renderer_class of {config.name} is one of {', '.join(named)}, not {chosen!r}")
+        rgb = config.background
+        chosen = (
+            RenderEngineVtkParams(default_clear_color=[rgb.r(), rgb.g(), rgb.b()]) if not chosen else named[chosen]()
+        )
+    return makers[type(chosen)](chosen)
