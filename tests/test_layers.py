@@ -42,7 +42,7 @@ TOP = {"visualization", "testing", "cli"}
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
 # `visualization`, a scenario is deployed by `deployment`.
 MAY_DELEGATE: dict[str, set[str]] = {
-    "testbed": {"deployment"},
+    "testbed": {"deployment", "visualization"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import inf, isfinite, isnan
 from typing import Any
 
@@ -50,7 +50,7 @@ class QualityError(ValueError):
     """A quality function that raises, or returns what is not a quality."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measure:
     """A function of quality variables, sampled over a rollout and read as one number.
 
@@ -74,6 +74,15 @@ class Measure:
         if not self.of:
             raise QualityError("a quality needs at least one quality variable: give of=[address, ...]")
         check_reading(self.reading)
+
+    def __repr__(self) -> str:
+        """Show the function, its variables and what differs from the defaults."""
+        changed = [
+            f"{item.name}={getattr(self, item.name)!r}"
+            for item in fields(self)[2:]
+            if getattr(self, item.name) != item.default
+        ]
+        return f"{type(self).__name__}({', '.join([self.name, f'of={list(self.of)}', *changed])})"
 
     @property
     def name(self) -> str:
@@ -106,7 +115,7 @@ class Measure:
         """The one number that the samples at ``times`` are read as."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Quality(Measure):
     """f(q(t)) >= 0, equation (12): larger is better. Or, with ``minimize``, a cost c >= 0: smaller is better.
 
@@ -155,7 +164,7 @@ class Quality(Measure):
         return self.upper * horizon if self.reading == "integral" else self.upper
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Constraint(Measure):
     """What a rollout has to keep: f(q(t)) at most, or at least, a limit; by default at every sample time.
 

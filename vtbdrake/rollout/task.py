@@ -25,7 +25,7 @@ FAILED = "failed"
 QUALITY_FAILED = "QualityError: "
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RolloutResult:
     """The outcome of one rollout.
 
@@ -63,6 +63,14 @@ class RolloutResult:
     record: Mapping[str, Any] = field(default_factory=dict)
     state: Snapshot | None = None
     wall_time: float = nan
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{address}={np.asarray(v).tolist()}" for address, v in self.parameters.items())
+        if self.failed:
+            return f"RolloutResult({{{values}}}: failed: {self.message})"
+        end = float(self.times[-1]) if len(self.times) else nan
+        best = "" if isnan(self.value) else f", value {self.value:g} at t* = {self.t_star:g} s"
+        return f"RolloutResult({{{values}}}: {self.end} after {end:g} s{best})"
 
     @property
     def failed(self) -> bool:

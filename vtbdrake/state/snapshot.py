@@ -21,7 +21,7 @@ KIND = "vtbdrake snapshot"
 VERSION = 1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Snapshot:
     """The state s(t) = [x, a] of a whole Diagram at one time.
 
@@ -62,6 +62,14 @@ class Snapshot:
     def __getitem__(self, address: str) -> np.ndarray:
         """The value of an addressed variable."""
         return self.values[address]
+
+    def __repr__(self) -> str:
+        owner = self.scenario.get("scenario", "a bare Diagram").partition(":")[2] or "a bare Diagram"
+        return f"Snapshot(t={self.time:g} s, {owner}, {len(self.values)} variables)"
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Complete ``snapshot["dps.<TAB>`` in IPython."""
+        return list(self.values)
 
     def compare(self, other: Snapshot) -> dict[str, float]:
         """Where two snapshots differ: the largest absolute difference by address or group.

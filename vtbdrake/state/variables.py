@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from math import inf
 from typing import Any
 
@@ -24,7 +25,7 @@ class VariableError(ValueError):
     """A value that a variable cannot take, or a write to a derived one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Variable:
     """An addressed element of the state s = [x, a] of a Diagram.
 
@@ -51,6 +52,9 @@ class Variable:
     bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
     carried_by: str = ""
     order: int = 0
+
+    def __repr__(self) -> str:
+        return f"Variable({self.address!r}, kind={self.kind!r}, shape={self.shape}, unit={self.unit!r})"
 
     @property
     def hidden(self) -> bool:
@@ -167,6 +171,20 @@ class Variables(Mapping[str, Variable]):
     def __len__(self) -> int:
         return len(self._listed)
 
+    def __repr__(self) -> str:
+        tops = dict.fromkeys(address.partition(".")[0] for address in self)
+        return f"Variables({len(self)} addresses that begin with {', '.join(tops)})"
+
+    def _repr_html_(self) -> str:
+        """Show a table in a notebook."""
+        rows = [("address", "kind", "shape", "unit", "bounds"), *map(_row, self._listed.values())]
+        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        return f'<div style="max-height: 30em; overflow: auto"><table>{body}</table></div>'
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Complete ``variables["dps.<TAB>`` in IPython."""
+        return [*self._listed, *self._by_demand]
+
     def read(self, context: Context, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
         """sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``."""
         return {address: self[address].get(context) for address in addresses}
@@ -211,21 +229,24 @@ class Variables(Mapping[str, Variable]):
         for variable in self._listed.values():
             if pattern not in variable.address:
                 continue
-            kind = variable.kind + (" (derived)" if variable.derived else "")
-            shape = "x".join(map(str, variable.shape)) or "scalar"
-            bounded = any(np.isfinite(bound).any() for bound in variable.bounds)
-            bounds = variable.bounds_text() if bounded else ""
             value = variable.get(context) + 0.0  # no negative zeros
             text = (
                 f"{value:.6g}"
                 if isinstance(value, float)
                 else np.array2string(value.ravel(), precision=4, threshold=8, suppress_small=True, max_line_width=999)
             )
-            rows.append((variable.address, kind, shape, variable.unit, bounds, text))
+            rows.append((*_row(variable), text))
         widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
         return "\n".join(lines)
+
+
+def _row(variable: Variable) -> tuple[str, str, str, str, str]:
+    kind = variable.kind + (" (derived)" if variable.derived else "")
+    shape = "x".join(map(str, variable.shape)) or "scalar"
+    bounded = any(np.isfinite(bound).any() for bound in variable.bounds)
+    return variable.address, kind, shape, variable.unit, variable.bounds_text() if bounded else ""
 
 
 def check_address(address: object) -> None:

@@ -68,6 +68,9 @@ class AddressedDiagram:
         self.scenario = scenario
         self._variables = variables
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"
+
     # -- contexts and simulators
 
     def default_context(self) -> Context:

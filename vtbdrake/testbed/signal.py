@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import inf
 from typing import Any
 
@@ -17,7 +17,7 @@ class SignalError(ValueError):
     """A signal that is ill declared, missing, or does not fit the port that is to carry it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Signal:
     """One signal that crosses the boundary of a DPS.
 
@@ -46,6 +46,16 @@ class Signal:
     max_age: float = inf
     idle: Any = None
     default: ArrayLike | None = None
+
+    def __repr__(self) -> str:
+        """Show what differs from the defaults."""
+        shown = [repr(self.name)]
+        for item in fields(self)[1:]:
+            value = getattr(self, item.name)
+            if not (np.ndim(value) == 0 and isinstance(value, type(item.default)) and value == item.default):
+                text = f"<{type(value).__name__}>" if item.name == "model_value" else _brief(value)
+                shown.append(f"{item.name}={text}")
+        return f"Signal({', '.join(shown)})"
 
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in ".:/ "):
@@ -175,7 +185,13 @@ def _pixels(value: Any) -> str:
     return f"{value.width()} x {value.height()} pixels" if hasattr(value, "mutable_data") else ""
 
 
-@dataclass(frozen=True)
+def _brief(value: Any) -> str:
+    if np.ndim(value) == 0:
+        return f"{value:g}" if isinstance(value, float) else repr(value)
+    return np.array2string(np.asarray(value), precision=4, threshold=4, edgeitems=1, separator=", ").replace("\n", "")
+
+
+@dataclass(frozen=True, repr=False)
 class Interface:
     """All signals of a DPS: sensor signals in, actuator signals out, commands u in.
 
@@ -204,6 +220,10 @@ class Interface:
         for signal in self.commands:
             if not signal.is_vector:
                 raise SignalError(f"command {signal.name} is abstract; a command is a vector (give size=)")
+
+    def __repr__(self) -> str:
+        sides = {item.name: ", ".join(signal.name for signal in getattr(self, item.name)) for item in fields(self)}
+        return f"Interface({', '.join(f'{side}=[{names}]' for side, names in sides.items())})"
 
     @staticmethod
     def _refuse_twins(signals: Sequence[Signal], what: str) -> None:

@@ -141,6 +141,12 @@ class VirtualTestbed(AddressedDiagram):
         for belief in beliefs:
             belief.check(self._variables)
 
+    def _repr_html_(self) -> str:
+        """Show Figure 4 in a notebook, with the switches as they were built."""
+        from vtbdrake.visualization.diagram import svg
+
+        return svg(self)
+
     # -- switches
 
     def positions(self, context: Context) -> dict[str, dict[str, str]]:
