@@ -360,11 +360,11 @@ def test_killed_hub_is_noticed_and_its_successor_found() -> None:
             loop.runtime.cycle()  # takes in what the hub had still sent
             loop.runtime.cycle()
             assert not loop.bridge.connected
-            assert loop.bridge.losses == 1
+            assert loop.bridge.link.losses == 1
             loop.until(lambda: "is stale" in loop.latched)
             with Hub(port=port, protect=[COMMAND]):
                 loop.until(lambda: loop.bridge.connected)
-                assert loop.bridge.reconnections == 1
+                assert loop.bridge.link.reconnections == 1
                 loop.recover()
                 accepted = loop.machine.status().accepted["torque"]
                 loop.until(lambda: loop.machine.status().accepted["torque"] > accepted)

@@ -194,7 +194,7 @@ def test_killed_hub_is_noticed_by_the_next_poll_and_its_successor_found() -> Non
         assert arm.sent["position"].withheld == {"no bus": 1}
         with Hub(port=port):
             assert wait(arm, lambda: arm.connected)
-            assert (arm.losses, arm.reconnections) == (1, 1)
+            assert (arm.link.losses, arm.link.reconnections) == (1, 1)
             peer = Peer(arm.url)
             peer.lcm.publish("IIWA_STATUS", status(2).encode())
             assert wait(arm, lambda: arm.sensed["position"].count == 2)

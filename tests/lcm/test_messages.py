@@ -11,16 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vtbdrake.lcm.maps import Field
 from vtbdrake.lcm.messages import MalformedError, MessageDecoder, MessageEncoder
 
 EVERY = "dqfihb?"
 HEAD = b"\xf1\xf2\xf3\xf4\xf5\xf6\xf7\xf8"
 INTEGERS = {"q": 64, "i": 32, "h": 16, "b": 8}
+TYPES = {"d": "double", "q": "int64_t", "f": "float", "i": "int32_t", "h": "int16_t", "b": "int8_t", "?": "boolean"}
 
 
-def fields(code: str, *shape: int | str) -> list[tuple[str, str, tuple[int | str, ...]]]:
-    """Of a message with a time and an array."""
-    return [("utime", "q", ()), ("numbers", code, shape)]
+def fields(code: str, *shape: int | str) -> list[Field]:
+    """Return the fields of a message with a time and an array."""
+    return [Field("utime", "int64_t"), Field("numbers", TYPES[code], shape)]
 
 
 def message(code: str, numbers: list[float], utime: int = 5) -> bytes:
@@ -48,9 +50,18 @@ def test_numbers_are_decoded_as_struct_reads_them(code: str, data: st.DataObject
 @settings(max_examples=300)
 @given(n=st.integers(0, 3), m=st.integers(0, 3), text=st.binary(max_size=5), cut=st.integers(0, 200))
 def test_lengths_strings_and_dimensions_move_what_follows(n: int, m: int, text: bytes, cut: int) -> None:
-    layout = [("n", "h", ()), ("m", "b", ()), ("text", "s", ()), ("grid", "f", ("n", "m", 2)), ("z", "i", ("m",))]
+    layout = [
+        Field("n", "int16_t"),
+        Field("m", "int8_t"),
+        Field("text", "string"),
+        Field("pairs", "", ("n",), (Field("pairs.name", "string", (2,)), Field("pairs.x", "int8_t"))),
+        Field("grid", "float", ("n", "m", 2)),
+        Field("z", "int32_t", ("m",)),
+    ]
     grid, z = [0.5 * k for k in range(n * m * 2)], [k - 7 for k in range(m)]
-    data = HEAD + struct.pack(f">hbI{len(text)}s{len(grid)}f{m}i", n, m, len(text), text, *grid, *z)
+    string = struct.pack(f">I{len(text)}s", len(text), text)
+    pairs = n * (2 * string + b"\7")
+    data = HEAD + struct.pack(">hb", n, m) + string + pairs + struct.pack(f">{len(grid)}f{m}i", *grid, *z)
     decoder = MessageDecoder(HEAD, layout, {"z": ["z"], "n": ["n"], "grid": ["grid"]})
     sent, values = decoder.decode(data)
     assert math.isnan(sent)
@@ -63,7 +74,7 @@ def test_lengths_strings_and_dimensions_move_what_follows(n: int, m: int, text: 
 
 @pytest.mark.parametrize("code", INTEGERS)
 def test_impossible_lengths_are_rejected_without_reading(code: str) -> None:
-    layout = [("n", code, ()), ("grid", "d", ("n", "n", "n", "n"))]
+    layout = [Field("n", TYPES[code]), Field("grid", "double", ("n", "n", "n", "n"))]
     decoder = MessageDecoder(HEAD, layout, {"grid": ["grid"]})
     for length, expected in ((-1, "size"), (-(2 ** (INTEGERS[code] - 1)), "size"), (100, "truncated")):
         assert reason(decoder, HEAD + struct.pack(f">{code}", length) + bytes(16)) == expected
@@ -71,9 +82,15 @@ def test_impossible_lengths_are_rejected_without_reading(code: str) -> None:
 
 
 @settings(max_examples=500)
-@given(st.binary(max_size=60))
+@given(st.binary(max_size=60) | st.lists(st.sampled_from([0, 0, 0, 1, 2, 255]), max_size=60).map(bytes))
 def test_any_bytes_are_decoded_or_rejected(data: bytes) -> None:
-    layout = [("n", "b", ()), ("text", "s", ()), ("z", "h", ("n", 2)), ("d", "d", ("n",))]
+    layout = [
+        Field("n", "int8_t"),
+        Field("text", "string"),
+        Field("pairs", "", ("n",), (Field("pairs.n", "int8_t"), Field("pairs.x", "float", ("pairs.n",)))),
+        Field("z", "int16_t", ("n", 2)),
+        Field("d", "double", ("n",)),
+    ]
     decoder = MessageDecoder(HEAD, layout, {"z": ["z"], "d": ["d"]})
     try:
         _, values = decoder.decode(HEAD + data)
@@ -95,13 +112,15 @@ def test_values_of_earlier_messages_stay_as_they_are() -> None:
     [
         (fields("d", "later"), {}, ""),
         (fields("d", "numbers"), {}, ""),
-        ([("x", "d", ()), ("numbers", "d", ("x",))], {}, ""),
-        ([("x", "i", (2,)), ("numbers", "d", ("x",))], {}, ""),
-        (fields("x"), {}, ""),
+        ([Field("x", "double"), Field("numbers", "double", ("x",))], {}, ""),
+        ([Field("x", "int32_t", (2,)), Field("numbers", "double", ("x",))], {}, ""),
+        ([Field("m", "", (), (Field("m.n", "int32_t"),)), Field("numbers", "double", ("m.n",))], {}, ""),
+        ([Field("m", "", (1,), (Field("m.x", "double"),))], {"a": ["m.x"]}, ""),
+        ([Field("m", "", (1,), (Field("m.x", "int64_t"),))], {}, "m.x"),
+        ([Field("m", "", (), (Field("m.x", "double"),))], {"a": ["m"]}, ""),
         (fields("d", 2), {"a": ["other"]}, ""),
         (fields("d", 2), {}, "numbers"),
-        (fields("s"), {"a": ["numbers"]}, ""),
-        ([("a", "d", ()), ("a", "d", ())], {}, ""),
+        ([Field("numbers", "string")], {"a": ["numbers"]}, ""),
     ],
 )
 def test_layout_that_contradicts_itself_is_refused(layout: Any, signals: Any, stamp: str) -> None:
@@ -119,7 +138,7 @@ def test_only_bytes_are_decoded() -> None:
 @settings(max_examples=100)
 @given(entries=st.lists(st.floats(-1e40, 1e40) | st.floats(-200.0, 200.0) | st.floats(), min_size=2, max_size=2))
 def test_numbers_are_encoded_as_struct_writes_them(code: str, entries: list[float]) -> None:
-    layout = [("utime", "q", ()), ("b", code, ()), ("a", code, ())]
+    layout = [Field("utime", "int64_t"), Field("b", TYPES[code]), Field("a", TYPES[code])]
     encoder = MessageEncoder(HEAD, layout, {"a": ["a", "b"]}, "utime", example=message(code, [0, 0]))
     utime = 2**60 + 1
     try:
@@ -151,7 +170,7 @@ def test_vectors_of_another_size_are_not_encoded(value: Any) -> None:
 
 
 def test_time_that_does_not_fit_is_not_encoded() -> None:
-    encoder = MessageEncoder(HEAD, [("utime", "i", ())], {}, "utime", example=HEAD + bytes(4))
+    encoder = MessageEncoder(HEAD, [Field("utime", "int32_t")], {}, "utime", example=HEAD + bytes(4))
     with pytest.raises(OverflowError, match="the time 2147483648 us does not fit"):
         encoder.encode({}, 2**31)
 
@@ -172,6 +191,6 @@ class Made(dict[str, np.ndarray]):
 
 
 def test_encoder_uses_vectors_that_nobody_else_keeps() -> None:
-    layout = [("a", "d", (2,)), ("b", "d", (2,))]
+    layout = [Field("a", "double", (2,)), Field("b", "double", (2,))]
     encoder = MessageEncoder(HEAD, layout, {"1": ["a"], "2": ["b"]}, example=HEAD + bytes(32))
     assert encoder.encode(Made(), 0) == HEAD + struct.pack(">4d", 1.0, 1.0, 2.0, 2.0)

@@ -48,10 +48,9 @@ class LcmBridge(Bridge):
     Attributes:
         url: the LCM URL of the bus.
         sent: by actuator signal, how many commands were sent, and why others were not.
-        foreign_messages: by actuator channel, how many messages of other publishers were heard; empty if ``watch`` is
-            off.
+        foreign_messages: by actuator channel, how many messages of other publishers were heard (with ``watch``).
         clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was accepted.
-        losses, reconnections: how often the bus was lost and found again.
+        link: the connection to the bus, which counts losses and reconnections.
     """
 
     def __init__(
@@ -116,33 +115,22 @@ class LcmBridge(Bridge):
         self._writers = [ChannelWriter(map, _signals(interface.act, map), self.sent) for map in act]
 
         self._watch = not url.startswith(_PRIVATE) if watch is None else watch
-        self._foreign = ForeignCommands([map.channel for map in act], lambda: self._link.name, on_foreign)
+        self._foreign = ForeignCommands([map.channel for map in act], lambda: self.link.name, on_foreign)
+        self.foreign_messages: Mapping[str, int] = self._foreign.heard
         handlers: dict[str, Handler] = {reader.channel: self._tapped(reader) for reader in self._readers}
         if self._watch:
             handlers |= {map.channel: self._foreign.take for map in act}
         if url.startswith(_HUB):
             handlers[STATUS_CHANNEL] = self._foreign.take_status
-        self._link = LcmLink(url, handlers, connect_timeout=connect_timeout)
-
-    @property
-    def foreign_messages(self) -> dict[str, int]:
-        return dict(self._foreign.heard) if self._watch else {}
+        self.link = LcmLink(url, handlers, connect_timeout=connect_timeout)
 
     @property
     def clock_jumps(self) -> dict[str, int]:
         return {reader.channel: reader.clock_jumps for reader in self._readers}
 
     @property
-    def losses(self) -> int:
-        return self._link.losses
-
-    @property
-    def reconnections(self) -> int:
-        return self._link.reconnections
-
-    @property
     def connected(self) -> bool:
-        return self._link.connected
+        return self.link.connected
 
     @property
     def blocked_reason(self) -> str | None:
@@ -162,13 +150,13 @@ class LcmBridge(Bridge):
         return f"somebody else publishes commands on {', '.join(sorted(found))}: only one may command a machine"
 
     def open(self) -> None:
-        self._link.open()
+        self.link.open()
 
     def close(self) -> None:
-        self._link.close()
+        self.link.close()
 
     def poll(self, timeout: float = 0.0) -> int:
-        return self._link.take(timeout, self._burst)
+        return self.link.take(timeout, self._burst)
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         """Send actuator commands.
@@ -194,7 +182,7 @@ class LcmBridge(Bridge):
         if self._watch:
             for writer, data in messages:
                 self._foreign.expect(writer.channel, data)
-        sent = self._link.publish(*[(writer.channel, data) for writer, data in messages])
+        sent = self.link.publish(*[(writer.channel, data) for writer, data in messages])
         passed: set[str] = set()
         for writer, data in messages:
             # A refused message was sent all the same: the hub lets it pass as soon as the channel is free.
@@ -223,7 +211,7 @@ class LcmBridge(Bridge):
         """
         if not self.url.startswith(_HUB):
             raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to take over")
-        self._link.publish(*[(TAKE_PREFIX + writer.channel, b"") for writer in self._writers])
+        self.link.publish(*[(TAKE_PREFIX + writer.channel, b"") for writer in self._writers])
 
 
 class ChannelReader:

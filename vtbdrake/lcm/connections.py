@@ -12,6 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from queue import Empty, SimpleQueue
 from urllib.parse import urlsplit
 
 import lcm
@@ -148,9 +149,11 @@ class TcpqConnection(Connection):
         self._reader = TcpqReader(max_message=_LONGEST_MESSAGE, greeted=True)
         self._unsent = b""
         self._stamped = stamped
+        parts = urlsplit(url)
+        address = parts.hostname or "127.0.0.1", _DEFAULT_PORT if parts.port is None else parts.port
         # The kernel does not stamp what comes by a Unix socket.
-        shortcut = None if stamped else connect_shortcut(*tcpq_address(url))
-        self._socket = shortcut or socket.create_connection(tcpq_address(url), timeout)
+        shortcut = None if stamped else connect_shortcut(*address)
+        self._socket = shortcut or socket.create_connection(address, timeout)
         try:
             if shortcut is None:
                 self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -244,58 +247,43 @@ class TcpqConnection(Connection):
         self._socket.close()
 
 
-def tcpq_address(url: str) -> tuple[str, int]:
-    """Return host and port of ``tcpq://host:port``, with defaults for what is left out.
-
-    Raises:
-        ValueError: the port is no number.
-    """
-    parts = urlsplit(url)
-    return parts.hostname or "127.0.0.1", _DEFAULT_PORT if parts.port is None else parts.port
-
-
 def _literally(channel: str) -> str:
     """Return the regular expression that matches this channel only."""
     return "".join(f"\\{c}" if c in r".^$*+?()[]{}|" + "\\" else c for c in channel)
 
 
-class _Search(threading.Thread):
-    """Tries to connect until it succeeds or is cancelled; a thread of its own, because connecting may take long."""
+class _Search:
+    """Tries to connect until it succeeds or is cancelled; in a thread of its own, because connecting may take long."""
 
     def __init__(self, connect: Callable[[], Connection]) -> None:
-        super().__init__(name="vtbdrake-lcm-search", daemon=True)
         self._connect = connect
         self._cancelled = threading.Event()
-        self._lock = threading.Lock()
-        self._found: Connection | None = None
-        self.ended = threading.Event()
+        self._found: SimpleQueue[Connection] = SimpleQueue()
+        threading.Thread(target=self._run, name="vtbdrake-lcm-search", daemon=True).start()
 
-    def run(self) -> None:
+    def _run(self) -> None:
         # A thread inherits the scheduling of the one that starts it; this one must not compete with a real-time loop.
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         pause = FIRST_PAUSE
         while not self._cancelled.is_set():
             try:
-                connection = self._connect()
+                self._found.put(self._connect())
+                break
             except OSError:
                 self._cancelled.wait(pause)
                 pause = min(2 * pause, LONGEST_PAUSE)
-                continue
-            with self._lock:
-                if self._cancelled.is_set():
-                    connection.close()
-                else:
-                    self._found = connection
-            break
-        self.ended.set()
+        if self._cancelled.is_set():
+            self.cancel()
 
-    def result(self) -> Connection | None:
-        """Return the connection, once."""
-        with self._lock:
-            found, self._found = self._found, None
-        return found
+    def result(self, timeout: float = 0.0) -> Connection | None:
+        """Return the connection, once; wait for it."""
+        try:
+            return self._found.get(timeout=timeout) if timeout > 0 else self._found.get_nowait()
+        except Empty:
+            return None
 
     def cancel(self) -> None:
+        """End the search, and close what it has found."""
         self._cancelled.set()
         if (found := self.result()) is not None:
             found.close()
@@ -365,16 +353,16 @@ class LcmLink:
         connection = self._current()
         return [] if connection is None else [connection]
 
-    def _current(self) -> Connection | None:
-        if self._search is not None and (found := self._search.result()) is not None:
+    def _current(self, timeout: float = 0.0) -> Connection | None:
+        if self._search is not None and (found := self._search.result(timeout)) is not None:
             self._connection, self._search = found, None
             self.reconnections += 1
         return self._connection
 
-    def _required(self) -> Connection | None:
+    def _required(self, timeout: float = 0.0) -> Connection | None:
         if not self.is_open:
             raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
-        return self._current()
+        return self._current(timeout)
 
     def take(self, timeout: float, limit: int) -> int:
         """Pass messages to their handlers, and return how many.
@@ -383,14 +371,13 @@ class LcmLink:
             timeout: seconds to wait for the first message.
             limit: the most messages that are taken.
         """
-        connection = self._connection or self._required()
+        end = time.monotonic() + timeout
+        connection = self._connection or self._required(timeout)
         if connection is None:
-            if timeout > 0 and self._search is not None:
-                self._search.ended.wait(timeout)
             return 0
         try:
             count = connection.take(limit)
-            end = time.monotonic() + timeout
+            timeout = end - time.monotonic()
             while not count and timeout > 0:
                 select.select((connection,), (connection,) if connection.pending else (), (), timeout)
                 count = connection.take(limit)
@@ -420,7 +407,6 @@ class LcmLink:
             self._connection.close()
             self._connection = None
         self._search = _Search(self._connect)
-        self._search.start()
 
     def close(self) -> None:
         """Close the connection, or end the search; the link may be opened again."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from io import BytesIO
 from math import nan, prod
-from operator import attrgetter
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from vtbdrake.lcm.messages import MalformedError, MessageDecoder, MessageEncoder
 from vtbdrake.testbed import Signal
@@ -23,7 +22,7 @@ Decoder = Callable[[bytes], tuple[float, Mapping[str, Any]]]
 Encoder = Callable[[Mapping[str, Any], int], bytes]
 """Returns the message with values by signal and the time in microseconds."""
 
-_CODES = {
+_NUMBERS = {
     "int8_t": "b",
     "int16_t": "h",
     "int32_t": "i",
@@ -32,6 +31,7 @@ _CODES = {
     "double": "d",
     "boolean": "?",
 }  # LCM's types of numbers, as `struct` calls them
+_CODES = _NUMBERS | {"byte": "b", "string": "s"}
 
 
 def decode(message_type: Any, data: bytes) -> Any:
@@ -165,16 +165,18 @@ class Field(NamedTuple):
         path: its name; dotted if it lies in a message within the message.
         typename: its type in LCM.
         dimensions: its shape; the path of another field where that field holds the size. Empty for a scalar.
+        members: the fields of a message within the message.
     """
 
     path: str
     typename: str
-    dimensions: tuple[int | str, ...]
+    dimensions: tuple[int | str, ...] = ()
+    members: tuple[Field, ...] = ()
 
     @property
     def code(self) -> str:
-        """The type as `struct` calls it: a byte is an integer, ``s`` a string; empty for other messages."""
-        return {"byte": "b", "string": "s"}.get(self.typename) or _CODES.get(self.typename, "")
+        """The type as `struct` calls it; ``s`` for a string, ``{`` for a message."""
+        return _CODES.get(self.typename, "{")
 
     @property
     def length(self) -> str:
@@ -182,27 +184,33 @@ class Field(NamedTuple):
         return next((size for size in self.dimensions if isinstance(size, str)), "")
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """The fixed dimensions."""
-        return tuple(size for size in self.dimensions if isinstance(size, int))
+    def size(self) -> int:
+        """How many numbers it has if its dimensions are fixed."""
+        return prod(size for size in self.dimensions if isinstance(size, int))
 
 
-def _fields(message: Any, prefix: str = "") -> list[Field]:
-    """Return all fields of a message and of the messages within it, in the order of encoding."""
+def _fields(message_type: Any, prefix: str = "") -> tuple[Field, ...]:
     found = []
-    kind = type(message)
-    for name, typename, dimensions in zip(kind.__slots__, kind.__typenames__, kind.__dimensions__, strict=True):
+    for name, typename, dimensions in zip(
+        message_type.__slots__, message_type.__typenames__, message_type.__dimensions__, strict=True
+    ):
         sizes = tuple(prefix + size if isinstance(size, str) else size for size in dimensions or ())
-        found.append(Field(prefix + name, typename, sizes))
-        if hasattr(getattr(message, name), "__typenames__"):
-            found += _fields(getattr(message, name), f"{prefix}{name}.")
+        members: tuple[Field, ...] = ()
+        if typename not in _CODES:
+            package, _, own_name = typename.rpartition(".")
+            members = _fields(getattr(import_module(package or own_name), own_name), f"{prefix}{name}.")
+        found.append(Field(prefix + name, typename, sizes, members))
+    return tuple(found)
+
+
+def _by_path(fields: Sequence[Field]) -> dict[str, Field]:
+    """Return all fields that occur exactly once in every message."""
+    found = {}
+    for field in fields:
+        found[field.path] = field
+        if not field.dimensions:
+            found |= _by_path(field.members)
     return found
-
-
-def _owner(message: Any, path: str) -> tuple[Any, str]:
-    """Return the message within ``message`` that has the field at ``path``, and the field's name there."""
-    parents, _, name = path.rpartition(".")
-    return (attrgetter(parents)(message) if parents else message), name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,34 +218,50 @@ class VectorMap(LcmMap):
     """An `LcmMap` of vector signals; `vector_map` makes one.
 
     Attributes:
-        fields: by signal, the fields that hold its entries, one after the other.
+        parts: by signal, the fields that hold its entries, one after the other.
+        fields: all fields of the message type.
         stamp: path of the field with the sender's time in microseconds; empty if there is none.
     """
 
-    fields: Mapping[str, Sequence[Field]]
+    parts: Mapping[str, Sequence[Field]]
+    fields: Sequence[Field]
     stamp: str = ""
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         self._check(signals)
-        layout = self._layout(self.signals)
-        return super().decoder(signals) if layout is None else MessageDecoder(*layout).decode
+        return MessageDecoder(*self._layout(self.signals)).decode
 
     def encoder(self, signals: Sequence[Signal]) -> Encoder:
         self._check(signals)
-        general = super().encoder(signals)
-        if self._layout(()) is None:
-            return general
         sizes = {signal.name: signal.size or 0 for signal in signals}
         encoders: dict[tuple[str, ...], MessageEncoder] = {}  # by the signals in the message
 
         def encode(values: Mapping[str, Any], utime: int) -> bytes:
             names = tuple(values)
             if names not in encoders:
-                example = general({name: np.zeros(sizes[name]) for name in names}, 0)
-                encoders[names] = MessageEncoder(*(self._layout(names) or ()), example=example)
+                example = self._example({name: sizes[name] for name in names})
+                encoders[names] = MessageEncoder(*self._layout(names), example=example)
             return encoders[names].encode(values, utime)
 
         return encode
+
+    def _layout(self, names: Sequence[str]) -> tuple[bytes, Sequence[Field], dict[str, list[str]], str]:
+        """Return the arguments of `MessageDecoder` and `MessageEncoder` for messages with these signals."""
+        signals = {name: [field.path for field in self.parts[name]] for name in names}
+        return self.type._get_packed_fingerprint(), self.fields, signals, self.stamp
+
+    def _example(self, sizes: Mapping[str, int]) -> bytes:
+        """Return a message with signals of these sizes, in which all numbers but the lengths of arrays are zero.
+
+        Raises:
+            LookupError: the message cannot leave out a signal that is missing.
+        """
+        lengths = {self.parts[name][0].length: size for name, size in sizes.items()}
+        for name in self.parts.keys() - sizes.keys():
+            length = self.parts[name][0].length
+            if not length or lengths.get(length):
+                raise LookupError(name)
+        return bytes(self.type._get_packed_fingerprint() + _zeros(self.fields, lengths))
 
     def _check(self, signals: Sequence[Signal]) -> None:
         """Raise ValueError if a signal is abstract, or not of the size of its fields."""
@@ -245,34 +269,34 @@ class VectorMap(LcmMap):
         for signal in signals:
             if signal.size is None:
                 raise ValueError(f"signal {signal.name} is abstract; channel {self.channel} carries vectors")
-            fields = self.fields[signal.name]
-            if length := fields[0].length:
+            parts = self.parts[signal.name]
+            if length := parts[0].length:
                 other = lengths.setdefault(length, signal)
                 if other.size != signal.size:
                     raise ValueError(
                         f"signals {other.name} and {signal.name} have {other.size} and {signal.size} entries, but "
                         f"field {length} of {self.type.__name__} is the length of both"
                     )
-            elif signal.size != (size := sum(prod(field.shape) for field in fields)):
-                paths = ", ".join(field.path for field in fields)
+            elif signal.size != (size := sum(field.size for field in parts)):
+                paths = ", ".join(field.path for field in parts)
                 raise ValueError(
                     f"signal {signal.name} has {signal.size} entries, but {paths} of {self.type.__name__} on channel "
                     f"{self.channel} has {size}"
                 )
 
-    def _layout(self, names: Sequence[str]) -> tuple[Any, ...] | None:
-        """Return the arguments of `MessageDecoder` and `MessageEncoder` for a message with the signals ``names``.
 
-        None if messages of this type can hold arrays of strings or of messages: lcm-gen's code handles those.
-        """
-        fields = []
-        for field in _fields(self.type()):
-            if field.code and not (field.code == "s" and field.dimensions):
-                fields.append((field.path, field.code, field.dimensions))
-            elif field.dimensions:
-                return None
-        signals = {name: [field.path for field in self.fields[name]] for name in names}
-        return self.type._get_packed_fingerprint(), fields, signals, self.stamp
+def _zeros(fields: Sequence[Field], lengths: Mapping[str, int]) -> bytes:
+    """Return the bytes of these fields, in which all numbers but the lengths (by path) are zero."""
+    data = b""
+    for field in fields:
+        count = prod(lengths.get(size, 0) if isinstance(size, str) else size for size in field.dimensions)
+        if field.code == "{":
+            data += count * _zeros(field.members, lengths if not field.dimensions else {})
+        elif field.code == "s":
+            data += count * b"\0\0\0\1\0"
+        else:
+            data += struct.pack(f">{count}{field.code}", *[lengths.get(field.path, 0)] * count)
+    return data
 
 
 def vector_map(
@@ -291,35 +315,24 @@ def vector_map(
     Raises:
         ValueError: there is no such field, or it does not hold numbers.
     """
-    known = {field.path: field for field in _fields(message_type())}
+    try:
+        known_fields = _fields(message_type)
+    except RecursionError:
+        raise ValueError(f"{message_type.__name__} contains itself: write an LcmMap for it") from None
+    known = _by_path(known_fields)
     found: dict[str, list[Field]] = {}
-    for name, paths in fields.items():
-        found[name] = [
-            _number_field(message_type, known, path) for path in ([paths] if isinstance(paths, str) else paths)
-        ]
-        if len(found[name]) > 1 and any(field.length for field in found[name]):
+    for name, given in fields.items():
+        paths = [given] if isinstance(given, str) else given
+        found[name] = [_number_field(message_type, known, path) for path in paths]
+        if len(paths) > 1 and any(field.length for field in found[name]):
             raise ValueError(
                 f"signal {name} on channel {channel} cannot be spread over {', '.join(paths)}: an array of variable "
                 "length carries a signal alone"
             )
     if stamp and _number_field(message_type, known, stamp).dimensions:
         raise ValueError(f"field {stamp} of {message_type.__name__} is no time; give stamp='' if there is none")
-
-    def to_values(message: Any) -> dict[str, np.ndarray]:
-        return {
-            name: np.concatenate([np.ravel(np.asarray(attrgetter(field.path)(message), float)) for field in parts])
-            for name, parts in found.items()
-        }
-
     return VectorMap(
-        channel=channel,
-        type=message_type,
-        signals=tuple(found),
-        decode=to_values,
-        encode=lambda values, utime: _compose(message_type(), found, values, stamp, utime),
-        sent=(lambda message: attrgetter(stamp)(message) * 1e-6) if stamp else no_time,
-        fields=found,
-        stamp=stamp,
+        channel=channel, type=message_type, signals=tuple(found), parts=found, fields=known_fields, stamp=stamp
     )
 
 
@@ -328,48 +341,10 @@ def _number_field(message_type: Any, known: Mapping[str, Field], path: str) -> F
         fields = ", ".join(message_type.__slots__)
         raise ValueError(f"{message_type.__name__} has no field {path!r}; it has {fields}")
     field = known[path]
-    if field.typename not in _CODES or (field.length and len(field.dimensions) > 1):
+    if field.typename not in _NUMBERS or (field.length and len(field.dimensions) > 1):
         shape = "".join(f"[{dimension}]" for dimension in field.dimensions)
         raise ValueError(
             f"field {path} of {message_type.__name__} is a {field.typename}{shape}: a vector signal travels in "
             "numbers, in arrays of fixed dimensions, or in an array of one dimension; write an LcmMap for it"
         )
     return field
-
-
-def _compose(
-    message: Any, fields: Mapping[str, Sequence[Field]], values: Mapping[str, Any], stamp: str, utime: int
-) -> Any:
-    """Set values, by signal, and the time in a new message: fields of missing signals stay zero or empty.
-
-    Raises:
-        LookupError: the message cannot leave out a signal that is missing.
-    """
-    if stamp:
-        owner, name = _owner(message, stamp)
-        setattr(owner, name, utime)
-    for signal, value in values.items():
-        numbers = np.asarray(value, dtype=float)
-        for field in fields[signal]:
-            owner, name = _owner(message, field.path)
-            shape = numbers.shape if field.length else field.shape
-            part, numbers = numbers[: prod(shape)].reshape(shape), numbers[prod(shape) :]
-            if field.length:
-                _set_length(message, field.length, part.size)
-            setattr(owner, name, (part if field.code in "df" else np.vectorize(round, otypes="O")(part)).tolist())
-    for signal in fields.keys() - values.keys():
-        for field in fields[signal]:
-            if not field.length or attrgetter(field.length)(message):
-                raise LookupError(signal)
-    return message
-
-
-def _set_length(message: Any, length: str, size: int) -> None:
-    """Set a length, and fill all arrays of that length with zeros unless they have it already."""
-    owner, name = _owner(message, length)
-    setattr(owner, name, size)
-    for field in _fields(message):
-        if field.dimensions == (length,) and field.typename in _CODES:
-            owner, name = _owner(message, field.path)
-            if len(getattr(owner, name)) != size:
-                setattr(owner, name, [0] * size)

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Fields = Sequence[tuple[str, str, Sequence[int | str]]]
+from vtbdrake.lcm.maps import Field
 
 class MalformedError(ValueError):
     reason: str
@@ -12,7 +12,7 @@ class MalformedError(ValueError):
 
 class MessageDecoder:
     def __init__(
-        self, fingerprint: bytes, fields: Fields, signals: Mapping[str, Sequence[str]], stamp: str = ""
+        self, fingerprint: bytes, fields: Sequence[Field], signals: Mapping[str, Sequence[str]], stamp: str = ""
     ) -> None: ...
     def decode(self, data: bytes) -> tuple[float, dict[str, NDArray[np.float64]]]: ...
 
@@ -20,7 +20,7 @@ class MessageEncoder:
     def __init__(
         self,
         fingerprint: bytes,
-        fields: Fields,
+        fields: Sequence[Field],
         signals: Mapping[str, Sequence[str]],
         stamp: str = "",
         *,

@@ -26,7 +26,7 @@ from vtbdrake.lcm.byte_order cimport (
 
 cnp.import_array()
 
-cdef dict _WIDTHS = {"d": 8, "q": 8, "f": 4, "i": 4, "h": 2, "b": 1, "?": 1, "s": 1}  # bytes, by type
+cdef dict _WIDTHS = {"d": 8, "q": 8, "f": 4, "i": 4, "h": 2, "b": 1, "?": 1, "s": 1, "{": 1}  # bytes, by type
 
 
 class MalformedError(ValueError):
@@ -43,9 +43,10 @@ cdef struct Dimension:
 
 
 cdef struct Field:
-    char code  # type as in `struct`
+    char code  # type as in `struct`; "s" for a string, "{" for a message
     Py_ssize_t width  # of a number, in bytes
     Py_ssize_t dimension, dimension_end  # its dimensions among those of the layout
+    Py_ssize_t end  # behind its members, which follow it
     # In the message that was located last:
     Py_ssize_t offset  # of the first number
     Py_ssize_t count  # of numbers
@@ -56,8 +57,7 @@ cdef class MessageLayout:
 
     Args:
         fingerprint: the first 8 bytes of every message.
-        fields: path, type and dimensions of every field in the order of encoding. Types as in `struct`; ``s`` is a
-            string. A dimension is a number or the path of an earlier integer field.
+        fields: the `vtbdrake.lcm.maps.Field` of every field, in the order of encoding.
         signals: the paths of the fields that make up each signal, by name.
         stamp: path of the field with the sender's time in microseconds; empty if there is none.
     """
@@ -68,45 +68,45 @@ cdef class MessageLayout:
     cdef Dimension* dimensions
     cdef Py_ssize_t stamp  # field; -1 if there is none
     cdef list names  # of the signals
-    cdef Py_ssize_t part_count
     cdef Py_ssize_t* parts  # fields of all signals, one signal after the other
     cdef Py_ssize_t* part_ends  # by signal
 
     def __cinit__(self, bytes fingerprint not None, fields, signals, str stamp="", **_):
         cdef Py_ssize_t i = 0, k = 0
-        cdef dict index = {path: i for i, (path, _, _) in enumerate(fields)}
-        if len(fingerprint) != 8 or len(index) != len(fields):
-            raise ValueError("a message type has a fingerprint of 8 bytes, and fields with different paths")
+        cdef list flat = []
+        if len(fingerprint) != 8:
+            raise ValueError(f"a fingerprint has 8 bytes, not {len(fingerprint)}")
         self.fingerprint = fingerprint
-        self.field_count = len(fields)
-        self.fields = <Field*>zeros(len(fields), sizeof(Field))
-        self.dimensions = <Dimension*>zeros(sum(len(dimensions) for _, _, dimensions in fields), sizeof(Dimension))
-        for i, (_, code, dimensions) in enumerate(fields):
-            self.fields[i].code = ord(code)
-            self.fields[i].width = _WIDTHS[code]
+        _flatten(fields, flat, None, True)
+        # Only what occurs exactly once in every message is a number of a signal, or a time.
+        cdef dict single = {field.path: i for i, (field, _, _, is_single) in enumerate(flat) if is_single}
+        self.field_count = len(flat)
+        self.fields = <Field*>zeros(len(flat), sizeof(Field))
+        self.dimensions = <Dimension*>zeros(sum(len(entry[0].dimensions) for entry in flat), sizeof(Dimension))
+        for i, (field, end, parent, _) in enumerate(flat):
+            self.fields[i].code = ord(field.code)
+            self.fields[i].width = _WIDTHS[field.code]
+            self.fields[i].end = end
             self.fields[i].dimension = k
-            for dimension in dimensions:
+            for dimension in field.dimensions:
                 self.dimensions[k].field = -1
                 if isinstance(dimension, str):
-                    length = index[dimension]
-                    if not (length < i and self.fields[length].code in b"qihb" and not fields[length][2]):
-                        raise ValueError(f"{dimension} is no length: it has to be one integer, and to come before")
-                    self.dimensions[k].field = length
+                    self.dimensions[k].field = _length(flat, i, dimension)
                 else:
                     self.dimensions[k].size = dimension
                 k += 1
             self.fields[i].dimension_end = k
-        self.stamp = index[stamp] if stamp else -1
+        self.stamp = single[stamp] if stamp else -1
         self.names = list(signals)
         paths = [path for parts in signals.values() for path in parts]
         for path in [*paths, stamp] if stamp else paths:
-            if fields[index[path]][1] == "s" or (path == stamp and fields[index[path]][2]):
+            field = flat[single[path]][0]
+            if field.code in "s{" or (path == stamp and field.dimensions):
                 raise ValueError(f"{path} does not hold numbers, or is a time of several numbers")
-        self.part_count = len(paths)
         self.parts = <Py_ssize_t*>zeros(len(paths), sizeof(Py_ssize_t))
         self.part_ends = <Py_ssize_t*>zeros(len(signals), sizeof(Py_ssize_t))
         for i, path in enumerate(paths):
-            self.parts[i] = index[path]
+            self.parts[i] = single[path]
         k = 0
         for i, name in enumerate(signals):
             k += len(signals[name])
@@ -120,22 +120,25 @@ cdef class MessageLayout:
 
     cdef int locate(self, bytes data) except -1:
         """Find each field in a message. Every byte is checked to be there before it is read."""
-        cdef const char* message = PyBytes_AS_STRING(data)
-        cdef Py_ssize_t size = PyBytes_GET_SIZE(data), offset = 8, count, i, k
-        cdef int64_t length
-        cdef Field* field
+        cdef Py_ssize_t size = PyBytes_GET_SIZE(data)
         if size < 8:
             raise MalformedError("truncated")
-        if memcmp(message, PyBytes_AS_STRING(self.fingerprint), 8):
+        if memcmp(PyBytes_AS_STRING(data), PyBytes_AS_STRING(self.fingerprint), 8):
             raise MalformedError("fingerprint")
-        for i in range(self.field_count):
+        if self.walk(PyBytes_AS_STRING(data), size, 8, 0, self.field_count) != size:
+            raise MalformedError("trailing")
+        return 0
+
+    cdef Py_ssize_t walk(
+        self, const char* message, Py_ssize_t size, Py_ssize_t offset, Py_ssize_t begin, Py_ssize_t end
+    ) except -1:
+        """Find some fields, which begin at ``offset``, and return where they end."""
+        cdef Py_ssize_t count, before, i = begin, k
+        cdef int64_t length
+        cdef Field* field
+        while i < end:
             field = &self.fields[i]
             count = 1
-            if field.code == b"s":
-                if size - offset < 4:
-                    raise MalformedError("truncated")
-                count = get_uint32(message + offset)
-                offset += 4
             for k in range(field.dimension, field.dimension_end):
                 length = self.dimensions[k].size
                 if self.dimensions[k].field >= 0:
@@ -144,13 +147,25 @@ cdef class MessageLayout:
                     raise MalformedError("size")
                 # More than the message can hold is as wrong as anything larger; so nothing overflows.
                 count = size if length and count > size // length else count * <Py_ssize_t>length
+            i = field.end
+            if field.code == b"{":
+                for k in range(count):
+                    before = offset
+                    offset = self.walk(message, size, offset, <Py_ssize_t>(field - self.fields) + 1, field.end)
+                    if offset == before:  # Such a message is empty, and so are the others.
+                        break
+                continue
+            if field.code == b"s":
+                for k in range(count):
+                    if size - offset < 4 or size - offset - 4 < <Py_ssize_t>get_uint32(message + offset):
+                        raise MalformedError("truncated")
+                    offset += 4 + <Py_ssize_t>get_uint32(message + offset)
+                continue
             if count > (size - offset) // field.width:
                 raise MalformedError("truncated")
             field.offset, field.count = offset, count
             offset += count * field.width
-        if offset != size:
-            raise MalformedError("trailing")
-        return 0
+        return offset
 
     cdef Py_ssize_t count(self, Py_ssize_t signal) noexcept:
         """Return how many numbers the signal has in the located message."""
@@ -257,6 +272,23 @@ cdef class MessageEncoder(MessageLayout):
                     entry += 1
                     at += field.width
         return data
+
+
+def _flatten(fields, list flat, parent, is_single):
+    """Append each field with the index behind its members, its parent, and whether it occurs once in every message."""
+    for field in fields:
+        index = len(flat)
+        flat.append(None)
+        _flatten(field.members, flat, index, is_single and not field.dimensions)
+        flat[index] = (field, len(flat), parent, is_single)
+
+
+def _length(list flat, index, path):
+    """Return the index of the integer that holds a length of a field: it precedes the field in the same message."""
+    for i, (field, _, parent, _) in enumerate(flat[:index]):
+        if field.path == path and parent == flat[index][2] and field.code in "qihb" and not field.dimensions:
+            return i
+    raise ValueError(f"{path} is no length: it has to be one integer that comes before in the same message")
 
 
 cdef inline int64_t _integer(const char* message, const Field* field) noexcept:
