@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from vtbdrake.lcm.hub import Hub
     from vtbdrake.lcm.protocol import Protocol
     from vtbdrake.machine import MachineProcess
-    from vtbdrake.monitoring.live.client import LiveClient, watch
-    from vtbdrake.monitoring.live.live_watch import LiveWatch
+    from vtbdrake.monitoring.live.client import LiveClient, LiveWatch, watch
     from vtbdrake.monitoring.live.service import LiveService
     from vtbdrake.monitoring.residuals import ResidualMonitor
     from vtbdrake.optimization import Boundary, Choice, CVaR, Parameter, Problem, Quantile, Study, Sweep
@@ -81,8 +80,7 @@ _HOMES = {
     "control.guards": ("Guards",),
     "lcm.hub": ("Hub",),
     "lcm.bridge": ("LcmBridge",),
-    "monitoring.live.client": ("LiveClient", "watch"),
-    "monitoring.live.live_watch": ("LiveWatch",),
+    "monitoring.live.client": ("LiveClient", "LiveWatch", "watch"),
     "monitoring.live.service": ("LiveService",),
     "machine": ("MachineProcess",),
     "deployment": ("Deployment",),

@@ -11,7 +11,7 @@ import numpy as np
 from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.monitoring.live.client import LiveClient, LiveError, SilenceError
+from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
 
 
 @click.command("set")
@@ -77,5 +77,5 @@ def _client(url: str, timeout: float) -> Iterator[LiveClient]:
     try:
         with LiveClient(url, timeout=timeout) as client:
             yield client
-    except (BridgeError, LiveError, SilenceError) as error:
+    except (BridgeError, LiveError, LiveTimeoutError) as error:
         raise FailedError(one_line(error)) from error

@@ -12,7 +12,7 @@ from vtbdrake.cli.group import FailedError, one_line
 from vtbdrake.cli.options import timeout_option, url_option
 from vtbdrake.cli.text import finite
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.monitoring.live.client import LiveError, SilenceError, watch
+from vtbdrake.monitoring.live.client import LiveError, LiveTimeoutError, watch
 
 
 @click.command("watch")
@@ -41,7 +41,7 @@ def watch_values(addresses: tuple[str, ...], url: str, every: int, count: int | 
         for time, values in islice(watch(url, addresses, every=every, timeout=timeout), count):
             plain = {address: finite(np.asarray(value).tolist()) for address, value in values.items()}
             click.echo(json.dumps({"time": time, **plain}))
-    except (BridgeError, LiveError, SilenceError) as error:
+    except (BridgeError, LiveError, LiveTimeoutError) as error:
         raise FailedError(one_line(error)) from error
     except KeyboardInterrupt:
         return

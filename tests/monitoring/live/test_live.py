@@ -18,9 +18,8 @@ from tests.control.scripted import PERIOD
 from tests.monitoring.live.rig import PATIENCE, Rig, served
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
-from vtbdrake.monitoring.live.client import LiveClient, LiveError, SilenceError, watch
-from vtbdrake.monitoring.live.desk import MAX_WAITING
-from vtbdrake.monitoring.live.live_watch import LiveWatch
+from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError, LiveWatch, watch
+from vtbdrake.monitoring.live.server import MAX_WAITING
 
 # Enough to read everything in one cycle, on a computer that is busy.
 AMPLE = {"budget": 10.0, "longest": 10.0}
@@ -84,11 +83,11 @@ def test_who_is_not_let_to_set_is_told_by_whom(hub: Hub) -> None:
         owner.publish("VTB_SET", b"")
 
         def reason(timeout: float) -> str:
-            with LiveClient(bus.url, timeout=timeout) as client, pytest.raises(SilenceError) as caught:
+            with LiveClient(bus.url, timeout=timeout) as client, pytest.raises(LiveTimeoutError) as caught:
                 client.set({"dps.gain": 3.0})
             return str(caught.value)
 
-        told = f"lets {client_name(owner.fileno())} alone publish on VTB_SET"
+        told = f"lets only {client_name(owner.fileno())} publish on VTB_SET"
         assert any(told in reason(timeout) for timeout in LONGER_AND_LONGER)
 
 
@@ -151,7 +150,7 @@ def test_answer_that_is_none_of_a_dps_is_a_live_error(
     channel = f"VTB_{method.upper()}"
     with impostor(hub.url, channel, [(f"{channel}_ANSWER", answer)]), pytest.raises(LiveError) as caught:
         asked(hub.url, method, *arguments)
-    assert str(answer.get("error", "is no DPS of vtbdrake")) in str(caught.value)
+    assert str(answer.get("error", "is not from a DPS of vtbdrake")) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +198,7 @@ def test_what_is_read_is_what_is_there(shared: Rig) -> None:
         ({"dps.gain": -1.0}, "must lie in"),
         ({"dps.gain": [1.0, 2.0]}, "shape"),
         ({"u.target": [[1.0], [2.0, 3.0]]}, ""),
-        ({"dps.velocity": 1.0, "dps.gain": float("nan")}, "the value of dps.gain is a finite number"),
+        ({"dps.velocity": 1.0, "dps.gain": float("nan")}, "the value of dps.gain must be a finite number"),
         ({"time": 1.0}, "time is not written"),
         ({"real.act.velocity": [1.0, 1.0]}, "real.act.velocity is an output port"),
     ],
@@ -233,7 +232,7 @@ def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
         bus.publish("VTB_RESET", b'{"id": "me", "reset": 1}')
         for data in (b"", b"\x00\xff", b" " * 100_000, b'{"id": "me", "set": {"x": Infinity}}', b'{"id": "me"}'):
             bus.publish("VTB_SET", data)
-        rig.until(lambda: service.refused == 6)
+        rig.until(lambda: service.rejected == 6)
         while len(answers) < 5:
             assert bus.handle_timeout(round(1e3 * PATIENCE))
         assert [answer["id"] for answer in answers] == ["", "", "", "me", "me"]
@@ -253,7 +252,7 @@ def test_a_flood_of_requests_costs_the_loop_one_a_cycle(hub: Hub) -> None:
         # Those that the loop is not bothered with are refused without it.
         while len(answers) < 100 - MAX_WAITING:
             assert bus.handle_timeout(round(1e3 * PATIENCE))
-        assert all("requests wait already" in answer["error"] for answer in answers)
+        assert all("requests are waiting" in answer["error"] for answer in answers)
         rig.until(lambda: sum(len(cycle.changes) for cycle in rig.cycles[before:]) == MAX_WAITING)
     assert all(len(cycle.changes) <= 1 for cycle in rig.cycles[before:])
 
@@ -270,19 +269,19 @@ def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> Non
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("nan")])
 def test_timeout_that_is_no_positive_time_is_refused(hub: Hub, timeout: float) -> None:
     for begin in (LiveClient, lambda url, timeout: LiveWatch(url, ["dps.gain"], timeout=timeout)):
-        with pytest.raises(ValueError, match="the timeout is a positive time in seconds, not"):
+        with pytest.raises(ValueError, match="the timeout must be a positive number of seconds, not"):
             begin(hub.url, timeout=timeout)
-    with pytest.raises(ValueError, match="the timeout is a positive time in seconds, not"):
+    with pytest.raises(ValueError, match="the timeout must be a positive number of seconds, not"):
         next(watch(hub.url, ["dps.gain"], timeout=timeout))
 
 
 def test_lease_that_is_no_number_is_refused(hub: Hub) -> None:
-    with pytest.raises(LiveError, match="lease lies in 0.1 to 60 s, not at nan"):
+    with pytest.raises(LiveError, match="lease must be 0.1 to 60 s, not nan"):
         next(watch(hub.url, ["dps.gain"], lease=float("nan"), timeout=0.1))
 
 
 def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
-    with LiveClient(hub.url, timeout=0.1) as client, pytest.raises(SilenceError, match="nobody has answered"):
+    with LiveClient(hub.url, timeout=0.1) as client, pytest.raises(LiveTimeoutError, match="no answer"):
         client.get(["dps.gain"])
 
 
@@ -344,7 +343,7 @@ def test_nobody_waits_for_ever_while_others_watch_more_than_there_is_time_for(hu
 
 def test_what_takes_too_long_to_read_is_not_read_again(hub: Hub) -> None:
     with served(hub.url, budget=1e-9, longest=1e-9) as (rig, service):
-        with pytest.raises(LiveError, match=r"dps.ticks takes .* ms to be read"):
+        with pytest.raises(LiveError, match=r"reading dps.ticks takes .* ms"):
             rig.during(watched, hub.url, ["dps.ticks"], 1)
         assert service.watches == 0
 
@@ -360,13 +359,13 @@ def test_unknown_addresses_are_not_watched(shared: Rig, address: str, reason: st
 
 def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> None:
     def reason(timeout: float) -> str:
-        with pytest.raises(SilenceError) as caught:
+        with pytest.raises(LiveTimeoutError) as caught:
             list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=timeout))
         return str(caught.value)
 
     with served(hub.url, **AMPLE) as (rig, _):
         rig.during(asked, hub.url, "get", ["dps.gain"])
-        told = "or 1000000000 cycles of it take longer"
+        told = "or 1000000000 cycles take longer"
         assert rig.during(lambda: any(told in reason(timeout) for timeout in LONGER_AND_LONGER))
 
 

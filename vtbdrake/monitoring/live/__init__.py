@@ -1,5 +1,7 @@
-"""A running DPS, seen and set from other processes, without holding up its loop: `service.LiveService` in the loop's
-process, `desk` in its worker process; `client.LiveClient`, `client.watch` and `live_watch.LiveWatch` elsewhere.
+"""Live values: a running DPS is read, watched and set from other processes without delaying its loop.
 
-Nothing is imported here: neither the worker process nor those who watch need Drake.
+`service.LiveService` runs in the loop's process, `server.LiveServer` in its worker process; other processes use
+`client.LiveClient`, `client.watch` and `client.LiveWatch`.
+
+This module imports nothing: neither the worker process nor the clients need Drake.
 """

@@ -1,37 +1,48 @@
-"""The part of those who set, read, watch and reset what runs in another process."""
+"""Clients of live values: they set, read, watch and reset a DPS that runs in another process."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 import uuid
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.control.json_object import json_object
+from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
-from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, parse, to_json
+from vtbdrake.monitoring.live.messages import (
+    ANSWER,
+    GET,
+    RESET,
+    SET,
+    WATCH,
+    WATCHED,
+    is_number,
+    parse_request,
+    to_json,
+)
 
 _CONNECT_TIMEOUT = 2.0  # s
-_BURST = 1000  # messages to take in at a time
+_BURST = 1000  # messages taken at a time
 _SLICE = 0.05  # s; longest wait for a message before looking at the clock
-_REPEAT = 0.5  # s after which a request is said again
-_TAKE_AGAIN = 0.05  # s after which a channel that belongs to somebody else is asked for again
+_REPEAT_PERIOD = 0.5  # s after which a request is sent again
+_TAKE_PERIOD = 0.05  # s after which a channel that another client owns is asked for again
 
 Values = dict[str, float | NDArray[np.float64]]
 
 
 class LiveError(ValueError):
-    """The DPS refuses what it is asked for, or somebody else on the bus gives an answer that a DPS would not."""
+    """A request that the DPS rejects, or an answer on the bus that no DPS would give."""
 
 
-class SilenceError(TimeoutError):
-    """Nobody answers."""
+class LiveTimeoutError(TimeoutError):
+    """No answer or no value came in time."""
 
 
 class LiveClient:
@@ -43,100 +54,99 @@ class LiveClient:
             dps.set({"dps.impl.stiffness": 200.0})
 
     Args:
-        url: the bus.
-        timeout: seconds to wait for an answer.
+        url: LCM URL of the bus.
+        timeout: Seconds to wait for an answer.
 
     Raises:
-        BridgeError: there is no bus.
-        ValueError: the timeout is no positive number.
+        BridgeError: There is no bus.
+        ValueError: The timeout is not positive.
     """
 
     def __init__(self, url: str, *, timeout: float = 5.0) -> None:
-        self._timeout = check_timeout(timeout)
-        self._answers: dict[str, dict[str, Any]] = {}
-        self._waiting = ""
-        self._asked = -np.inf
-        self._owners: dict[str, str] = {}  # of the channels that a hub protects, and that others own
-        handlers = dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._hear)
-        self._link = LcmLink(url, {**handlers, STATUS_CHANNEL: self._hear_status}, connect_timeout=_CONNECT_TIMEOUT)
+        self._timeout = _check_timeout(timeout)
+        self._id = ""
+        self._answer: dict[str, Any] = {}
+        self._owners: dict[str, str] = {}  # of the channels that a hub protects, and that other clients own
+        handlers = dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._receive)
+        self._link = LcmLink(url, {**handlers, STATUS_CHANNEL: self._receive_status}, connect_timeout=_CONNECT_TIMEOUT)
         self._link.open()
 
     def set(self, values: Mapping[str, ArrayLike]) -> None:
-        """Sets variables by address, all of them or none.
+        """Set variables by address, all of them or none.
 
         Raises:
-            LiveError: one of them is refused.
-            SilenceError: nobody answers; they may have been set or not.
+            LiveError: One of them is rejected.
+            LiveTimeoutError: There is no answer; they may have been set or not.
         """
-        self._ask(SET, {"set": dict(values)})
+        self._request(SET, {"set": dict(values)})
 
     def get(self, addresses: Iterable[str]) -> Values:
-        """The present values of variables and vector output ports, by address.
+        """Return the present values of variables and vector output ports by address.
 
         Raises:
-            LiveError: one of them is refused.
-            SilenceError: nobody answers.
+            LiveError: One of them is rejected.
+            LiveTimeoutError: There is no answer.
         """
         addresses = list(addresses)
-        return to_arrays(_values(self._ask(GET, {"get": addresses}), addresses, GET))
+        return _arrays(self._request(GET, {"get": addresses}), addresses, GET)
 
     def reset(self) -> list[str]:
-        """Releases the latch of the guards; what they had latched for, empty if they had not.
+        """Release the latch of the guards and return the reasons for which it had latched.
 
         Raises:
-            LiveError: a cause persists; the fallbacks go on.
-            SilenceError: nobody answers; it may have been released or not.
+            LiveError: A cause persists; the fallbacks go on.
+            LiveTimeoutError: There is no answer; the latch may have been released or not.
         """
-        answer = self._ask(RESET, {"reset": True})
+        answer = self._request(RESET, {"reset": True})
         released = answer.get("released")
         if not isinstance(released, list) or not all(isinstance(reason, str) for reason in released):
-            raise _no_answer(RESET, "the list of reasons in 'released'", answer)
+            raise _invalid(RESET, "the list of reasons in 'released'", answer)
         return released
 
-    def _ask(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
-        self._waiting = _new_id()
-        message = {"id": self._waiting, **request}
-        limit, self._asked = time.monotonic() + self._timeout, -np.inf
-        while self._waiting not in self._answers:
+    def _request(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
+        self._id, self._answer = uuid.uuid4().hex, {}
+        data = _checked(channel, {"id": self._id, **request})
+        deadline, sent = time.monotonic() + self._timeout, -np.inf
+        while not self._answer:
             now = time.monotonic()
-            if now >= limit:
-                raise _silence(self._link, self._timeout, channel, self._owners.get(channel))
-            if channel in self._owners and now >= self._asked + _TAKE_AGAIN:
-                # The hub refuses as long as the other one goes on publishing.
+            if now >= deadline:
+                raise _no_answer(self._link, self._timeout, channel, self._owners.get(channel))
+            if channel in self._owners and now >= sent + _TAKE_PERIOD:
+                # The hub rejects this as long as the owner goes on publishing.
                 self._link.publish((TAKE_PREFIX + channel, b""))
-                self._asked = -np.inf
+                sent = -np.inf
                 del self._owners[channel]
-            if now >= self._asked + _REPEAT:
-                # Who begins to serve just now has not heard it; who has, knows it by its id.
-                _publish(self._link, channel, message)
-                self._asked = now
+            if now >= sent + _REPEAT_PERIOD:
+                # A service that has just started has missed it; others know it by its id.
+                self._link.publish((channel, data))
+                sent = now
             self._link.take(_SLICE, _BURST)
-        answer = self._answers.pop(self._waiting)
+        answer = self._answer
         if "error" in answer:
             raise LiveError(str(answer["error"]))
         if answer.get("ok") is not True:
-            raise _no_answer(channel, "'ok' or an error", answer)
+            raise _invalid(channel, "'ok' or an error", answer)
         return answer
 
-    def _hear(self, channel: str, data: bytes) -> None:
-        answer = _answer(data)
-        if answer.get("id") == self._waiting:
-            self._answers[self._waiting] = answer
+    def _receive(self, channel: str, data: bytes) -> None:
+        answer = _json_object(data)
+        if answer.get("id") == self._id:
+            self._answer = answer
 
-    def _hear_status(self, channel: str, data: bytes) -> None:
+    def _receive_status(self, channel: str, data: bytes) -> None:
         try:
             protected = HubStatistics.from_json(data).protected
         except (ValueError, TypeError, KeyError, AttributeError):
-            return  # Not of a hub; on other buses anybody may say it.
+            return  # Not from a hub: on other buses every client may publish here.
         self._owners = {
             name: state.owner for name, state in protected.items() if state.owner not in (None, self._link.name)
         }
 
     def close(self) -> None:
-        """Gives the connection back."""
+        """Close the connection."""
         self._link.close()
 
-    def __enter__(self) -> LiveClient:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -146,183 +156,269 @@ class LiveClient:
 def watch(
     url: str, addresses: Sequence[str], *, every: int = 1, lease: float = 2.0, timeout: float = 5.0
 ) -> Iterator[tuple[float, Values]]:
-    """The values of variables and vector output ports of a DPS that runs with a `LiveService`, as time goes on.
+    """Yield the values of variables and vector output ports of a DPS that runs with a `LiveService`, until it ends.
 
     ::
 
         for time, values in watch("tcpq://127.0.0.1:7700", ["dps.impl.torque"], every=10):
             print(time, values["dps.impl.torque"])
 
-    It ends when the DPS does. Who no longer iterates costs the loop nothing once the lease is over.
+    When the iteration stops, the watch costs the loop nothing once the lease is over.
 
     Args:
-        url: the bus.
-        addresses: what to watch.
-        every: so many cycles; fewer values come where the loop lacks the time to read all that is watched.
-        lease: seconds, renewed as long as one iterates.
-        timeout: seconds without a value after which one gives up.
+        url: LCM URL of the bus.
+        addresses: Addresses of variables and output ports.
+        every: Period in cycles; fewer values come where the loop lacks the time to read all that is watched.
+        lease: Lease in seconds, which is renewed during the iteration.
+        timeout: Seconds without a value after which an error is raised.
 
     Yields:
         The DPS's time in seconds, and the values by address. Where the loop lacks the time to read all of them in one
-        cycle, they are of this and the cycles before.
+        cycle, they are of this and the previous cycles.
 
     Raises:
-        BridgeError: there is no bus.
-        LiveError: an address is refused.
-        SilenceError: nothing comes.
-        ValueError: the timeout is no positive number.
+        BridgeError: There is no bus.
+        LiveError: An address is rejected.
+        LiveTimeoutError: No value comes.
+        ValueError: The timeout is not positive.
     """
-    for message in samples(url, addresses, every, lease, timeout):
-        yield message["time"], to_arrays(message["values"])
+    for now, _, values in _samples(url, addresses, every, lease, timeout):
+        yield now, values
 
 
-def samples(
+def _samples(
     url: str, addresses: Sequence[str], every: int, lease: float, timeout: float, stop: threading.Event | None = None
-) -> Iterator[dict[str, Any]]:
-    """As `watch`, with all that is told beside the values, until ``stop`` is set; see `messages`."""
-    check_timeout(timeout)
-    request = {"id": _new_id(), "watch": list(addresses), "every": every, "lease": lease}
-    _checked(WATCH, request)
+) -> Iterator[tuple[float, float, Values]]:
+    """Yield ``time``, ``since`` and the watched values (see `messages`) until ``stop`` is set."""
+    _check_timeout(timeout)
+    id = uuid.uuid4().hex
+    request = {"id": id, "watch": list(addresses), "every": every, "lease": lease}
+    data = _checked(WATCH, request)
     received: deque[dict[str, Any]] = deque()
 
-    def hear(channel: str, data: bytes) -> None:
-        message = _answer(data)
-        if channel != WATCH + ANSWER or message.get("id") == request["id"]:
+    def receive(channel: str, data: bytes) -> None:
+        message = _json_object(data)
+        if channel != WATCH + ANSWER or message.get("id") == id:
             received.append(message)
 
-    channels = (WATCH + ANSWER, f"{WATCHED}{request['id']}")
-    link = LcmLink(url, dict.fromkeys(channels, hear), connect_timeout=_CONNECT_TIMEOUT)
+    link = LcmLink(url, dict.fromkeys((WATCH + ANSWER, WATCHED + id), receive), connect_timeout=_CONNECT_TIMEOUT)
     link.open()
-    renewed, heard, begun = -np.inf, time.monotonic(), False
+    renewed, last, begun = -np.inf, time.monotonic(), False
     try:
         while stop is None or not stop.is_set():
             now = time.monotonic()
             if now >= renewed + lease / 3:
-                _publish(link, WATCH, request)
+                link.publish((WATCH, data))
                 renewed = now
             link.take(_SLICE, _BURST)
             while received:
                 message = received.popleft()
-                heard = time.monotonic()
+                last = time.monotonic()
                 if "error" in message:
                     raise LiveError(str(message["error"]))
                 if "ended" in message:
                     return
                 begun = True
                 if "values" in message:
-                    _check_sample(message, addresses)
-                    yield message
-            if time.monotonic() >= heard + timeout:
+                    values = _arrays(message, addresses, WATCHED)
+                    for name in ("time", "since"):
+                        if not is_number(message.get(name)):
+                            raise _invalid(WATCHED, f"a number of seconds in {name!r}", message)
+                    yield message["time"], message["since"], values
+            if time.monotonic() >= last + timeout:
                 if begun and link.connected:
-                    raise SilenceError(
-                        f"no value has come for {timeout:g} s: the loop stands still, or {every} cycles of it take "
-                        "longer; then choose a longer timeout"
+                    raise LiveTimeoutError(
+                        f"no value came within {timeout:g} s: the loop stands still, or {every} cycles take longer; "
+                        "then choose a longer timeout"
                     )
-                raise _silence(link, timeout)
+                raise _no_answer(link, timeout)
     finally:
         link.publish((WATCH, to_json({**request, "watch": []})))
         link.close()
 
 
-def _publish(link: LcmLink, channel: str, message: dict[str, Any]) -> None:
-    """
+class LiveWatch:
+    """Keeps the newest watched values for plotting; a thread of its own receives them.
+
+    ::
+
+        with LiveWatch("tcpq://127.0.0.1:7700", ["dps.impl.torque"], every=10) as live:
+            ...
+            plt.plot(live.arrays()["time"], live.arrays()["dps.impl.torque"])
+
+    Args:
+        url, addresses, every, lease, timeout: See `watch`.
+        size: Number of samples that are kept.
+
     Raises:
-        LiveError: the DPS would refuse it anyway.
+        ValueError: The timeout is not positive.
     """
-    link.publish((channel, _checked(channel, message)))
+
+    def __init__(
+        self,
+        url: str,
+        addresses: Sequence[str],
+        *,
+        size: int = 10_000,
+        every: int = 1,
+        lease: float = 2.0,
+        timeout: float = 5.0,
+    ) -> None:
+        _check_timeout(timeout)
+        self._addresses = tuple(addresses)
+        self._samples: deque[tuple[float, float, Values]] = deque(maxlen=size)
+        self._error: Exception | None = None
+        self._stop = threading.Event()
+        self._grown = threading.Condition()
+        self._count = 0
+        arguments = (url, addresses, every, lease, timeout, self._stop)
+        self._thread = threading.Thread(target=self._collect, args=arguments, name="vtbdrake-live-watch", daemon=True)
+        self._thread.start()
+
+    def _collect(self, *arguments: Any) -> None:
+        try:
+            for sample in _samples(*arguments):
+                with self._grown:
+                    self._samples.append(sample)
+                    self._count += 1
+                    self._grown.notify_all()
+        except (LiveError, LiveTimeoutError, BridgeError) as error:
+            self._error = error
+        with self._grown:
+            self._grown.notify_all()
+
+    @property
+    def alive(self) -> bool:
+        """Return whether more values can come."""
+        return self._thread.is_alive()
+
+    def wait(self, count: int, *, timeout: float = 10.0) -> None:
+        """Wait until ``count`` samples have come in all.
+
+        Raises:
+            LiveError: The DPS rejects the watch.
+            LiveTimeoutError: They do not come within ``timeout`` seconds, or the watch has timed out.
+            BridgeError: There is no bus.
+        """
+        with self._grown:
+            arrived = self._grown.wait_for(lambda: self._count >= count or not self._thread.is_alive(), timeout)
+        self._check()
+        if not arrived or self._count < count:
+            raise LiveTimeoutError(f"{self._count} of {count} samples came within {timeout} s")
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Return the samples that are kept, the oldest first.
+
+        Returns:
+            ``time`` and ``since``, of shape (n,), in seconds, and the values by address, of shape (n, ...). The values
+            were read between the cycles of ``since`` and ``time``: in one, if the loop had the time for it.
+
+        Raises:
+            LiveError: The DPS has rejected the watch.
+            LiveTimeoutError: The watch has timed out.
+            BridgeError: There is no bus.
+        """
+        self._check()
+        with self._grown:
+            samples = list(self._samples)
+        columns = {"time": np.array([time for time, _, _ in samples]), "since": np.array([s for _, s, _ in samples])}
+        return columns | {a: np.array([values[a] for _, _, values in samples]) for a in self._addresses}
+
+    def frame(self) -> Any:
+        """Return `arrays` as a pandas DataFrame with one column per number, over time.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("a frame needs pandas: pip install 'vtbdrake[dataframe]'") from error
+        arrays = self.arrays()
+        time = arrays.pop("time")
+        del arrays["since"]
+        columns: dict[str, Any] = {}
+        for address, values in arrays.items():
+            flat = values.reshape(time.size, -1)
+            names = [address] if values.ndim < 2 else [f"{address}[{k}]" for k in range(flat.shape[1])]
+            columns |= dict(zip(names, flat.T, strict=True))
+        return pd.DataFrame(columns, index=pd.Index(time, name="time"))
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """End the watch; the samples that are kept remain."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+# -- checks
+
+
+def _check_timeout(timeout: float) -> float:
+    if not timeout > 0.0:
+        raise ValueError(f"the timeout must be a positive number of seconds, not {timeout}")
+    return timeout
 
 
 def _checked(channel: str, message: dict[str, Any]) -> bytes:
-    """Return the bytes of a request.
-
-    Raises:
-        LiveError: the DPS would refuse it anyway.
-    """
+    """Return the bytes of a request, or raise the LiveError with which the DPS would reject it."""
     data = to_json(message)
     try:
-        parse(channel, data)
+        parse_request(channel, data)
     except ValueError as error:
         raise LiveError(str(error)) from None
     return data
 
 
-def check_timeout(timeout: float) -> float:
-    """Return ``timeout``.
-
-    Raises:
-        ValueError: it is no positive number of seconds.
-    """
-    if not timeout > 0.0:
-        raise ValueError(f"the timeout is a positive time in seconds, not {timeout}")
-    return timeout
-
-
-def _answer(data: bytes) -> dict[str, Any]:
-    """Return what is said on a channel of answers; empty if it is no JSON object, as whoever is on the bus may say."""
+def _json_object(data: bytes) -> dict[str, Any]:
+    """Return the JSON object of an answer, or an empty one: every client of the bus may publish there."""
     try:
-        return json_object(data, ValueError)
-    except ValueError:
+        message = json.loads(data)
+    except (ValueError, RecursionError):
         return {}
+    return message if isinstance(message, dict) else {}
 
 
-def _values(message: Mapping[str, Any], addresses: Sequence[str], channel: str) -> dict[str, Any]:
-    """Return the values of a message, by address.
+def _arrays(message: Mapping[str, Any], addresses: Sequence[str], channel: str) -> Values:
+    """Return the values of a message, lists as arrays.
 
     Raises:
-        LiveError: they are not those of the addresses, or one of them is no number and no array of numbers.
+        LiveError: An address is missing, or a value is not a number or a rectangular list of numbers.
     """
     values = message.get("values")
     if not isinstance(values, dict) or not set(addresses) <= values.keys():
-        raise _no_answer(channel, f"the values of {', '.join(addresses)}", message)
+        raise _invalid(channel, f"the values of {', '.join(addresses)}", message)
+    found: Values = {}
     for address, value in values.items():
-        if not _is_array(value):
-            raise _no_answer(channel, f"a number or an array of numbers for {address}", value)
-    return values
+        try:
+            array = np.array(value)
+        except (ValueError, OverflowError):  # ragged, or out of range
+            array = np.array(None)
+        if array.dtype.kind not in "iuf" and array.size:
+            raise _invalid(channel, f"a number or an array of numbers for {address}", value)
+        found[address] = array.astype(float) if isinstance(value, list) else value
+    return found
 
 
-def _check_sample(message: Mapping[str, Any], addresses: Sequence[str]) -> None:
-    """
-    Raises:
-        LiveError: a message of watched values is none.
-    """
-    _values(message, addresses, WATCHED)
-    for name in ("time", "since"):
-        if not _is_number(message.get(name)):
-            raise _no_answer(WATCHED, f"a number of seconds in {name!r}", message)
-
-
-def _is_array(value: Any) -> bool:
-    """Whether this is a number, or a rectangular list of lists of numbers; NaN and infinity are numbers here."""
-    try:
-        array = np.array(value)
-    except (ValueError, OverflowError):
-        return False  # It is ragged.
-    return array.dtype.kind in "iuf" or array.size == 0
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _no_answer(channel: str, expected: str, got: Any) -> LiveError:
+def _invalid(channel: str, expected: str, got: Any) -> LiveError:
     text = repr(got)
     return LiveError(
-        f"what answered on {channel} is no DPS of vtbdrake: its answer should have {expected}, and is "
-        f"{text if len(text) <= 100 else text[:100] + '...'}; see who publishes there"
+        f"an answer on {channel} is not from a DPS of vtbdrake: it should have {expected}, and is "
+        f"{text if len(text) <= 100 else text[:100] + '...'}; check which client publishes there"
     )
 
 
-def _silence(link: LcmLink, seconds: float, channel: str = "", owner: str | None = None) -> SilenceError:
-    what = "does a DPS run there (vtbdrake run)?" if link.connected else "the bus is lost"
+def _no_answer(link: LcmLink, seconds: float, channel: str = "", owner: str | None = None) -> LiveTimeoutError:
+    cause = "does a DPS run there (vtbdrake run)?" if link.connected else "the bus is lost"
     if owner is not None:
-        what = f"the hub lets {owner} alone publish on {channel}, which goes on doing so"
-    return SilenceError(f"nobody has answered on {link.url} for {seconds:g} s: {what}")
-
-
-def _new_id() -> str:
-    return uuid.uuid4().hex
-
-
-def to_arrays(values: Mapping[str, Any]) -> Values:
-    """Lists become arrays."""
-    return {a: np.array(value, dtype=float) if isinstance(value, list) else value for a, value in values.items()}
+        cause = f"the hub lets only {owner} publish on {channel}, which goes on doing so"
+    return LiveTimeoutError(f"no answer on {link.url} within {seconds:g} s: {cause}")

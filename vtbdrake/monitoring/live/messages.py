@@ -1,4 +1,4 @@
-"""What is said on the bus about a running DPS, as JSON.
+"""Requests and answers about a running DPS, as JSON on an LCM bus.
 
 ========== ===================================================== =======================================
 channel    request                                               answer, on the channel ``..._ANSWER``
@@ -10,14 +10,14 @@ VTB_WATCH  ``{"id": ID, "watch": [ADDRESS, ...], "every": N,     ``{"id": ID, "o
            "lease": S}``, again before the lease is over         ``VTB_WATCHED/ID``, every N cycles
 ========== ===================================================== =======================================
 
-Who is refused gets ``{"id": ID, "error": REASON}``. Values watched are ``{"cycle": K, "since": T0, "time": T, "values":
-{...}}``: read between the cycles of the DPS's times T0 and T, which are one and the same as long as there is time for
-all of them in one cycle. What is not finite is there as Python's ``json`` writes and reads it: NaN, Infinity. Who
-watches nothing (an empty list) has ended. ``{"id": ID, "ended": true}`` tells that the DPS has. A reset releases the
-latch of the guards, unless a cause persists; what it had latched for is told.
+The answer to a rejected request is ``{"id": ID, "error": REASON}``. Watched values are ``{"cycle": K, "since": T0,
+"time": T, "values": {...}}``: they were read between the cycles of the DPS's times T0 and T, which are equal if there
+was time to read all of them in one cycle. Numbers that are not finite are written as Python's ``json`` does: NaN,
+Infinity. An empty list of addresses ends a watch. ``{"id": ID, "ended": true}`` says that the DPS has ended. A reset
+releases the latch of the guards, unless a cause persists, and returns the reasons for which it had latched.
 
-Whoever is on the bus may say these things. ``vtbdrake hub`` protects VTB_SET and VTB_RESET: one client at a time uses
-them, the next one half a second later.
+Every client of the bus may send requests. ``vtbdrake hub`` protects VTB_SET and VTB_RESET: one client at a time may
+publish there, the next one half a second later.
 """
 
 from __future__ import annotations
@@ -30,29 +30,27 @@ from math import isfinite
 from operator import methodcaller
 from typing import Any
 
-from vtbdrake.control.json_object import json_object
-
 SET, GET, RESET, WATCH = "VTB_SET", "VTB_GET", "VTB_RESET", "VTB_WATCH"
 WATCHED = "VTB_WATCHED/"
 ANSWER = "_ANSWER"
 
 MAX_LENGTH = 1 << 16
-"""Of a request, in bytes."""
+"""Limit on the bytes of a request."""
 MAX_ADDRESSES = 64
-"""Of a request."""
+"""Limit on the addresses of a request."""
 SHORTEST_LEASE, LONGEST_LEASE = 0.1, 60.0
-"""In seconds."""
+"""Limits on a lease, in seconds."""
 
 _ID = re.compile(r"[\w.:-]{1,40}")
 
 
 class RequestError(ValueError):
-    """A request that cannot be fulfilled."""
+    """A request that is not valid or cannot be fulfilled."""
 
 
 @dataclass(frozen=True)
 class SetRequest:
-    """Wants variables to be set, by address, all of them or none."""
+    """A request to set variables, by address: all of them or none."""
 
     id: str
     values: dict[str, Any]
@@ -60,10 +58,10 @@ class SetRequest:
 
 @dataclass(frozen=True)
 class ReadRequest:
-    """Wants variables and output ports to be read: once, or every so many cycles for ``lease`` seconds.
+    """A request to read variables and output ports: once, or every ``every`` cycles for ``lease`` seconds.
 
     Attributes:
-        every: 0 for once.
+        every: period in cycles; 0 to read once.
     """
 
     id: str
@@ -74,7 +72,7 @@ class ReadRequest:
 
 @dataclass(frozen=True)
 class ResetRequest:
-    """Wants the latch of the guards released."""
+    """A request to release the latch of the guards."""
 
     id: str
 
@@ -83,78 +81,89 @@ Request = SetRequest | ReadRequest | ResetRequest
 
 
 def to_json(message: Any) -> bytes:
-    """The bytes of a message; it may hold arrays of numpy."""
+    """Return a message as JSON; it may contain arrays of NumPy."""
     return json.dumps(message, separators=(",", ":"), default=methodcaller("tolist")).encode()
 
 
-def parse_id(data: bytes) -> str:
-    """Whose request this is; empty if that cannot be made out."""
+def json_object(data: bytes) -> dict[str, Any]:
+    """Return the JSON object of a message.
+
+    Raises:
+        RequestError: The data are too long, not JSON, or not an object.
+    """
+    if len(data) > MAX_LENGTH:
+        raise RequestError(f"a request must have at most {MAX_LENGTH} bytes, not {len(data)}")
     try:
-        found = _parsed(data).get("id")
+        message = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"a request must be JSON: {error}") from None
+    if not isinstance(message, dict):
+        raise RequestError(f"a request must be a JSON object, not {_short(message)}")
+    return message
+
+
+def request_id(data: bytes) -> str:
+    """Return the id of a request, or an empty string if it has no valid one."""
+    try:
+        id = json_object(data).get("id")
     except RequestError:
         return ""
-    return found if isinstance(found, str) and _ID.fullmatch(found) else ""
+    return id if isinstance(id, str) and _ID.fullmatch(id) else ""
 
 
-def parse(channel: str, data: bytes) -> Request:
-    """
+def parse_request(channel: str, data: bytes) -> Request:
+    """Return the request in a message.
+
     Raises:
-        RequestError: it is none.
+        RequestError: The message is not a valid request.
     """
     try:
-        return _request(channel, data)
+        return _request(channel, json_object(data))
     except RecursionError:
-        raise RequestError("a request is nested too deep: a value is a number, or a list of such") from None
+        raise RequestError("a request is nested too deep: a value is a number or a list of numbers") from None
 
 
-def _request(channel: str, data: bytes) -> Request:
-    message = _parsed(data)
+def _request(channel: str, message: dict[str, Any]) -> Request:
     id = message.get("id")
     if not isinstance(id, str) or not _ID.fullmatch(id):
-        raise RequestError(f"a request has an id of up to 40 letters, digits and _.:-, not {_short(id)}")
+        raise RequestError(f"the id must be up to 40 letters, digits and _.:-, not {_short(id)}")
     if channel == SET:
-        return SetRequest(id, _values(_only(message, "set")))
+        return SetRequest(id, _values(_field(message, "set")))
     if channel == RESET:
-        if _only(message, "reset") is not True:
-            raise RequestError(f"reset is true, not {_short(message['reset'])}")
+        if _field(message, "reset") is not True:
+            raise RequestError(f"reset must be true, not {_short(message['reset'])}")
         return ResetRequest(id)
     if channel == GET:
-        return ReadRequest(id, _addresses(_only(message, "get"), least=1))
-    addresses = _addresses(_only(message, "watch", "every", "lease"), least=0)
+        return ReadRequest(id, _addresses(_field(message, "get"), least=1))
+    addresses = _addresses(_field(message, "watch", "every", "lease"), least=0)
     every, lease = message.get("every", 1), message.get("lease", 2.0)
     if type(every) is not int or every < 1:
-        raise RequestError(f"every is a number of cycles, 1 or more, not {_short(every)}")
-    if not _is_number(lease) or not SHORTEST_LEASE <= lease <= LONGEST_LEASE:
-        raise RequestError(f"lease lies in {SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s, not at {_short(lease)}")
+        raise RequestError(f"every must be a number of cycles of at least 1, not {_short(every)}")
+    if not is_number(lease) or not SHORTEST_LEASE <= lease <= LONGEST_LEASE:
+        raise RequestError(f"lease must be {SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s, not {_short(lease)}")
     return ReadRequest(id, addresses, every, lease)
 
 
-def _parsed(data: bytes) -> dict[str, Any]:
-    if len(data) > MAX_LENGTH:
-        raise RequestError(f"a request has at most {MAX_LENGTH} bytes, not {len(data)}")
-    return json_object(data, RequestError, show=_short)
-
-
-def _only(message: dict[str, Any], what: str, *others: str) -> Any:
-    known = ("id", what, *others)
-    if what not in message or not message.keys() <= set(known):
-        raise RequestError(f"this request has {', '.join(known)}, not {_short(', '.join(message))}")
-    return message[what]
+def _field(message: dict[str, Any], name: str, *optional: str) -> Any:
+    known = ("id", name, *optional)
+    if name not in message or not message.keys() <= set(known):
+        raise RequestError(f"this request must have {', '.join(known)}, not {_short(', '.join(message))}")
+    return message[name]
 
 
 def _addresses(given: Any, *, least: int) -> tuple[str, ...]:
     if not isinstance(given, list) or not all(isinstance(address, str) for address in given):
-        raise RequestError(f"addresses are a list of texts, not {_short(given)}")
+        raise RequestError(f"addresses must be a list of strings, not {_short(given)}")
     if not least <= len(given) <= MAX_ADDRESSES:
-        raise RequestError(f"a request has {least} to {MAX_ADDRESSES} addresses, not {len(given)}")
+        raise RequestError(f"a request must have {least} to {MAX_ADDRESSES} addresses, not {len(given)}")
     return tuple(dict.fromkeys(given))
 
 
 def _values(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
-        raise RequestError(f"values are given by address, not as {_short(given)}")
+        raise RequestError(f"values must be an object of addresses and values, not {_short(given)}")
     if not 1 <= len(given) <= MAX_ADDRESSES:
-        raise RequestError(f"a request has 1 to {MAX_ADDRESSES} values, not {len(given)}")
+        raise RequestError(f"a request must have 1 to {MAX_ADDRESSES} values, not {len(given)}")
     for address, value in given.items():
         _check_value(address, value)
     return given
@@ -164,12 +173,13 @@ def _check_value(address: str, value: Any) -> None:
     if isinstance(value, list):
         for item in value:
             _check_value(address, item)
-    elif not _is_number(value):
-        raise RequestError(f"the value of {address} is a finite number or a list of such, not {_short(value)}")
+    elif not is_number(value) or not abs(value) < 1e308 or not isfinite(value):
+        raise RequestError(f"the value of {address} must be a finite number or a list of them, not {_short(value)}")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e308 and isfinite(value)
+def is_number(value: Any) -> bool:
+    """Return whether a JSON value is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _short(value: Any) -> str:
@@ -178,7 +188,7 @@ def _short(value: Any) -> str:
 
 
 def nested(entries: Sequence[float], shape: Sequence[int]) -> Any:
-    """Entries in C order as nested lists of a shape; a number, if that is ()."""
+    """Return entries in C order as nested lists of a shape, or as a number for the shape ()."""
     if not shape:
         return entries[0]
     size = len(entries) // shape[0] if shape[0] else 0

@@ -1,6 +1,7 @@
-"""The worker process's part: it speaks with those on the bus, so that the loop need not.
+"""The server of live values: it talks to the clients on the bus, in a worker process of the loop.
 
-Between the loop and its worker process go frames of `pickle`, and those of `Values`, many and quick.
+The loop sends frames of two kinds: `VALUES`, many and quick, and pickled outcomes of requests. The server sends it
+pickled requests.
 """
 
 from __future__ import annotations
@@ -30,45 +31,44 @@ from vtbdrake.monitoring.live.messages import (
     ReadRequest,
     Request,
     RequestError,
-    ResetRequest,
-    SetRequest,
     nested,
-    parse,
-    parse_id,
+    parse_request,
+    request_id,
     to_json,
 )
 
 _log = logging.getLogger(__name__)
 
 MAX_WAITING = 16
-"""Requests that the loop has not fulfilled yet."""
+"""Limit on the requests that wait for the loop."""
 MAX_WATCHES = 16
+"""Limit on the watches."""
 
-_TICK = 0.1  # s; leases are no more exact than that
-_BURST = 200  # messages to take in at a time
-_MEMORY = 1000  # requests to set and get that are known if they are said again
+_TICK = 0.1  # s; resolution of leases
+_BURST = 200  # messages taken at a time
+_MEMORY = 1000  # requests to set and get whose repetition is recognized
 _CONNECT_TIMEOUT = 2.0  # s
-_TRY_AGAIN = 0.5  # s
+_RETRY_PERIOD = 0.5  # s
 
-# From the loop:
-VALUES = b"v"  # records of what was read
-TEXT = b"t"  # a pickled (number of a request, what became of it)
+# Frames of the loop:
+VALUES = b"v"  # records of values
+OUTCOME = b"o"  # a pickled (number of a request, outcome)
 _HEAD = struct.Struct("<IQddI")
 
 
 def values_record(number: int, cycle: int, since: float, time: float, entries: Sequence[float]) -> bytes:
-    """What was read for request ``number``; records, one after another, make a frame of `VALUES`."""
+    """Return a record of the values read for request ``number``; concatenated records make a frame of `VALUES`."""
     return struct.pack(f"<IQddI{len(entries)}d", number, cycle, since, time, len(entries), *entries)
 
 
-def text_frame(number: int, **outcome: Any) -> bytes:
-    """A frame of what became of request ``number``: ``ok``, ``error``, ``unknown`` (an address) or ``shapes``."""
-    return TEXT + pickle.dumps((number, outcome))
+def outcome_frame(number: int, **outcome: Any) -> bytes:
+    """Return a frame with the outcome of request ``number``: ``ok``, ``error``, ``unknown`` (address) or ``shapes``."""
+    return OUTCOME + pickle.dumps((number, outcome))
 
 
 @dataclass
 class _Task:
-    """A request that the loop has, and who wants it."""
+    """A request that was sent to the loop."""
 
     request: Request
     channel: str
@@ -77,44 +77,49 @@ class _Task:
     answered: bool = False
 
 
-class Desk:
-    """Takes in requests from the bus, checks them, hands them to the loop, and sends what comes back.
+class LiveServer:
+    """Receives requests from the bus, checks them, passes them on to the loop, and publishes the outcomes.
+
+    Args:
+        loop: Connection with the loop's process.
+        url: LCM URL of the bus.
+        addresses: Addresses of the output ports, and of the variables, of the loop's target.
 
     Attributes:
-        refused: how many requests were.
+        rejected: number of rejected requests.
+
+    Raises:
+        EOFError: The loop has closed its connection before there was a bus.
     """
 
-    def __init__(self, channel: FrameConnection, url: str, addresses: Sequence[str]) -> None:
-        self.refused = 0
-        self._loop = channel
+    def __init__(self, loop: FrameConnection, url: str, addresses: Sequence[str]) -> None:
+        self.rejected = 0
+        self._loop = loop
         self._addresses = addresses
-        self._link = LcmLink(url, dict.fromkeys((SET, GET, RESET, WATCH), self._hear), connect_timeout=_CONNECT_TIMEOUT)
+        self._link = LcmLink(
+            url, dict.fromkeys((SET, GET, RESET, WATCH), self._receive), connect_timeout=_CONNECT_TIMEOUT
+        )
         self._open()
         self._tasks: dict[int, _Task] = {}
-        self._numbers = 0
-        self._heard: deque[str] = deque(maxlen=_MEMORY)
-        self._told = 0  # of those refused
-        self._tell_next = 0.0
+        self._num_tasks = 0
+        self._known_ids: deque[str] = deque(maxlen=_MEMORY)
+        self._reported = 0  # of those rejected
+        self._next_report = 0.0
 
     def _open(self) -> None:
-        """Connects to the bus, sooner or later.
-
-        Raises:
-            EOFError: the loop's end of the line has closed before that.
-        """
-        told = False
+        logged = False
         while not self._link.is_open:
             try:
                 self._link.open()
             except BridgeError as error:
-                if not told:
-                    _log.error("the live service waits for the bus, nobody can get or set: %s", error)
-                told = True
+                if not logged:
+                    _log.error("the live service waits for the bus, no client can get or set: %s", error)
+                logged = True
                 with contextlib.suppress(TimeoutError):
-                    self._loop.receive(_TRY_AGAIN)  # Nothing comes but the end.
+                    self._loop.receive(_RETRY_PERIOD)  # The loop sends nothing before the first request.
 
     def run(self) -> None:
-        """Until the loop's end of the line closes."""
+        """Serve until the loop closes its connection."""
         try:
             while True:
                 sources: list[Any] = [self._loop, *self._link.sources]
@@ -123,49 +128,49 @@ class Desk:
                     pass
                 self._take_frames()
                 self._end_leases()
-                self._tell_refused()
+                self._report_rejected()
         except EOFError:
             for task in self._tasks.values():
-                self._say(task, ended=True)
+                self._answer(task, ended=True)
         finally:
             self._link.close()
 
     # -- from the bus
 
-    def _hear(self, channel: str, data: bytes) -> None:
+    def _receive(self, channel: str, data: bytes) -> None:
         try:
-            request = parse(channel, data)
-            self._accept(channel, request)
+            self._accept(channel, parse_request(channel, data))
         except RequestError as error:
-            self.refused += 1
-            self._publish(channel + ANSWER, {"id": parse_id(data), "error": str(error)})
+            self.rejected += 1
+            self._publish(channel + ANSWER, {"id": request_id(data), "error": str(error)})
 
     def _accept(self, channel: str, request: Request) -> None:
-        """
+        """Send a request to the loop, unless it repeats an earlier one.
+
         Raises:
-            RequestError: there are too many.
+            RequestError: There are too many requests or watches.
         """
         now = time.monotonic()
         if channel != WATCH:
-            if request.id in self._heard:
+            if request.id in self._known_ids:
                 return
-            self._heard.append(request.id)
+            self._known_ids.append(request.id)
         elif isinstance(request, ReadRequest):
-            if self._renewed(request, now) or not request.addresses:
+            if self._renew(request, now) or not request.addresses:
                 return
             if sum(task.channel == WATCH for task in self._tasks.values()) >= MAX_WATCHES:
                 raise RequestError(
-                    f"there are {MAX_WATCHES} watches already: end one, or wait for the end of its lease"
+                    f"watch rejected: {MAX_WATCHES} watches are active; end one, or wait for the end of its lease"
                 )
         if sum(not task.answered for task in self._tasks.values()) >= MAX_WAITING:
-            raise RequestError(f"{MAX_WAITING} requests wait already: try again")
-        self._numbers += 1
+            raise RequestError(f"request rejected: {MAX_WAITING} requests are waiting; try again")
+        self._num_tasks += 1
         lease = request.lease if isinstance(request, ReadRequest) else 0.0
-        self._tasks[self._numbers] = _Task(request, channel, now + lease)
-        self._loop.send(pickle.dumps((self._numbers, _order(request))))
+        self._tasks[self._num_tasks] = _Task(request, channel, now + lease)
+        self._loop.send(pickle.dumps((self._num_tasks, request)))
 
-    def _renewed(self, request: ReadRequest, now: float) -> bool:
-        """Whether this is the renewal of a watch; one that has changed, or has ended, is taken away."""
+    def _renew(self, request: ReadRequest, now: float) -> bool:
+        """Renew the lease of a watch and return whether there was one; drop a watch that has changed or ended."""
         for number, task in self._tasks.items():
             if task.channel == WATCH and task.request.id == request.id:
                 if task.request == request:
@@ -184,11 +189,11 @@ class Desk:
         del self._tasks[number]
         self._loop.send(pickle.dumps((number, None)))
 
-    def _tell_refused(self) -> None:
+    def _report_rejected(self) -> None:
         now = time.monotonic()
-        if self.refused > self._told and now >= self._tell_next:
-            self._told, self._tell_next = self.refused, now + _TICK
-            self._loop.send(pickle.dumps((0, ("refused", self.refused))))
+        if self.rejected > self._reported and now >= self._next_report:
+            self._reported, self._next_report = self.rejected, now + _TICK
+            self._loop.send(pickle.dumps((0, self.rejected)))
 
     # -- from the loop
 
@@ -201,36 +206,36 @@ class Desk:
             if frame[:1] == VALUES:
                 start = 1
                 while start < len(frame):
-                    start = self._tell_values(frame, start)
+                    start = self._publish_values(frame, start)
             else:
-                self._conclude(*pickle.loads(frame[1:]))
+                self._finish(*pickle.loads(frame[1:]))
 
-    def _conclude(self, number: int, outcome: dict[str, Any]) -> None:
+    def _finish(self, number: int, outcome: dict[str, Any]) -> None:
         task = self._tasks.get(number)
         if task is None:
             return
-        if "unknown" in outcome:
-            outcome = {"error": self._unknown(outcome["unknown"])}
         if "shapes" in outcome:
             task.shapes = outcome["shapes"]
             if task.channel == WATCH:
                 task.answered = True
-                self._say(task, ok=True)
+                self._answer(task, ok=True)
             return
+        if "unknown" in outcome:
+            outcome = {"error": self._unknown(outcome["unknown"])}
         del self._tasks[number]
-        self.refused += "error" in outcome
-        self._say(task, **outcome)
+        self.rejected += "error" in outcome
+        self._answer(task, **outcome)
 
     def _unknown(self, address: str) -> str:
         if address in self._addresses:
-            return f"{address} is an output port: it is read, not set"
-        # Only who mistypes an address pays for Drake.
+            return f"{address} is an output port: it can be read, not set"
+        # Imports Drake, for a misspelt address only.
         from vtbdrake.state.variables import suggestion
 
         return f"there is no variable and no output port {address!r}{suggestion(address, self._addresses)}"
 
-    def _tell_values(self, frame: bytes, start: int) -> int:
-        """Tells the record that begins at ``start``; where the next one does."""
+    def _publish_values(self, frame: bytes, start: int) -> int:
+        """Publish the record that begins at ``start`` and return where the next one begins."""
         number, cycle, since, now, count = _HEAD.unpack_from(frame, start)
         end = start + _HEAD.size + 8 * count
         task = self._tasks.get(number)
@@ -245,24 +250,16 @@ class Desk:
             self._publish(WATCHED + task.request.id, {"cycle": cycle, "since": since, "time": now, "values": values})
         else:
             del self._tasks[number]
-            self._say(task, ok=True, time=now, values=values)
+            self._answer(task, ok=True, time=now, values=values)
         return int(end)
 
-    def _say(self, task: _Task, **outcome: Any) -> None:
+    def _answer(self, task: _Task, **outcome: Any) -> None:
         self._publish(task.channel + ANSWER, {"id": task.request.id, **outcome})
 
     def _publish(self, channel: str, message: dict[str, Any]) -> None:
         self._link.publish((channel, to_json(message)))
 
 
-def _order(request: Request) -> tuple[Any, ...]:
-    if isinstance(request, SetRequest):
-        return ("set", request.values)
-    if isinstance(request, ResetRequest):
-        return ("reset", ())
-    return ("read", request.addresses, request.every)
-
-
-def attend(channel: FrameConnection, url: str, addresses: Sequence[str]) -> None:
-    """The main program of the worker process."""
-    Desk(channel, url, addresses).run()
+def serve(loop: FrameConnection, url: str, addresses: Sequence[str]) -> None:
+    """Run a server in the worker process."""
+    LiveServer(loop, url, addresses).run()
