@@ -19,7 +19,7 @@ from diagrams.space_climber.payload import PHASE
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import CVaR, Mean, Risk, Study, Worst
 from vtbdrake.optimization.problem import Problem
-from vtbdrake.optimization.solvers.catalogue import make_solver
+from vtbdrake.optimization.solvers import make_solver
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutRunner, ThreadExecutor
 

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from math import nan
 from typing import Any
 
-from vtbdrake.optimization import Study
+from vtbdrake.optimization import Study, Trial
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.study_file import StudyFile
 
@@ -47,18 +47,15 @@ def recorded(
     units = [""] * len(parameters) if units is None else list(units)
     meta = {"problem": problem, "solver": "TPE", "seed": 0, "options": {}, "units": units}
     file = StudyFile(None, meta=meta)
-    rows = [
-        (
-            batch,
-            0,
-            made["at"],
-            made["values"] or (nan,) * len(qualities),
-            made["violations"],
-            made["exact"],
-            "solver",
-            made["method"],
+    for batch, made in enumerate(points):
+        trial = Trial(
+            parameters=dict(zip((parameter.address for parameter in parameters), made["at"], strict=True)),
+            values=made["values"] or (nan,) * len(qualities),
+            violations=made["violations"],
+            exact=made["exact"],
+            origin="solver",
+            method=made["method"],
+            batch=batch,
         )
-        for batch, made in enumerate(points)
-    ]
-    file.save_trials(rows, told=len(rows))
+        file.save_trials(batch, {0: trial}, complete=True)
     return Study(file)

@@ -18,7 +18,7 @@ from sqlalchemy import event  # noqa: E402
 
 from tests.optimization.recorded import point, recorded  # noqa: E402
 from tests.optimization.studies import DAMPING, RATE, THETA, gap, pendulum_problem  # noqa: E402
-from vtbdrake.optimization import Choice, Parameter, Study, StudyError, optuna_trials  # noqa: E402
+from vtbdrake.optimization import Choice, Parameter, Study, StudyError, Trial, optuna_trials  # noqa: E402
 from vtbdrake.optimization.optuna_bridge import importances  # noqa: E402
 from vtbdrake.rollout import Constraint, Quality  # noqa: E402
 
@@ -186,7 +186,8 @@ def test_writing_again_adds_only_what_is_new(url):
 def test_a_point_that_a_batch_holds_twice_is_there_twice_and_stays_so(url):
     study = recorded([X, Y], [point((0.5, 0.5), 1.0)], qualities={"h": "maximize"})
     study.to_optuna(url, "twice")
-    study._file.save_trials([(0, 1, (0.5, 0.5), (1.0,), (), True, "user", "by hand")], told=None)
+    trial = Trial(dict(study.trials[0].parameters), (1.0,), (), True, "user", "by hand", batch=0)
+    study._file.save_trials(0, {1: trial}, complete=False)
     exported = study.to_optuna(url, "twice")
     assert [t.user_attrs["origin"] for t in exported.trials] == ["solver", "user"]
     assert len(study.to_optuna(url, "twice").trials) == 2

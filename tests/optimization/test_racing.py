@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from tests.optimization.studies import DAMPING, THETA, StatedExecutor
 from tests.testbeds import PendulumScenario
-from vtbdrake.optimization import CVaR, Mean, Parameter, Problem, Quantile, Risk, Worst
-from vtbdrake.optimization.judge import Judge
-from vtbdrake.optimization.outcome import Outcome
+from vtbdrake.optimization import CVaR, Mean, Outcome, Parameter, Problem, Quantile, Risk, Worst
+from vtbdrake.optimization.evaluator import Evaluator
+from vtbdrake.optimization.solvers import CATALOGUE
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
-from vtbdrake.optimization.solvers.catalogue import CATALOGUE
 from vtbdrake.rollout import Constraint, Quality
 
 risks = st.one_of(
@@ -64,13 +63,13 @@ def outcome(value: float, violation: float | None = None, end: str = "horizon") 
     return Outcome(value, value, () if violation is None else (violation,), 0.0, end, "", 0.0)
 
 
-def judged(stated: Problem, table: dict, batches, *, racing: bool, budget: float = np.inf):
+def evaluated(stated: Problem, table: dict, batches, *, racing: bool, budget: float = np.inf):
     """(evaluations by point, rollouts run)."""
     known: dict = {}
-    judge = Judge(
+    evaluator = Evaluator(
         stated, known, lambda rows: known.update({row: table[row] for row in rows}), racing=racing, budget=budget
     )
-    evaluations = {e.point: e for batch in batches for e in judge.judge(batch)}
+    evaluations = {e.point: e for batch in batches for e in evaluator.evaluate(batch)}
     assert sum(e.effort for e in evaluations.values()) * len(stated.conditions) == pytest.approx(len(known))
     return evaluations, len(known)
 
@@ -109,7 +108,7 @@ def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk
         return outcome(float(rng.random()), rng.uniform(-3.0, 1.0) if kind[2] else None)
 
     table = {(p, c): one() for p in points for c in range(conditions)}
-    raced, run = judged(stated, table, [points[i : i + 6] for i in range(0, 24, 6)], racing=True, budget=budget)
+    raced, run = evaluated(stated, table, [points[i : i + 6] for i in range(0, 24, 6)], racing=True, budget=budget)
     assert run <= len(table)
     truth = {}
     for point in points:
@@ -198,9 +197,9 @@ def test_racing_saves_what_the_worst_condition_tells():
     # The first is the best; of the others, condition 3 alone says that they are worse.
     table = {(p, c): outcome(0.9 if c != 3 or p == points[0] else 0.1) for p in points for c in range(8)}
     table[points[0], 3] = outcome(0.5)
-    _, run = judged(problem(8, "worst"), table, [points[:1], *[[p] * 1 for p in points[1:]]], racing=True)
+    _, run = evaluated(problem(8, "worst"), table, [points[:1], *[[p] * 1 for p in points[1:]]], racing=True)
     assert run == 8 * 15, "alone, a point meets all conditions in one round of eight"
-    _, run = judged(problem(8, "worst"), table, [points[:1], points[1:]], racing=True)
+    _, run = evaluated(problem(8, "worst"), table, [points[:1], points[1:]], racing=True)
     assert run == 8 + 14, "together, each meets the condition in which the best fares worst, and is dropped"
 
 
@@ -216,18 +215,18 @@ def test_racing_finishes_points_within_a_budget_that_is_too_small_for_all(budget
         if len(known) == budget:
             raise SpentError
 
-    judge = Judge(problem(4, "mean"), known, run, racing=True, budget=budget)
+    evaluator = Evaluator(problem(4, "mean"), known, run, racing=True, budget=budget)
     points = [(i / 64.0,) for i in range(1, 41)]
     with pytest.raises(SpentError):
-        judge.judge(points)
-    assert sum(judge.evaluation(point).exact for point in points) >= 1
+        evaluator.evaluate(points)
+    assert sum(evaluator.evaluation(point).exact for point in points) >= 1
 
 
 def test_a_point_that_breaks_a_constraint_is_dropped():
     stated = problem(4, "mean", constraints=[Constraint(abs, THETA, at_most=1.0)])
     a, b = (0.1,), (0.2,)
     table = {(a, c): outcome(0.2, -1.0) for c in range(4)} | {(b, c): outcome(0.9, c - 0.5) for c in range(4)}
-    evaluations, _ = judged(stated, table, [[a], [b]], racing=False)
+    evaluations, _ = evaluated(stated, table, [[a], [b]], racing=False)
     assert evaluations[b].violations == (2.5,) and not evaluations[b].feasible
     assert evaluations[a].feasible
 
@@ -235,7 +234,7 @@ def test_a_point_that_breaks_a_constraint_is_dropped():
 def test_one_failed_simulation_leaves_a_point_without_value():
     a = (0.1,)
     table = {(a, 0): outcome(0.2), (a, 1): outcome(np.nan, end="failed"), (a, 2): outcome(0.4)}
-    evaluations, _ = judged(problem(3, "mean"), table, [[a]], racing=False)
+    evaluations, _ = evaluated(problem(3, "mean"), table, [[a]], racing=False)
     assert evaluations[a].failed and not evaluations[a].feasible
 
 
@@ -248,11 +247,11 @@ def test_equal_points_are_judged_once():
         runs.extend(rows)
         known.update({row: outcome(0.5) for row in rows})
 
-    judge = Judge(problem(2, "mean"), known, run)
-    first, second = judge.judge([a, a])
+    evaluator = Evaluator(problem(2, "mean"), known, run)
+    first, second = evaluator.evaluate([a, a])
     assert first.values == second.values and (first.effort, second.effort) == (1.0, 0.0)
     assert runs == [(a, 0), (a, 1)]
-    judge.judge([a])
+    evaluator.evaluate([a])
     assert len(runs) == 2
 
 

@@ -27,8 +27,7 @@ from tests.optimization.studies import (
 )
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
-from vtbdrake.optimization.solvers import Solver
-from vtbdrake.optimization.solvers.catalogue import CATALOGUE
+from vtbdrake.optimization.solvers import CATALOGUE, Solver
 from vtbdrake.rollout import Constraint, Quality, QualityError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,7 +87,7 @@ def test_two_qualities_have_a_front_and_no_best():
     better = (values[None, :, 0] <= values[:, None, 0]) & (values[None, :, 1] >= values[:, None, 1])
     better &= (values[None, :, 0] < values[:, None, 0]) | (values[None, :, 1] > values[:, None, 1])
     assert [trial.number for trial in study.pareto()] == np.flatnonzero(~better.any(axis=1)).tolist()
-    with pytest.raises(ValueError, match=r"ask for pareto\(\)"):
+    with pytest.raises(ValueError, match=r"use pareto\(\)"):
         study.best  # noqa: B018
 
 
@@ -365,25 +364,23 @@ def test_points_given_by_hand_have_their_turn_before_a_design_that_takes_the_who
 
 
 class Thinker(Solver):
-    """Asks for one point, and then thinks for ever."""
-
-    name = "thinker"
+    """A solver that asks for one point, and then thinks for ever."""
 
     def __init__(self, search, *, name, disturb=None):
-        self._asked = False
+        super().__init__(search, name=name)
+        self._points = [(0.5, 0.5)]
         self._disturb = disturb
         self._never = threading.Event()
 
-    def ask(self):
-        if not self._asked:
-            self._asked = True
-            return [(0.5, 0.5)]
+    def _next(self):
+        if self._points:
+            return [self._points.pop()]
         if self._disturb is not None:
             os.kill(os.getpid(), signal.SIGINT)
         self._never.wait()
         return []
 
-    def tell(self, evaluations):
+    def _learn(self, asked, given):
         return
 
     def close(self):
@@ -473,7 +470,7 @@ def test_a_quality_function_that_has_changed_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"solver": 3}, "a solver is known by its name, unlike 3; one of auto, "),
+        ({"solver": 3}, "a solver is given by its name, one of auto, "),
         ({"seed": 1.5}, "a seed is a whole number, not 1.5"),
         ({"seed": True}, "a seed is a number, not True"),
         ({"options": 3}, "the options of a solver are given as {name: value, ...}, not as 3"),
@@ -509,7 +506,7 @@ def test_a_quality_function_that_raises_leaves_the_study_whole(tmp_path, executo
     with Study.open(path) as again:
         assert len(again) == finished < 64
         assert all(o.value <= 1.0 for o in again.rollouts.values())
-        assert again._file.sessions()[0][2] == "QualityError"
+        assert again._file.sessions()[0]["reason"] == "QualityError"
 
 
 @pytest.mark.parametrize("executor", ["serial", "processes"])
@@ -646,13 +643,15 @@ def test_points_that_wait_can_be_changed_and_taken_back(tmp_path):
         study.remove(first)
         with pytest.raises(ValueError, match="outside its range"):
             study.edit(third, [7.0, 0.0])
-        with pytest.raises(StudyError, match=f"no point {first} waits to be judged in .*; {second}, {third} do"):
+        with pytest.raises(
+            StudyError, match=f"no point {first} waits to be evaluated in .*; the queue has: {second}, {third}"
+        ):
             study.remove(first)
     with pendulum_problem().study(path) as study:
         study.run(rollouts=6, executor="serial", progress=False)
         given = [tuple(t.parameters.values()) for t in study.trials if t.origin == "user"]
         assert given == [(-0.5, 1.0), (0.75, 0.0)] and study.queue == {}
-        with pytest.raises(StudyError, match="no point 2 waits to be judged in .*; none does"):
+        with pytest.raises(StudyError, match="no point 2 waits to be evaluated in .*; the queue has: none"):
             study.edit(second, [0.0, 0.0])
 
 

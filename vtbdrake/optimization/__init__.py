@@ -2,12 +2,11 @@
 
 from vtbdrake.optimization.boundary import Boundary
 from vtbdrake.optimization.motion import Motion, ProblemRollout
-from vtbdrake.optimization.outcome import Outcome, Trial
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
 from vtbdrake.optimization.study import Study
-from vtbdrake.optimization.study_error import StudyError
+from vtbdrake.optimization.study_file import Outcome, StudyError, Trial
 from vtbdrake.optimization.sweep import Sweep
 
 __all__ = [

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import casadi
 import numpy as np
 
-from vtbdrake.optimization.gradient import Gradients
-from vtbdrake.optimization.judge import Judge
-from vtbdrake.optimization.outcome import Outcome, Row
+from vtbdrake.optimization.evaluator import Evaluator, Gradients
 from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study_file import Outcome, RolloutKey
 from vtbdrake.rollout import Executor, make_executor
 from vtbdrake.rollout.arguments import as_number
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 CENTRAL, AUTODIFF = "central", "autodiff"
 
-# By how much of its range a parameter may lie outside: interior point methods relax bounds a little.
+# How far outside its range a parameter may be, as a part of it: interior point methods relax bounds a little.
 _SLACK = 1e-6
 
 
@@ -31,21 +30,22 @@ class ProblemFunction(casadi.Callback):
     Use it as any function, in ``Opti`` or ``nlpsol``, together with symbolic expressions; solvers need
     ``hessian_approximation="limited-memory"``, as there is no second derivative. Keep it alive while they work.
 
-    A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers swallow what a
-    function raises: call `check` after them, which raises it as itself.
+    A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers suppress the
+    exceptions of a function: call `check` after them, which raises the last one.
 
     Attributes:
-        error: what was raised last while it was evaluated, or None.
-        rollouts: how many there were.
+        error: the last exception during an evaluation, or None.
 
     Args:
+        problem: with continuous parameters and one quality.
+        name: of the CasADi function.
         gradient: ``central`` differences, whose points are rolled out side by side, or ``autodiff`` (see `Gradients`).
         step: of the differences, as a part of each parameter's range.
         executor, workers: see `Problem.sweep`.
 
     Raises:
-        ValueError: a parameter is not continuous, there are several qualities, or the gradient is unknown or cannot
-            be had.
+        ValueError: a parameter is not continuous, there are several qualities, or the gradient is unknown or not
+            available.
     """
 
     def __init__(
@@ -67,47 +67,49 @@ class ProblemFunction(casadi.Callback):
             raise ValueError("a CasADi function has one value, but the problem has several qualities")
         for parameter in problem.parameters:
             if not parameter.is_continuous:
-                raise ValueError(f"{parameter.address} is not continuous: there is no derivative by it")
+                raise ValueError(f"{parameter.address} is not continuous: it has no derivative")
         self._problem = problem
         self._gradients = Gradients(problem) if gradient == AUTODIFF else None
         self._step = step
         rollouts = 2 * len(problem.parameters) * len(problem.conditions)
         self._executor = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, workers=workers)
         self._owned = self._executor is not executor
-        self._known: dict[Row, Outcome] = {}
-        self._judge = Judge(problem, self._known, self._roll_out)
+        self._known: dict[RolloutKey, Outcome] = {}
+        self._evaluator = Evaluator(problem, self._known, self._roll_out)
         self._jacobian: _Jacobian | None = None
         self.error: BaseException | None = None
         self.construct(name, {})
 
     @property
     def rollouts(self) -> int:
+        """The number of rollouts so far."""
         return len(self._known)
 
     def close(self) -> None:
-        """Gives back the executor."""
+        """Close the executor, unless it is the caller's."""
         if self._owned:
             self._executor.close()
 
     def check(self) -> None:
-        """Raises what was raised while it was evaluated, if anything was."""
+        """Raise the last exception during an evaluation, if there was one."""
         if self.error is not None:
             raise self.error
 
     def value(self, x: np.ndarray) -> float:
-        """The value at ``x``, shape (n,)."""
-        (evaluation,) = self._judge.judge([self._point(x)])
-        return self._judge.in_the_users_terms(evaluation)[0]
+        """Return the value at ``x``, shape (n,)."""
+        return self._values([self._point(x)])[0]
+
+    def _values(self, points: Sequence[Point]) -> list[float]:
+        return [self._evaluator.in_user_terms(evaluation)[0] for evaluation in self._evaluator.evaluate(points)]
 
     def slope(self, x: np.ndarray) -> np.ndarray:
-        """The gradient at ``x``, shape (n,)."""
+        """Return the gradient at ``x``, shape (n,)."""
         point = self._point(x)
         if self._gradients is not None:
             sign = -1.0 if self._problem.objectives[0].minimize else 1.0
             return sign * np.array(self._gradients.at(point))
         pairs = [self._neighbours(point, i) for i in range(len(point))]
-        evaluations = self._judge.judge([neighbour for pair in pairs for neighbour in pair])
-        values = np.array([self._judge.in_the_users_terms(e)[0] for e in evaluations]).reshape(-1, 2)
+        values = np.array(self._values([neighbour for pair in pairs for neighbour in pair])).reshape(-1, 2)
         widths = np.array([above[i] - below[i] for i, (below, above) in enumerate(pairs)])
         return (values[:, 1] - values[:, 0]) / widths
 
@@ -126,10 +128,10 @@ class ProblemFunction(casadi.Callback):
             entries.append(min(max(value, lower), upper) if lower - slack <= value <= upper + slack else value)
         return self._problem.point(entries)
 
-    def _roll_out(self, rows: Sequence[Row]) -> None:
-        points = [self._problem.values(point, condition=condition) for point, condition in rows]
+    def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
+        points = [self._problem.values(point, condition=condition) for point, condition in keys]
         for index, result in self._executor.run(self._problem.task, points):
-            self._known[rows[index]] = Outcome.of(result)
+            self._known[keys[index]] = Outcome.of(result)
 
     # -- what CasADi calls
 
@@ -160,7 +162,7 @@ class ProblemFunction(casadi.Callback):
 
 
 class _Jacobian(casadi.Callback):
-    """(x, h) -> dh/dx, as a row."""
+    """The Jacobian (x, h) -> dh/dx, shape (1, n)."""
 
     def __init__(self, function: ProblemFunction, name: str, opts: Mapping[str, Any]) -> None:
         super().__init__()

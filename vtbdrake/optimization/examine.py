@@ -18,9 +18,9 @@ from vtbdrake.optimization.boundary import (
     repeat_around,
     why_never_unsafe,
 )
-from vtbdrake.optimization.outcome import Row
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.optimization.sweep import Sweep
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.arguments import as_number, as_whole
@@ -43,7 +43,7 @@ def sweep(
     points = [problem.point(point.tolist()) for point in table]
     rows = [(point, condition) for point in points for condition in range(len(problem.conditions))]
     with _executor(problem, executor, rollouts=len(rows), workers=workers) as chosen:
-        results = _run(problem, chosen, task, rows, progress=progress, description="sweep")
+        results = _run(problem, chosen, task, rows, progress=progress, name="sweep")
     return _table(problem, rows, results)
 
 
@@ -101,9 +101,9 @@ class _Search:
         self._refinement = refinement
         self._executor = executor
         self._progress = progress
-        self._rows: list[Row] = []
+        self._rows: list[RolloutKey] = []
         self._results: list[RolloutResult] = []
-        self._repeated_rows: list[Row] = []
+        self._repeated_rows: list[RolloutKey] = []
         self._repeated_results: list[RolloutResult] = []
         # Candidate -> (rollouts, unsafe ones); first of those without jitter.
         self._counts: dict[Candidate, tuple[int, int]] = {}
@@ -111,7 +111,7 @@ class _Search:
 
     def examine(self, wanted: Sequence[Candidate]) -> list[bool]:
         """One rollout for each candidate; whether it was unsafe."""
-        rows: list[Row] = [((self._refinement.value(index),), condition) for index, condition in wanted]
+        rows: list[RolloutKey] = [((self._refinement.value(index),), condition) for index, condition in wanted]
         results = self._roll(rows)
         self._rows += rows
         self._results += results
@@ -126,7 +126,7 @@ class _Search:
         new = [candidate for candidate in wanted if candidate not in self._counts]
         if new:
             self.examine(new)
-        rows: list[Row] = [
+        rows: list[RolloutKey] = [
             ((value,), candidate[1]) for candidate in wanted for value in self._jittered(candidate, repeats, jitter)
         ]
         results = self._roll(rows)
@@ -151,16 +151,14 @@ class _Search:
         # What would leave the range is reflected at its end.
         return [float(parameter.from_unit(1.0 - abs(1.0 - v))) for v in moved.tolist()]
 
-    def _roll(self, rows: Sequence[Row]) -> list[RolloutResult]:
-        found = _run(
-            self._problem, self._executor, self._problem.task, rows, progress=self._progress, description="boundary"
-        )
+    def _roll(self, rows: Sequence[RolloutKey]) -> list[RolloutResult]:
+        found = _run(self._problem, self._executor, self._problem.task, rows, progress=self._progress, name="boundary")
         finished = [result for result in found if result is not None]
         if len(finished) < len(found):
             raise KeyboardInterrupt
         return finished
 
-    def _table(self, rows: Sequence[Row], results: Sequence[RolloutResult]) -> Sweep:
+    def _table(self, rows: Sequence[RolloutKey], results: Sequence[RolloutResult]) -> Sweep:
         return _table(self._problem, rows, results)
 
     def boundary(self) -> Boundary:
@@ -170,7 +168,7 @@ class _Search:
         repeated = self._sorted(self._repeated_rows, self._repeated_results) if self._repeated else None
         return boundary_of(self._sorted(self._rows, self._results), chances, repeated)
 
-    def _sorted(self, rows: Sequence[Row], results: Sequence[RolloutResult]) -> Sweep:
+    def _sorted(self, rows: Sequence[RolloutKey], results: Sequence[RolloutResult]) -> Sweep:
         order = sorted(range(len(rows)), key=lambda k: rows[k])
         return self._table([rows[k] for k in order], [results[k] for k in order])
 
@@ -187,13 +185,19 @@ def _executor(problem: Problem, executor: str | Executor, *, rollouts: int, work
 
 
 def _run(
-    problem: Problem, executor: Executor, task: RolloutTask, rows: Sequence[Row], *, progress: bool, description: str
+    problem: Problem,
+    executor: Executor,
+    task: RolloutTask,
+    rows: Sequence[RolloutKey],
+    *,
+    progress: bool,
+    name: str,
 ) -> list[RolloutResult | None]:
     points = [problem.values(point, condition=condition) for point, condition in rows]
-    return run_rollouts(executor, task, points, progress=progress, description=description)
+    return run_rollouts(executor, task, points, progress=progress, description=name)
 
 
-def _table(problem: Problem, rows: Sequence[Row], results: Sequence[RolloutResult | None]) -> Sweep:
+def _table(problem: Problem, rows: Sequence[RolloutKey], results: Sequence[RolloutResult | None]) -> Sweep:
     finished = [(*row, result) for row, result in zip(rows, results, strict=True) if result is not None]
     return Sweep(
         parameters=numeric(problem),

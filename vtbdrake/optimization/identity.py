@@ -51,17 +51,6 @@ def describe(problem: Problem) -> dict[str, Any]:
     return plain
 
 
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a solver as they come back from a file.
-
-    Raises:
-        ValueError: one is neither a number, nor a word, nor made of these.
-    """
-    if not isinstance(options, Mapping):
-        raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
-    return plain(options, "the options of its solver")
-
-
 def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
     """Values as they come back from a file.
 

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from vtbdrake.optimization.identity import differences
 from vtbdrake.optimization.optuna_trials import insert_trials
-from vtbdrake.optimization.outcome import Outcome, Row, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_error import StudyError
-from vtbdrake.optimization.study_file import encode
+from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, Trial, encode
 
 if TYPE_CHECKING:
     import optuna
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial
 
-    from vtbdrake.optimization.study_record import StudyRecord
+    from vtbdrake.optimization.study import Study
 
 # What makes a study the one that it is, beside its problem: of the same ones it may be exported again.
 _IDENTITY = ("solver", "seed", "options")
@@ -34,7 +32,7 @@ _IDENTITY = ("solver", "seed", "options")
 _FEWEST = 10
 
 
-def to_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> optuna.Study:
+def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.Study:
     """Writes a study into Optuna's storage. See `Study.to_optuna`.
 
     Raises:
@@ -64,7 +62,7 @@ def to_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> o
     return exported
 
 
-def points_from_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: str) -> list[Point]:
+def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> list[Point]:
     """The points of a study in Optuna's storage that ``study`` has not judged, nor in its queue.
 
     See `Study.import_optuna`.
@@ -90,7 +88,7 @@ def points_from_optuna(study: StudyRecord, storage: str | BaseStorage, *, name: 
     return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
 
 
-def importances(study: StudyRecord) -> tuple[dict[str, float], ...]:
+def importances(study: Study) -> tuple[dict[str, float], ...]:
     """How much each parameter decides about whether a point is among the best tenth: for each quality, by address.
 
     The shares sum to 1, the largest comes first. They come from the points that have a value, by Optuna's PED-ANOVA:
@@ -145,7 +143,7 @@ def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseS
     return opened
 
 
-def _exported(optuna: Any, storage: BaseStorage, study: StudyRecord, name: str) -> optuna.Study:
+def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> optuna.Study:
     """The study in the storage, made if it is not there."""
     record = json.loads(json.dumps(study.record))
     if name in optuna.get_all_study_names(storage):
@@ -175,7 +173,7 @@ def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
     return batch, json.dumps(params, sort_keys=True)
 
 
-def _rows(trial: Trial, study: StudyRecord) -> Iterable[Row]:
+def _rows(trial: Trial, study: Study) -> Iterable[RolloutKey]:
     point = tuple(trial.parameters.values())
     return ((point, condition) for condition in range(len(study.record["problem"]["conditions"])))
 
@@ -242,7 +240,7 @@ def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
     return found
 
 
-def _point(study: StudyRecord, trial: FrozenTrial, name: str) -> Point | None:
+def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
     """The point of a trial; None of one whose parameters are not all drawn yet."""
     params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
     addresses = [parameter.address for parameter in study.parameters]

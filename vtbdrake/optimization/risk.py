@@ -1,30 +1,36 @@
-"""One number of the qualities under several conditions: how a decision is judged whose outcome is not certain."""
+"""Risks: how the qualities of a decision under several conditions become one number."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, inf, isnan
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vtbdrake.rollout.arguments import as_number
 
+if TYPE_CHECKING:
+    from vtbdrake.optimization.study_file import Outcome
+    from vtbdrake.rollout import RolloutResult
+
 
 class Risk(ABC):
-    """Aggregates qualities h, larger is better, of shape (n,): one decision under n conditions.
+    """A function of the qualities h of one decision under n conditions, shape (n,); larger is better.
 
-    It must not become smaller when one of them becomes larger: racing rests on that.
+    It must not fall when one of them rises: racing relies on it.
     """
 
     @abstractmethod
     def __call__(self, h: np.ndarray) -> float:
-        """The one number."""
+        """Return one number for h, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Mean(Risk):
-    """The mean: for conditions that are met equally often."""
+    """The mean, for conditions that occur equally often."""
 
     def __call__(self, h: np.ndarray) -> float:
         return float(np.mean(h))
@@ -39,16 +45,22 @@ class Worst(Risk):
 
 
 @dataclass(frozen=True)
-class Quantile(Risk):
-    """What all but a share ``level`` of the conditions reach: of n sorted h, the one at ceil(level n).
-
-    ``level`` in (0, 1]; 0.5 is the (lower) median.
-    """
-
+class _Level(Risk):
     level: float
 
     def __post_init__(self) -> None:
-        _check_level(self)
+        level = as_number(f"the level of {type(self).__name__}", self.level)
+        if not 0.0 < level <= 1.0:
+            raise ValueError(f"the level of {type(self).__name__} lies in (0, 1], unlike {level}")
+        object.__setattr__(self, "level", level)
+
+
+@dataclass(frozen=True)
+class Quantile(_Level):
+    """The value that all but a share ``level`` of the conditions reach: of n sorted h, the one at ceil(level n).
+
+    ``level`` in (0, 1]; 0.5 is the (lower) median.
+    """
 
     def __call__(self, h: np.ndarray) -> float:
         # 0.28 * 25 is a little above 7 in floating point, and means 7.
@@ -57,23 +69,18 @@ class Quantile(Risk):
 
 
 @dataclass(frozen=True)
-class CVaR(Risk):
-    """Conditional value at risk: the mean of the worst share ``level`` of the conditions.
+class CVaR(_Level):
+    """The conditional value at risk: the mean of the worst share ``level`` of the conditions.
 
-    Where ``level`` n is not whole, the last counts with what is left of the share (Rockafellar and Uryasev, 2002).
+    Where ``level`` n is not whole, the last counts with the rest of the share (Rockafellar and Uryasev, 2002).
     ``level`` in (0, 1]; 1 is the mean.
     """
-
-    level: float
-
-    def __post_init__(self) -> None:
-        _check_level(self)
 
     def __call__(self, h: np.ndarray) -> float:
         worst = np.sort(h)
         count = self.level * worst.size
         weights = np.clip(count - np.arange(worst.size), 0.0, 1.0)
-        counted = weights > 0.0  # What is not counted may be infinite.
+        counted = weights > 0.0  # What does not count may be infinite.
         return float(worst[counted] @ weights[counted] / count)
 
 
@@ -81,7 +88,7 @@ RISKS: dict[str, Risk] = {"mean": Mean(), "worst": Worst()}
 
 
 def make_risk(risk: str | Risk) -> Risk:
-    """A risk by name, or the one given.
+    """Return a risk by name, or the one given.
 
     Raises:
         ValueError: the name is unknown.
@@ -95,8 +102,34 @@ def make_risk(risk: str | Risk) -> Risk:
     return RISKS[risk]
 
 
-def _check_level(risk: Quantile | CVaR) -> None:
-    level = as_number(f"the level of {type(risk).__name__}", risk.level)
-    if not 0.0 < level <= 1.0:
-        raise ValueError(f"the level of {type(risk).__name__} lies in (0, 1], unlike {level}")
-    object.__setattr__(risk, "level", level)
+def aggregate(
+    outcomes: Sequence[Outcome | RolloutResult | None],
+    *,
+    risk: Risk,
+    minimize: Sequence[bool],
+    constraints: int,
+    bounds: Sequence[float],
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Aggregate the outcomes of one point under several conditions.
+
+    Args:
+        outcomes: one per condition, none of them failed; None if a condition has not run.
+        risk: how the qualities under several conditions become one.
+        minimize: whether a quality is a cost, for each of them.
+        constraints: the number of constraints.
+        bounds: the best that each quality can be, in the user's terms; used for conditions that have not run.
+
+    Returns:
+        The qualities, larger is better (a cost is negated), and the worst violation of each constraint.
+    """
+    values = []
+    for k, (cost, bound) in enumerate(zip(minimize, bounds, strict=True)):
+        own = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]
+        # A user's risk may make NaN of infinities if nothing bounds the conditions that have not run.
+        with np.errstate(invalid="ignore"):
+            value = float(risk(np.array([-number if cost else number for number in own])))
+        values.append(inf if isnan(value) and None in outcomes else value)
+    tried = [outcome for outcome in outcomes if outcome is not None]
+    first = len(values) - 1
+    violations = [max((o.measures[first + k] for o in tried), default=-inf) for k in range(constraints)]
+    return tuple(values), tuple(violations)

@@ -3,56 +3,69 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from vtbdrake.optimization.identity import code_changes, describe, differences, plain, plain_options, revision, versions
-from vtbdrake.optimization.outcome import Trial
-from vtbdrake.optimization.parameter import checked_point
-from vtbdrake.optimization.solvers.catalogue import make_solver
-from vtbdrake.optimization.solvers.solver import Point, Solver
-from vtbdrake.optimization.study_error import StudyError
-from vtbdrake.optimization.study_file import StudyFile
-from vtbdrake.optimization.study_record import StudyRecord
+from vtbdrake.optimization.identity import (
+    code_changes,
+    describe,
+    differences,
+    dimensions,
+    plain,
+    revision,
+    versions,
+)
+from vtbdrake.optimization.parameter import Dimension, checked_point
+from vtbdrake.optimization.solvers import Solver, make_solver
+from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
 from vtbdrake.rollout.arguments import as_whole
 
 if TYPE_CHECKING:
+    import optuna
+    import pandas
+    from matplotlib.figure import Figure
     from optuna.storages import BaseStorage
 
     from vtbdrake.optimization.problem import Problem
 
-
-# What is called with a study and each of its new trials.
+# A function that is called with a study and each of its new trials.
 Callback = Callable[["Study", Trial], Any]
 
 
-class Study(StudyRecord):
+class Study:
     """The rollouts and points of one problem, in one file or in memory.
 
-    A study is made by `Problem.study`, which also resumes it, or opened to be read, and be given points, by `open`,
-    while another process runs it.
+    `Problem.study` begins a study, or resumes the one in a file. `open` opens a file for reading and for giving points,
+    also while another process runs the study. Properties read the file anew each time.
 
-    What it examines depends on the problem, the solver, the seed and the budget that the solver was made for, and not
-    on the executor: a study that is resumed makes its solver anew and tells it what is known, so that it goes on as if
-    it had not been interrupted. For a larger budget than before, the solver is made anew; what it asks for again is
-    known, and costs nothing.
+    Which points are examined depends on the problem, the solver, the seed and the budget that the solver was made for,
+    and not on the executor. A study is resumed by a new solver that is told what is known, so that it goes on as if it
+    had not been interrupted. For a larger budget than before, the solver is made anew; what it asks for again is known,
+    and takes no rollouts.
 
     Attributes:
         reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
-            ``interrupted``.
+            ``interrupted``; empty before the first.
+        message: the same in a sentence.
     """
 
     def __init__(self, file: StudyFile, problem: Problem | None = None) -> None:
-        super().__init__(file)
+        self._file = file
         self._problem = problem
+        self._meta = file.meta
         self._stopped = False
+        self.reason = ""
+        self.message = ""
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
-        """Open a study file to be read and to be given points.
+        """Open a study file for reading and for giving points.
 
         Raises:
             StudyError: there is none, it is damaged, or of another version.
@@ -71,16 +84,18 @@ class Study(StudyRecord):
         allow_changed_code: bool = False,
     ) -> Self:
         """Begin or resume the study of a problem; see `Problem.study`."""
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
         meta: dict[str, Any] = {
             "problem": describe(problem),
             "solver": "auto" if solver is None else solver,
             "seed": 0 if seed is None else as_whole("a seed", seed),
-            "options": plain_options(options or {}),
+            "options": plain(options or {}, "the options of its solver"),
             "versions": versions(),
             "revision": revision(problem.scenario),
             "units": list(problem.units),
         }
-        # An unknown solver, or one that cannot solve the problem, is told before there is a file.
+        # An unknown solver, or one that cannot solve the problem, is refused before there is a file.
         made = _solver(problem, meta, rollouts=None)
         made.close()
         meta["solver"] = made.name
@@ -113,7 +128,17 @@ class Study(StudyRecord):
             raise
         return study
 
-    # -- to run it
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # -- running it
 
     def run(
         self,
@@ -132,27 +157,28 @@ class Study(StudyRecord):
         """Run rollouts until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
 
         Args:
-            rollouts: how many the study has in the end, those of former runs included.
+            rollouts: how many the study has in the end, those of former runs included. With racing, a rest that is
+                smaller than one point under all conditions is left; `message` says so.
             seconds: the wall time of this run.
-            target: ends as soon as a point is at least as good: a quality as large, a cost as small. With several
-                workers, others may be finished by then.
-            racing: drop points that can no longer win before all their conditions have run (see `Judge`). By default,
-                where there are several conditions and one quality.
-            executor, workers: see `Problem.sweep`.
+            target: the run ends as soon as a point is at least as good: a quality as large, a cost as small. With
+                several workers, others may be finished by then.
+            racing: drop points that can no longer win before all their conditions have run (see `Evaluator`). By
+                default, if there are several conditions and one quality.
+            executor: see `Problem.sweep`.
+            workers: see `Problem.sweep`.
             time_limit: in seconds; a rollout that takes longer fails.
-            on_error: what becomes of a rollout in which a quality or constraint function raises, is negative or NaN.
-                ``record``: it counts as failed, with the message, and the first of a run is logged; ``raise``: the run
-                ends there.
-            callbacks: each is called with the study and a trial when that is judged and recorded for the first time,
-                batch by batch, in this thread. It may set attributes, add points, or `stop` the run; what it raises
-                ends the run.
-            progress: show a progress bar: rollouts per second, the best so far, the time left. Where there is neither a
-                terminal nor a notebook, log it every half minute instead, at the level INFO.
+            on_error: what happens if a quality or constraint function raises, is negative or NaN. ``record``: the
+                rollout counts as failed, with the message, and the first of a run is logged; ``raise``: the run ends.
+            callbacks: functions of the study and a trial, called in this thread for every trial that is recorded for
+                the first time, batch by batch. One may set attributes, add points, or `stop` the run; an exception ends
+                the run.
+            progress: show a progress bar: rollouts per second, the best so far, the time left. Without a terminal or a
+                notebook, log it every half minute instead, at the level INFO.
 
         Raises:
-            ValueError: there is no budget at all, or it makes no sense; an executor or solver is unknown.
+            ValueError: there is no budget at all, or an invalid one; an executor or solver is unknown.
             StudyError: another process runs the study, or it was opened without its problem.
-            QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``. What was finished is kept.
+            QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``. Finished rollouts are kept.
         """
         problem = self._problem
         if problem is None:
@@ -167,7 +193,7 @@ class Study(StudyRecord):
                 raise ValueError(f"a callback is a function of a study and a trial, not {callback!r}")
 
         def after_batch(batch: int) -> bool:
-            for trial in self._trials_of(batch) if callbacks else ():
+            for trial in self._file.trials_of(batch) if callbacks else ():
                 for callback in callbacks:
                     callback(self, trial)
             return self._stopped
@@ -199,47 +225,48 @@ class Study(StudyRecord):
         return self
 
     def stop(self) -> None:
-        """End the run when the batch of points that is being judged is complete.
-
-        It may be called by a callback, or in another thread.
-        """
+        """End the run after the present batch of points; may be called by a callback, or in another thread."""
         self._stopped = True
 
     def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
         self._meta = self._file.meta
         made_for, raced = self._meta.get("budget", 0), self._meta.get("racing")
-        # Another budget may be another sequence: a smaller one only ends the same one earlier.
+        # A larger budget may be another sequence of points; a smaller one only ends the same sequence earlier.
         larger = made_for is not None and (rollouts is None or rollouts > made_for)
         if larger or racing != raced:
             self._file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
             self._meta = self._file.meta
         return _solver(problem, self._meta, rollouts=self._meta["budget"])
 
+    # -- points and attributes given by hand
+
     def add(self, *points: Any) -> None:
         """Give points by hand, each a mapping address -> value or values in the order of the parameters.
 
-        They are judged before anything else that the study asks for next, in whatever process runs it, and the solver
-        is told of them.
+        They are evaluated before anything else that the study asks for next, in whatever process runs it, and the
+        solver is told of them.
 
         Raises:
             ValueError: a point has other entries than the study, or one lies outside its range.
         """
-        self._file.give([self._checked(point) for point in points])
+        self._file.give([checked_point(self.parameters, point) for point in points])
 
     def edit(self, number: int, point: Any) -> None:
-        """Put another point in the place of one of the `queue`.
+        """Replace a point of the `queue`.
 
         Raises:
-            StudyError: no point of that number waits: it was judged, removed, or never given.
+            StudyError: no point of that number waits: it was evaluated, removed, or never given.
             ValueError: as in `add`.
         """
-        self._file.change_queue(as_whole("the number of a point in the queue", number), self._checked(point))
+        self._file.change_queue(
+            as_whole("the number of a point in the queue", number), checked_point(self.parameters, point)
+        )
 
     def remove(self, number: int) -> None:
-        """Take a point out of the `queue`: it is not judged.
+        """Remove a point from the `queue`.
 
         Raises:
-            StudyError: no point of that number waits: it was judged, removed, or never given.
+            StudyError: no point of that number waits: it was evaluated, removed, or never given.
         """
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
@@ -252,25 +279,238 @@ class Study(StudyRecord):
             point: as in `add`; None for the study itself.
 
         Raises:
-            ValueError: the value cannot be kept, or the point is none of the study's space.
+            ValueError: the value cannot be stored, or the point is invalid.
         """
         if not isinstance(key, str) or not key:
             raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
         (kept,) = plain({key: value}, "attributes").values()
-        self._file.set_attribute(None if point is None else self._checked(point), key, kept)
+        self._file.set_attribute(None if point is None else checked_point(self.parameters, point), key, kept)
 
-    def _checked(self, point: Any) -> Point:
-        return checked_point(self.parameters, point)
+    @property
+    def queue(self) -> dict[int, dict[str, Any]]:
+        """The points given by hand that are not evaluated yet: number -> the point, address -> value."""
+        return self._file.queue()
 
-    def import_optuna(self, storage: str | BaseStorage, name: str) -> int:
-        """Gives the points of a study in Optuna's storage, as `add` does: evaluated by whomever, or only enqueued.
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The attributes of the study, see `set_attribute`; those of a point are `Trial.attributes`."""
+        return self._file.attributes().get(None, {})
 
-        They are judged by rollouts of this problem: a value from elsewhere says nothing about it. Points that are
-        judged already, or wait in the queue, are left out, so that what `to_optuna` wrote costs nothing when it comes
-        back.
+    # -- what it is about
+
+    @property
+    def path(self) -> Path | None:
+        """The path of the file; None if the study is in memory."""
+        return self._file.path
+
+    @property
+    def parameters(self) -> tuple[Dimension, ...]:
+        """The parameters that are varied."""
+        return dimensions(self._meta["problem"])
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The units of the parameters, see `Problem.units`."""
+        return tuple(self._meta["units"])
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """``maximize`` or ``minimize`` for each quality."""
+        return tuple(
+            "minimize" if quality["minimize"] else "maximize" for quality in self.record["problem"]["qualities"]
+        )
+
+    @property
+    def signs(self) -> tuple[float, ...]:
+        """1 for a quality, -1 for a cost."""
+        return tuple(-1.0 if direction == "minimize" else 1.0 for direction in self.directions)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the qualities."""
+        return tuple(quality["name"] for quality in self._meta["problem"]["qualities"])
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What the study is about: the problem, the scenario, the solver, the seed, the versions, the git revision, and
+        the ``changes`` of the code that were allowed."""
+        return dict(self._meta)
+
+    # -- what it has found
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All evaluated points."""
+        return tuple(self._file.trials())
+
+    @property
+    def rollouts(self) -> dict[RolloutKey, Outcome]:
+        """All finished rollouts by (point, number of the condition)."""
+        return self._file.outcomes()
+
+    @property
+    def finished(self) -> dict[RolloutKey, datetime]:
+        """The time at which each rollout was finished, in UTC."""
+        return self._file.finished()
+
+    def __len__(self) -> int:
+        """Return the number of finished rollouts."""
+        return self._file.count()
+
+    @property
+    def best(self) -> Trial:
+        """s^0*, equation (18), among the points examined: the best that keeps all constraints.
+
+        Raises:
+            ValueError: there are several qualities, or no point has a value and keeps the constraints.
+        """
+        if len(self.directions) > 1:
+            raise ValueError("several qualities have no single best point: use pareto()")
+        found = [trial for trial in self.trials if trial.counts]
+        if not found:
+            kept = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
+            raise ValueError(f"no point has a quality{kept}{self._failures()}")
+        (sign,) = self.signs
+        return max(found, key=lambda trial: sign * trial.value)
+
+    def pareto(self) -> tuple[Trial, ...]:
+        """Return the points that no other point beats in one quality without losing in another."""
+        found = [trial for trial in self.trials if trial.counts]
+        signed = [[s * v for s, v in zip(self.signs, trial.values, strict=True)] for trial in found]
+        return tuple(t for t, own in zip(found, signed, strict=True) if not any(_dominates(o, own) for o in signed))
+
+    def _failures(self) -> str:
+        messages = Counter(o.message for o in self.rollouts.values() if o.end == "failed")
+        return "".join(f"; {count} rollouts failed: {message}" for message, count in messages.most_common(1))
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Return columns by name, one entry per trial.
+
+        The columns are the parameters by address, the qualities, the violations of the constraints, how the trial came
+        about, and its attributes (None if it does not have one).
+        """
+        trials = self.trials
+        columns: dict[str, list[Any]] = {d.address: [t.parameters[d.address] for t in trials] for d in self.parameters}
+        for k, name in enumerate(self.names):
+            columns[name if name not in columns else f"{name} {k}"] = [t.values[k] for t in trials]
+        for k, constraint in enumerate(self._meta["problem"]["constraints"]):
+            name = f"violation of {constraint['name']}"
+            columns[name if name not in columns else f"{name} {k}"] = [t.violations[k] for t in trials]
+        for name in ("feasible", "exact", "origin", "method", "batch"):
+            columns[name] = [getattr(trial, name) for trial in trials]
+        for key in dict.fromkeys(key for trial in trials for key in trial.attributes):
+            columns[f"attribute {key}"] = [trial.attributes.get(key) for trial in trials]
+        return columns
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the columns of `to_dict` as a DataFrame, one row per trial; its index is `Trial.number`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("a DataFrame needs pandas: pip install 'vtbdrake[dataframe]'") from error
+        return pandas.DataFrame(self.to_dict(), index=pandas.RangeIndex(len(self.trials), name="number"))
+
+    def summary(self) -> str:
+        """Return a text: what was done, what was found, and what went wrong."""
+        trials, outcomes = self.trials, self.rollouts
+        methods = Counter(trial.method for trial in trials)
+        lines = [
+            f"{len(trials)} points, {len(outcomes)} rollouts; solver {self._meta['solver']}, seed "
+            f"{self._meta['seed']}: " + ", ".join(f"{method} ({count})" for method, count in methods.items())
+        ]
+        for change in self._meta.get("changes", []):
+            lines.append(f"the code changed on {change['at'][:10]}: {'; '.join(change['what'])}")
+        if self.message:
+            lines.append(f"ended: {self.message}")
+        lines.append(self._result())
+        dropped = sum(not trial.exact for trial in trials)
+        if dropped:
+            saved = len(trials) * len(self._meta["problem"]["conditions"]) - len(outcomes)
+            lines.append(f"racing dropped {dropped} points before all their conditions had run, {saved} rollouts less")
+        ends = Counter(outcome.end for outcome in outcomes.values())
+        times = sorted(outcome.wall_time for outcome in outcomes.values() if outcome.wall_time == outcome.wall_time)
+        if times:
+            lines.append(
+                f"rollouts took {sum(times):.3g} s in all, the median {times[len(times) // 2]:.3g} s; they ended by "
+                + ", ".join(f"{end} ({count})" for end, count in ends.items())
+                + self._failures()
+            )
+        return "\n".join(lines)
+
+    def _result(self) -> str:
+        """Return the best point, or the size of the Pareto front, in a line."""
+        if len(self.directions) > 1:
+            return f"Pareto front of {len(self.pareto())} points"
+        try:
+            best = self.best
+        except ValueError as error:
+            return f"best: {error}"
+        at = ", ".join(f"{address} = {value!r}" for address, value in best.parameters.items())
+        return f"best: {self.names[0]} = {best.value:g} at {at}"
+
+    # -- pictures and exports
+
+    def plot_history(self) -> Figure:
+        """Plot the values in the order of the study, and the best so far."""
+        from vtbdrake.visualization import study_plots
+
+        return study_plots.plot_history(self)
+
+    def plot_landscape(self, *addresses: str) -> Figure:
+        """Plot the quality over one or two parameters (Figure 6); the best value at each if there are more."""
+        from vtbdrake.visualization import study_plots
+
+        return study_plots.plot_landscape(self, *addresses)
+
+    def plot_slices(self) -> Figure:
+        """Plot the quality over every single parameter."""
+        from vtbdrake.visualization import study_plots
+
+        return study_plots.plot_slices(self)
+
+    def plot_importances(self) -> Figure:
+        """Plot how much each parameter decides about whether a point is good; needs the extra ``optuna``."""
+        from vtbdrake.visualization import study_plots
+
+        return study_plots.plot_importances(self)
+
+    def plot_pareto(self) -> Figure:
+        """Plot two qualities against each other, with the Pareto front."""
+        from vtbdrake.visualization import study_plots
+
+        return study_plots.plot_pareto(self)
+
+    def to_optuna(self, storage: str | BaseStorage, name: str) -> optuna.Study:
+        """Write the study into Optuna's storage, for ``optuna-dashboard <storage>``, Optuna's plots and importances.
+
+        Every point becomes a trial: complete; failed, if a simulation failed; or pruned, if racing dropped it. The
+        values, t*, ends and times of its rollouts are its user attributes; `record` is in those of the study. Writing
+        it again adds the new points.
 
         Args:
-            storage: an URL or a storage of Optuna's, see `to_optuna`.
+            storage: a URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
+            name: the name of the study there.
+
+        Raises:
+            ModuleNotFoundError: Optuna is not installed.
+            StudyError: the storage cannot be opened, or has another study of that name.
+        """
+        from vtbdrake.optimization.optuna_bridge import to_optuna
+
+        return to_optuna(self, storage, name=name)
+
+    def import_optuna(self, storage: str | BaseStorage, name: str) -> int:
+        """Give the points of a study in Optuna's storage, as `add` does, whether evaluated or only enqueued there.
+
+        They are evaluated by rollouts of this problem: a value from elsewhere tells nothing about it. Points that are
+        evaluated already, or wait in the queue, are left out, so that importing an export of `to_optuna` costs nothing.
+
+        Args:
+            storage: a URL or a storage of Optuna's, see `to_optuna`.
             name: of Optuna's study. Its parameters are named by their addresses.
 
         Returns:
@@ -288,8 +528,13 @@ class Study(StudyRecord):
         return len(points)
 
 
+def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Return whether signed values ``a`` are nowhere worse than ``b``, and somewhere better."""
+    return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
+
+
 def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None) -> Solver:
-    """The solver of a study, made for a budget of rollouts."""
+    """Return the solver of a study, made for a budget of rollouts."""
     budget = None if rollouts is None else -(-rollouts // len(problem.conditions))
     return make_solver(
         meta["solver"],

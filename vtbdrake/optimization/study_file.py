@@ -1,11 +1,11 @@
-"""A study on disk: one SQLite file with a write-ahead log, into which every finished rollout goes at once.
+"""A study on disk: one SQLite file with a write-ahead log, to which every finished rollout is written at once.
 
-Every row has a checksum. A file in which anything has changed that is not a study's own doing is damaged, and nothing
-is read from it.
+Every row has a checksum. A file that was changed by anything but a study is damaged, and nothing is read from it.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import sqlite3
@@ -13,16 +13,14 @@ import threading
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.optimization.outcome import Outcome
-from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_error import StudyError, damaged, explained
-from vtbdrake.optimization.study_lock import claim
-from vtbdrake.optimization.study_name import sqlite_name
+from vtbdrake.optimization.solvers.solver import Point, PointValues
+from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.task import QUALITY_FAILED
 
 VERSION = 2
@@ -34,31 +32,92 @@ _TABLES = {
     # A rollout is there once, whatever asked for it, and how often.
     "rollouts": "point TEXT, condition INTEGER, h REAL, value REAL, measures TEXT, t_star REAL, end TEXT, "
     "message TEXT, wall_time REAL, finished TEXT",
+    # Trials at positions below meta's ``first_position`` (0 if missing) were made by an earlier solver.
     "trials": "batch INTEGER, position INTEGER, point TEXT, trial_values TEXT, violations TEXT, exact INTEGER, "
     "origin TEXT, method TEXT",
     "gradients": "point TEXT PRIMARY KEY, gradient TEXT",
-    # Points given by hand; batch is that which they were judged with.
+    # Points given by hand; ``batch`` is NULL while they wait.
     "given": "number INTEGER PRIMARY KEY, point TEXT, batch INTEGER",
     "sessions": "number INTEGER PRIMARY KEY, started TEXT, ended TEXT, reason TEXT, versions TEXT, revision TEXT",
-    # What users say of a point; of the study, where the point is empty.
+    # The user's attributes of a point, or of the study if the point is empty.
     "attributes": "point TEXT, key TEXT, value TEXT",
 }
 _KEYS = {"rollouts": "point, condition", "trials": "batch, position", "attributes": "point, key"}
 _ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units"}
 
+# (point, number of the condition)
+RolloutKey = tuple[Point, int]
 
-# (batch, position, point, values, violations, exact, origin, method)
-TrialRow = tuple[int, int, Point, tuple[float, ...], tuple[float, ...], bool, str, str]
+
+class StudyError(ValueError):
+    """A study file that is no study, is damaged, of another version or of another problem, or cannot be used."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a study keeps of one finished rollout; the fields have the meaning of those of `RolloutResult`."""
+
+    h: float
+    value: float
+    measures: tuple[float, ...]
+    t_star: float
+    end: str
+    message: str
+    wall_time: float
+
+    @classmethod
+    def of(cls, result: RolloutResult) -> Outcome:
+        """Return what is kept of a result: everything but its trajectories."""
+        return cls(**{field.name: getattr(result, field.name) for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Trial(PointValues):
+    """A point s^0 of a study, and how good it is.
+
+    Attributes:
+        number: in the order of the study; counted by the study file.
+        parameters: the point, address -> value.
+        values: one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
+            simulation failed.
+        violations: one per constraint, the worst over the conditions: at most 0 where it holds.
+        exact: False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is
+            known but that the point violates a constraint.
+        origin: ``solver`` or ``user``, depending on who asked for the point.
+        method: the solver's method at that time.
+        batch: the number of the batch of points that were evaluated together.
+        attributes: the user's notes on the point, see `Study.set_attribute`.
+    """
+
+    parameters: Mapping[str, Any]
+    values: tuple[float, ...]
+    violations: tuple[float, ...]
+    exact: bool
+    origin: str
+    method: str
+    batch: int
+    number: int = 0
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def point(self) -> Point:
+        """The values of the parameters, in their order."""
+        return tuple(self.parameters.values())
+
+    @property
+    def value(self) -> float:
+        """The value of the first quality."""
+        return self.values[0]
 
 
 class StudyFile:
-    """The file of one study. Several processes may have it open; one of them may `run` it.
+    """The file of one study. Several processes may have it open; one of them may run the study.
 
-    One that exists can be read in a folder that cannot be written to as well, as long as nobody else runs it.
+    An existing file can also be read in a read-only folder, as long as no other process runs the study.
 
     Args:
         path: None keeps the study in memory.
-        meta: what a new study is about; None opens one that exists.
+        meta: what a new study is about; None opens an existing one.
 
     Raises:
         StudyError: there is none, it is damaged, or of another version.
@@ -67,44 +126,38 @@ class StudyFile:
     def __init__(self, path: str | os.PathLike[str] | None, *, meta: Mapping[str, Any] | None = None) -> None:
         self.path = None if path is None else Path(path)
         self._lock = threading.RLock()
-        if self.path is not None:
-            self._look(new=meta is not None)
-        with explained(self.path):
-            # Commits are explicit; the lock of this object keeps threads apart.
-            self._db = sqlite3.connect(
-                sqlite_name(self.path, new=meta is not None),
-                uri=True,
-                timeout=30.0,
-                isolation_level=None,
-                check_same_thread=False,
-            )
-        try:
-            with explained(self.path):
-                self._refuse_others(new=meta is not None)
-                if not self._is_empty():
-                    self._refuse_damage()
-                # A killed process loses nothing that was committed; a machine without power may lose the last rollouts.
-                self._db.execute("PRAGMA synchronous = NORMAL")
-                if meta is not None and self._is_empty():
-                    self._create(meta)
-        except BaseException:
-            self._db.close()
-            raise
-
-    def _look(self, *, new: bool) -> None:
-        assert self.path is not None
-        if not self.path.exists():
+        new = meta is not None
+        if self.path is not None and not self.path.exists():
             if not new:
                 raise StudyError(f"there is no study file {self.path}")
             if not self.path.parent.is_dir():
                 raise StudyError(f"{self.path} lies in a folder that does not exist")
+        with _explained(self.path):
+            # Commits are explicit; the lock of this object keeps threads apart.
+            self._db = sqlite3.connect(
+                _sqlite_name(self.path, new=new), uri=True, timeout=30.0, isolation_level=None, check_same_thread=False
+            )
+        try:
+            with _explained(self.path):
+                self._refuse_others(new=new)
+                if not self._is_empty():
+                    self._refuse_damage()
+                # A killed process loses nothing that was committed; a power failure may lose the last rollouts.
+                self._db.execute("PRAGMA synchronous = NORMAL")
+                if meta is not None and self._is_empty():
+                    self._create(meta)
+            self._addresses = [parameter["address"] for parameter in self.meta["problem"]["parameters"]]
+        except BaseException:
+            self._db.close()
+            raise
+        self._db.row_factory = sqlite3.Row
 
     def _is_empty(self) -> bool:
         (tables,) = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         return bool(tables == 0)
 
     def _refuse_others(self, *, new: bool) -> None:
-        """Refuse a file of another kind or version. It only reads: a file that is not ours stays as it is."""
+        """Refuse a file of another kind or version. It only reads, so that a file of others stays unchanged."""
         (application,) = self._db.execute("PRAGMA application_id").fetchone()
         (version,) = self._db.execute("PRAGMA user_version").fetchone()
         if application == 0 and self._is_empty():
@@ -122,29 +175,28 @@ class StudyFile:
     def _refuse_damage(self) -> None:
         (verdict,) = self._db.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
-            raise damaged(self.path, verdict)
+            raise _damaged(self.path, verdict)
         for table in _TABLES:
-            for _ in self._rows(table):
-                pass
+            self._rows(table)
         missing = sorted(_ABOUT - self.meta.keys())
         if missing:
-            raise damaged(self.path, f"it does not say the {', '.join(missing)}")
+            raise _damaged(self.path, f"it lacks the entries {', '.join(missing)}")
 
     def _create(self, meta: Mapping[str, Any]) -> None:
         self._db.execute("PRAGMA journal_mode = WAL")
         with self._transaction():
             if not self._is_empty():
-                return  # Another process has made it meanwhile.
+                return  # Another process has created it meanwhile.
             for table, columns in _TABLES.items():
                 key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
                 self._db.execute(f"CREATE TABLE {table} ({columns}, checksum INTEGER{key})")
-            self._insert("meta", [(key, json.dumps(value)) for key, value in meta.items()])
+            self._set(meta)
             self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._lock, explained(self.path):
+        with self._lock, _explained(self.path):
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -155,39 +207,45 @@ class StudyFile:
             self._db.execute("COMMIT")
 
     def _insert(self, table: str, rows: Iterable[tuple[Any, ...]], *, instead: str = "ABORT") -> None:
-        """Add rows with their checksums; ``instead`` is what SQLite does where there is a row of the same key."""
+        """Add rows with their checksums; ``instead`` is what SQLite does if there is a row of the same key."""
         sealed = [(*row, _checksum(table, row)) for row in rows]
         if sealed:
             marks = ", ".join("?" * len(sealed[0]))
             self._db.executemany(f"INSERT OR {instead} INTO {table} VALUES ({marks})", sealed)
 
-    def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of a table, checked and without their checksums; ``more`` says which, and in which order."""
-        with self._lock, explained(self.path):
+    def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> list[sqlite3.Row]:
+        """Return checked rows of a table; ``more`` says which, and in which order."""
+        with self._lock, _explained(self.path):
             found = self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall()
         for *row, checksum in found:
             if checksum != _checksum(table, row):
-                raise damaged(self.path, f"a row of {table} has changed")
-            yield tuple(row)
+                raise _damaged(self.path, f"a row of {table} has changed")
+        return found
 
-    def _next_number(self, table: str) -> int:
-        (last,) = self._db.execute(f"SELECT coalesce(max(number), 0) FROM {table}").fetchone()
-        return int(last) + 1
+    def _number(self, query: str, values: Sequence[Any] = ()) -> int:
+        """Return the single number that a query finds."""
+        with self._lock, _explained(self.path):
+            (number,) = self._db.execute(query, values).fetchone()
+        return int(number)
 
     def close(self) -> None:
+        """Close the file."""
         with self._lock:
             self._db.close()
 
     @contextmanager
     def running(self, *, versions: Mapping[str, str], revision: str) -> Iterator[list[str]]:
-        """Claim the file for this process, which runs the study. What it puts into the list is why the run ended.
+        """Claim the file for this process, which runs the study.
+
+        Yields:
+            A list, to which the reason why the run ended is appended.
 
         Raises:
-            StudyError: another process has it.
+            StudyError: another process has claimed it.
         """
-        with claim(self.path):
+        with _claim(self.path):
             with self._transaction():
-                begun = (self._next_number("sessions"), _now())
+                begun = (self._number("SELECT coalesce(max(number), 0) + 1 FROM sessions"), _now())
                 about = (json.dumps(dict(versions)), revision)
                 self._insert("sessions", [(*begun, None, None, *about)])
             reason: list[str] = []
@@ -205,15 +263,27 @@ class StudyFile:
     @property
     def meta(self) -> dict[str, Any]:
         """What the study is about: the problem, the solver, the seed and so on, by name."""
-        return {key: json.loads(value) for key, value in self._rows("meta")}
+        return {key: json.loads(value) for key, value, _ in self._rows("meta")}
 
-    def sessions(self) -> list[tuple[str, str | None, str | None, dict[str, str], str]]:
-        """(started, ended, why, versions, git revision) of every run; one that was killed has no end."""
-        rows = self._rows("sessions", "ORDER BY number")
-        return [(a, b, c, json.loads(d), e) for _, a, b, c, d, e in rows]
+    def set(self, key: str, value: Any) -> None:
+        """Set one entry of `meta`."""
+        with self._transaction():
+            self._set({key: value})
+
+    def _set(self, values: Mapping[str, Any]) -> None:
+        self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
+
+    def _get(self, key: str, default: int) -> int:
+        rows = self._rows("meta", "WHERE key = ?", (key,))
+        return int(json.loads(rows[0]["value"])) if rows else default
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """Return every run: started, ended and reason (None if it was killed), versions and git revision."""
+        rows = [dict(row) for row in self._rows("sessions", "ORDER BY number")]
+        return [{**row, "versions": json.loads(row["versions"])} for row in rows]
 
     def add(self, point: Point, condition: int, outcome: Outcome) -> None:
-        """Record a finished rollout, whole or not at all; one that is there already stays."""
+        """Record a finished rollout, whole or not at all; an existing one stays."""
         row = (
             encode(point),
             condition,
@@ -227,79 +297,72 @@ class StudyFile:
             _now(),
         )
         # One statement is a transaction by itself.
-        with self._lock, explained(self.path):
+        with self._lock, _explained(self.path):
             self._insert("rollouts", [row], instead="IGNORE")
 
-    def outcomes(self) -> dict[tuple[Point, int], Outcome]:
+    def outcomes(self) -> dict[RolloutKey, Outcome]:
         """Return all finished rollouts by (point, number of the condition)."""
         return {
             (decode(point), condition): Outcome(
-                _number(h), _number(value), tuple(json.loads(measures)), _number(t), end, message, _number(wall)
+                _float(h), _float(value), tuple(json.loads(measures)), _float(t_star), end, message, _float(wall_time)
             )
-            for point, condition, h, value, measures, t, end, message, wall, _ in self._rows(
+            for point, condition, h, value, measures, t_star, end, message, wall_time, *_ in self._rows(
                 "rollouts", "ORDER BY rowid"
             )
         }
 
-    def finished(self) -> dict[tuple[Point, int], datetime]:
+    def finished(self) -> dict[RolloutKey, datetime]:
         """Return when each rollout was finished, in UTC."""
-        return {(decode(row[0]), row[1]): datetime.fromisoformat(row[-1]) for row in self._rows("rollouts")}
+        rows = self._rows("rollouts")
+        return {(decode(row["point"]), row["condition"]): datetime.fromisoformat(row["finished"]) for row in rows}
 
     def count(self) -> int:
         """Return the number of finished rollouts."""
-        with self._lock, explained(self.path):
-            return int(self._db.execute("SELECT count(*) FROM rollouts").fetchone()[0])
-
-    def set(self, key: str, value: Any) -> None:
-        """Set one entry of `meta`."""
-        with self._transaction():
-            self._set({key: value})
-
-    def _set(self, values: Mapping[str, Any]) -> None:
-        self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
+        return self._number("SELECT count(*) FROM rollouts")
 
     def told(self) -> int:
         """Return the number of batches that the solver was told of."""
-        return int(self.meta.get("told", 0))
+        return self._get("told", 0)
 
-    def save_trials(self, rows: Sequence[TrialRow], *, told: int | None) -> None:
-        """Record judged points.
+    def save_trials(self, batch: int, trials: Mapping[int, Trial], *, complete: bool) -> None:
+        """Record trials of a batch, by their positions in it.
 
         Args:
-            rows: the points.
-            told: how many batches the solver has now been told of, the last of which these points are; what an earlier
-                run has left of that batch is replaced. None: the batch is not complete.
+            batch: the number of the batch.
+            trials: position -> trial.
+            complete: whether the solver was told of the batch. Then the trials replace all that an interrupted run has
+                recorded of it.
         """
-        encoded = [
-            (batch, position, encode(point), json.dumps(values), json.dumps(violations), int(exact), origin, method)
-            for batch, position, point, values, violations, exact, origin, method in rows
-        ]
         with self._transaction():
-            if told is not None:
-                # What was complete of this batch when a run ended in its midst.
-                self._db.execute("DELETE FROM trials WHERE batch = ? AND position >= 0", (told - 1,))
-            self._insert("trials", encoded, instead="REPLACE")
-            if told is not None:
-                self._set({"told": told})
+            first = self._get("first_position", 0)
+            if complete:
+                self._db.execute("DELETE FROM trials WHERE batch = ? AND position >= ?", (batch, first))
+                self._set({"told": batch + 1})
+            rows = [
+                (
+                    batch,
+                    first + position,
+                    encode(trial.point),
+                    json.dumps(trial.values),
+                    json.dumps(trial.violations),
+                    int(trial.exact),
+                    trial.origin,
+                    trial.method,
+                )
+                for position, trial in trials.items()
+            ]
+            self._insert("trials", rows, instead="REPLACE")
 
     def begin_anew(self, *, budget: int | None, racing: bool) -> None:
-        """Have a new solver told from the start: it is made for another budget of rollouts, or racing is another.
-
-        Trials so far stay, at positions below 0.
-        """
+        """Have a new solver told from the start, as the budget or the racing is another; trials so far stay."""
         with self._transaction():
             self._withdraw()
             self._set({"budget": budget, "racing": racing})
 
     def _withdraw(self) -> None:
-        """Note that no solver was told of the trials so far; they stay, at positions below 0."""
-        rows = list(self._rows("trials"))
-        if rows:
-            positions = [position for _, position, *_ in rows]
-            shift = max(positions) - min(positions) + 1
-            self._db.execute("DELETE FROM trials")
-            self._insert("trials", [(batch, position - shift, *rest) for batch, position, *rest in rows])
-        self._set({"told": 0})
+        """Mark all trials as those of an earlier solver."""
+        after = self._number("SELECT coalesce(max(position), 0) + 1 FROM trials")
+        self._set({"told": 0, "first_position": max(after, self._get("first_position", 0))})
 
     def change_code(
         self, problem: Mapping[str, Any], what: Sequence[str], *, versions: Mapping[str, str], revision: str
@@ -309,11 +372,10 @@ class StudyFile:
         Raises:
             StudyError: another process runs the study.
         """
-        with claim(self.path), self._transaction():
-            failed = {row[0] for row in self._rows("rollouts") if row[7].startswith(QUALITY_FAILED)}
+        with _claim(self.path), self._transaction():
+            failed = {row["point"] for row in self._rows("rollouts") if row["message"].startswith(QUALITY_FAILED)}
             self._db.execute("DELETE FROM gradients")
-            for point in failed:
-                self._db.execute("DELETE FROM trials WHERE point = ?", (point,))
+            self._db.executemany("DELETE FROM trials WHERE point = ?", [(point,) for point in failed])
             self._db.execute(
                 "DELETE FROM rollouts WHERE substr(message, 1, ?) = ?", (len(QUALITY_FAILED), QUALITY_FAILED)
             )
@@ -321,18 +383,43 @@ class StudyFile:
             change = {"at": _now(), "what": list(what), "versions": dict(versions), "revision": revision}
             self._set({"problem": problem, "changes": [*self.meta.get("changes", []), change]})
 
-    def trials(self) -> list[TrialRow]:
-        """Return all judged points, in the order of the study."""
-        return [_trial(row) for row in self._rows("trials", "ORDER BY batch, position")]
+    def trials(self) -> list[Trial]:
+        """Return all trials in the order of the study."""
+        return self._trials(self._rows("trials", "ORDER BY batch, position"), first=0)
 
-    def trials_of(self, batch: int) -> tuple[int, list[TrialRow]]:
-        """Return the number of the first trial of a batch among all trials, and the trials of that batch."""
-        rows = self._rows("trials", "WHERE batch = ? AND position >= 0 ORDER BY position", (batch,))
-        with self._lock, explained(self.path):
-            (before,) = self._db.execute(
-                "SELECT count(*) FROM trials WHERE batch < ? OR (batch = ? AND position < 0)", (batch, batch)
-            ).fetchone()
-        return before, [_trial(row) for row in rows]
+    def earlier_trials(self) -> list[Trial]:
+        """Return the trials of earlier solvers, which were made for another budget or another code."""
+        first = self._get("first_position", 0)
+        return self._trials(self._rows("trials", "WHERE position < ? ORDER BY batch, position", (first,)), first=0)
+
+    def trials_of(self, batch: int) -> list[Trial]:
+        """Return the trials of a batch that the present solver asked for."""
+        first = self._get("first_position", 0)
+        rows = self._rows("trials", "WHERE batch = ? AND position >= ? ORDER BY position", (batch, first))
+        query = "SELECT count(*) FROM trials WHERE batch < ? OR (batch = ? AND position < ?)"
+        return self._trials(rows, first=self._number(query, (batch, batch, first)))
+
+    def _trials(self, rows: Sequence[sqlite3.Row], *, first: int) -> list[Trial]:
+        """Return trials, the first of which has the number ``first``."""
+        attributes = self.attributes()
+        points = [decode(row["point"]) for row in rows]
+        return [
+            Trial(
+                parameters=self._by_address(point),
+                values=tuple(json.loads(row["trial_values"])),
+                violations=tuple(json.loads(row["violations"])),
+                exact=bool(row["exact"]),
+                origin=row["origin"],
+                method=row["method"],
+                batch=row["batch"],
+                number=number,
+                attributes=dict(attributes.get(point, {})),
+            )
+            for number, (point, row) in enumerate(zip(points, rows, strict=True), first)
+        ]
+
+    def _by_address(self, point: Point) -> dict[str, Any]:
+        return dict(zip(self._addresses, point, strict=True))
 
     def add_gradient(self, point: Point, gradient: Sequence[float]) -> None:
         """Record the gradient at a point."""
@@ -341,41 +428,41 @@ class StudyFile:
 
     def gradients(self) -> dict[Point, tuple[float, ...]]:
         """Return all gradients by point."""
-        return {decode(point): tuple(json.loads(gradient)) for point, gradient in self._rows("gradients")}
+        return {decode(point): tuple(json.loads(gradient)) for point, gradient, _ in self._rows("gradients")}
 
     # -- points given by hand
 
     def give(self, points: Sequence[Point]) -> None:
-        """Put points into the queue, to be judged with the next batch."""
+        """Put points into the queue, to be evaluated with the next batch."""
         with self._transaction():
-            first = self._next_number("given")
+            first = self._number("SELECT coalesce(max(number), 0) + 1 FROM given")
             self._insert("given", [(first + k, encode(point), None) for k, point in enumerate(points)])
 
     def take(self, batch: int, *, new: bool) -> list[Point]:
-        """Return the points given by hand that belong to a batch; with ``new``, those in the queue join it first."""
-        if new and self.queue():
+        """Return the points given by hand that belong to a batch; with ``new``, the queue joins the batch first."""
+        if new and self._rows("given", "WHERE batch IS NULL"):
             with self._transaction():
-                waiting = [(number, point, batch) for number, point, _ in self._rows("given", "WHERE batch IS NULL")]
+                waiting = [(number, point, batch) for number, point, *_ in self._rows("given", "WHERE batch IS NULL")]
                 self._insert("given", waiting, instead="REPLACE")
-        rows = self._rows("given", "WHERE batch = ? ORDER BY number", (batch,))
-        return [decode(point) for _, point, _ in rows]
+        return [decode(row["point"]) for row in self._rows("given", "WHERE batch = ? ORDER BY number", (batch,))]
 
-    def queue(self) -> dict[int, Point]:
-        """Return the points given by hand that wait to be judged, by their numbers."""
+    def queue(self) -> dict[int, dict[str, Any]]:
+        """Return the points that wait to be evaluated: number -> the point, address -> value."""
         rows = self._rows("given", "WHERE batch IS NULL ORDER BY number")
-        return {number: decode(point) for number, point, _ in rows}
+        return {row["number"]: self._by_address(decode(row["point"])) for row in rows}
 
     def change_queue(self, number: int, point: Point | None) -> None:
-        """Put another point in the place of one that waits, or none.
+        """Replace a point of the queue, or remove it if ``point`` is None.
 
         Raises:
-            StudyError: none of that number waits.
+            StudyError: no point of that number waits.
         """
         with self._transaction():
-            if not list(self._rows("given", "WHERE number = ? AND batch IS NULL", (number,))):
-                waiting = [str(other) for other in self.queue()]
-                which = f"{', '.join(waiting)} do" if len(waiting) > 1 else f"{''.join(waiting) or 'none'} does"
-                raise StudyError(f"no point {number} waits to be judged in {self.path or 'the study'}; {which}")
+            if not self._rows("given", "WHERE number = ? AND batch IS NULL", (number,)):
+                waiting = ", ".join(str(other) for other in self.queue()) or "none"
+                raise StudyError(
+                    f"no point {number} waits to be evaluated in {self.path or 'the study'}; the queue has: {waiting}"
+                )
             if point is None:
                 self._db.execute("DELETE FROM given WHERE number = ?", (number,))
             else:
@@ -384,7 +471,7 @@ class StudyFile:
     # -- attributes
 
     def set_attribute(self, point: Point | None, key: str, value: Any) -> None:
-        """Set an attribute of a point, or of the study."""
+        """Set an attribute of a point, or of the study if ``point`` is None."""
         with self._transaction():
             row = ("" if point is None else encode(point), key, json.dumps(value))
             self._insert("attributes", [row], instead="REPLACE")
@@ -392,15 +479,9 @@ class StudyFile:
     def attributes(self) -> dict[Point | None, dict[str, Any]]:
         """Return all attributes by point; those of the study under None."""
         found: dict[Point | None, dict[str, Any]] = {}
-        for point, key, value in self._rows("attributes", "ORDER BY rowid"):
+        for point, key, value, _ in self._rows("attributes", "ORDER BY rowid"):
             found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return found
-
-
-def _trial(row: tuple[Any, ...]) -> TrialRow:
-    batch, position, point, values, violations, exact, origin, method = row
-    numbers = tuple(json.loads(values)), tuple(json.loads(violations))
-    return batch, position, decode(point), *numbers, bool(exact), origin, method
 
 
 def _checksum(table: str, row: Sequence[Any]) -> int:
@@ -426,6 +507,77 @@ def _real(value: float) -> float | None:
     return None if isnan(value) else float(value)
 
 
-def _number(value: float | None) -> float:
-    """Return a number of SQLite, the inverse of `_real`."""
-    return float("nan") if value is None else value
+def _float(value: float | None) -> float:
+    """Return a number of SQLite as a float, the inverse of `_real`."""
+    return nan if value is None else value
+
+
+def _sqlite_name(path: Path | None, *, new: bool) -> str:
+    """Return the name for ``sqlite3.connect(..., uri=True)``; None is a database in memory."""
+    if path is None:
+        return ":memory:"
+    path = path.absolute()
+    beside = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
+    unfinished = any(log.exists() and log.stat().st_size > 0 for log in beside)
+    if new or unfinished or os.access(path.parent, os.W_OK, effective_ids=True):
+        return str(path)
+    # SQLite creates files beside one with a write-ahead log even to read it, unless it is told that nobody writes.
+    return f"{path.as_uri()}?immutable=1"
+
+
+@contextmanager
+def _claim(path: Path | None) -> Iterator[None]:
+    """Hold the lock of a study; the system releases it when the process dies.
+
+    The lock is a file of its own: closing any handle of the study itself would release SQLite's locks on it.
+    """
+    if path is None:
+        yield
+        return
+    lock = path.with_name(path.name + "-lock")
+    while True:
+        try:
+            handle = os.open(lock, os.O_CREAT | os.O_RDWR)
+        except OSError as error:
+            raise StudyError(f"the study {path} cannot be run, as its lock cannot be created: {error}") from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(handle)
+            raise StudyError(
+                f"the study {path} is being run by another process: wait for it, or give points to it with `add`"
+            ) from error
+        try:
+            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                break
+        except FileNotFoundError:
+            pass
+        os.close(handle)  # Its former owner has removed the file meanwhile.
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _damaged(path: Path | None, reason: object) -> StudyError:
+    return StudyError(f"{path} cannot be read ({reason}); it was left unchanged: restore it from a copy")
+
+
+@contextmanager
+def _explained(path: Path | None) -> Iterator[None]:
+    """Raise the errors of SQLite as `StudyError`."""
+    try:
+        yield
+    except sqlite3.ProgrammingError as error:
+        raise StudyError(f"the study {path} is closed ({error}): open it again") from error
+    except sqlite3.OperationalError as error:
+        # SQL that SQLite does not understand, or text that it cannot decode, is a sign of damage.
+        if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) == sqlite3.SQLITE_ERROR:
+            raise _damaged(path, error) from error
+        raise StudyError(
+            f"{path} cannot be used ({error}); what was recorded is kept: check the free space of its disk, and the "
+            "permissions of the file and its folder"
+        ) from error
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+        raise _damaged(path, error) from error

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.optimization.boundary import Boundary, boundary_of, why_no_boundary
-from vtbdrake.optimization.outcome import aggregate
 from vtbdrake.optimization.parameter import Parameter
-from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
+from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.arguments import all_of, as_whole

@@ -20,12 +20,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.tri import Triangulation
 
-from vtbdrake.optimization.outcome import Trial
+from vtbdrake.optimization import Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.visualization.plots import FAILED, Picture, draw_mesh, finish, label, mark_best
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization.study_record import StudyRecord
+    from vtbdrake.optimization.study import Study
 
 BEST = "#d6604d"
 _BROKEN = "0.45"
@@ -49,7 +49,7 @@ class Points:
     failed: tuple[Trial, ...]
 
     @classmethod
-    def of(cls, study: StudyRecord) -> Points:
+    def of(cls, study: Study) -> Points:
         """Group the points of a study.
 
         Raises:
@@ -85,7 +85,7 @@ class Points:
         )
         return Points(kept, broken, dropped, failed)
 
-    def best(self, study: StudyRecord, quality: int) -> Trial | None:
+    def best(self, study: Study, quality: int) -> Trial | None:
         """Return the best point in one quality; None if no point keeps the constraints."""
         sign = study.signs[quality]
         return max(self.kept, key=lambda trial: sign * trial.values[quality], default=None)
@@ -105,13 +105,13 @@ def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
     return np.array([trial.values[quality] for trial in trials], dtype=float)
 
 
-def name(study: StudyRecord, quality: int) -> str:
+def name(study: Study, quality: int) -> str:
     """Return the name of a quality; h if its function has none."""
     found = study.names[quality]
     return found if found.isidentifier() else "h(s⁰)"
 
 
-def quality_label(study: StudyRecord, quality: int) -> str:
+def quality_label(study: Study, quality: int) -> str:
     """Return an axis label such as ``energy (cost, worst of 5 conditions)``."""
     described = study.record["problem"]
     conditions = len(described["conditions"])
@@ -167,14 +167,14 @@ def _wrapped(text: str, width: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def scales(study: StudyRecord) -> dict[str, Scale]:
+def scales(study: Study) -> dict[str, Scale]:
     """Return the axis of each parameter, by address."""
     return {p.address: Scale(p, unit) for p, unit in zip(study.parameters, study.units, strict=True)}
 
 
 def draw_points(
     axes: Axes,
-    study: StudyRecord,
+    study: Study,
     points: Points,
     x: Callable[[Sequence[Trial]], np.ndarray],
     *,
@@ -248,13 +248,13 @@ def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]
     return _keys(marks)
 
 
-def point_keys(study: StudyRecord, points: Points) -> list[Line2D]:
+def point_keys(study: Study, points: Points) -> list[Line2D]:
     """Return the legend entries of the marks that `draw_points` makes."""
     dropped = "dropped by racing: no better than this", _dropped_style(study, 0)
     return _keys(_marks(points, broken=BROKEN_STYLE, dropped=dropped))
 
 
-def _dropped_style(study: StudyRecord, quality: int) -> dict[str, Any]:
+def _dropped_style(study: Study, quality: int) -> dict[str, Any]:
     # It points to where the value may be.
     return {**_DROPPED_STYLE, "marker": "v" if study.signs[quality] > 0.0 else "^"}
 
@@ -278,7 +278,7 @@ _SINGLE = "#2166ac"
 _LEVELS = 12
 
 
-def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
+def plot_landscape(study: Study, *addresses: str) -> Figure:
     """Plot every quality over one or two parameters; if others vary too, the best value at each place.
 
     Over two: an image where the points fill a grid; else filled contours between the points if nothing but these two
@@ -313,7 +313,7 @@ def plot_landscape(study: StudyRecord, *addresses: str) -> Figure:
 
 
 def draw_slice(
-    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
+    axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, width: int = 60, **style: Any
 ) -> None:
     """Draw one quality over one parameter, with the best point.
 
@@ -329,9 +329,7 @@ def draw_slice(
     finish(axes)
 
 
-def _draw_line(
-    axes: Axes, study: StudyRecord, points: Points, scale: Scale, *, quality: int, others: int
-) -> list[Artist]:
+def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, others: int) -> list[Artist]:
     """Draw the values and return legend entries."""
     draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
     axes.set_ylabel(quality_label(study, quality))
@@ -355,7 +353,7 @@ def _draw_line(
 
 
 def _draw_surface(
-    axes: Axes, study: StudyRecord, points: Points, x: Scale, y: Scale, *, quality: int, others: int
+    axes: Axes, study: Study, points: Points, x: Scale, y: Scale, *, quality: int, others: int
 ) -> list[Artist]:
     """Draw the values and return legend entries."""
     sign = study.signs[quality]
@@ -411,7 +409,7 @@ def _spans_a_plane(unit: np.ndarray) -> bool:
 
 
 def _legend_with_best(
-    axes: Axes, study: StudyRecord, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
+    axes: Axes, study: Study, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
 ) -> None:
     best = points.best(study, quality)
     if best is not None:
@@ -437,7 +435,7 @@ _PER_ROW = 4
 _ORDER_LABEL = "point, in the order of the study"
 
 
-def plot_history(study: StudyRecord) -> Figure:
+def plot_history(study: Study) -> Figure:
     """Plot every quality in the order of the points, coloured by solver, with the best value so far.
 
     Raises:
@@ -485,7 +483,7 @@ def plot_history(study: StudyRecord) -> Figure:
     return figure
 
 
-def plot_slices(study: StudyRecord) -> Figure:
+def plot_slices(study: Study) -> Figure:
     """Plot every quality over every parameter, coloured by the order of the points; the best point is a star.
 
     Raises:
@@ -518,7 +516,7 @@ def plot_slices(study: StudyRecord) -> Figure:
     return figure
 
 
-def plot_importances(study: StudyRecord) -> Figure:
+def plot_importances(study: Study) -> Figure:
     """Plot how much each parameter decides whether a point is among the best tenth, for every quality.
 
     See `vtbdrake.optimization.optuna_bridge.importances`.
@@ -548,7 +546,7 @@ def plot_importances(study: StudyRecord) -> Figure:
     return figure
 
 
-def plot_pareto(study: StudyRecord) -> Figure:
+def plot_pareto(study: Study) -> Figure:
     """Plot two qualities against each other with the Pareto front; of three qualities, every pair.
 
     Raises:
@@ -592,7 +590,7 @@ def plot_pareto(study: StudyRecord) -> Figure:
     return figure
 
 
-def _draw_pair(axes: Axes, study: StudyRecord, points: Points, pair: tuple[int, int]) -> None:
+def _draw_pair(axes: Axes, study: Study, points: Points, pair: tuple[int, int]) -> None:
     i, j = pair
     axes.scatter(values(points.kept, i), values(points.kept, j), s=22, color=_BARS, alpha=0.6, linewidths=0, gid="kept")
     axes.plot(values(points.broken, i), values(points.broken, j), gid="broken", **BROKEN_STYLE)

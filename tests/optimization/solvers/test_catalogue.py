@@ -13,7 +13,7 @@ from pydrake.solvers import MathematicalProgram, NloptSolver, SolverOptions
 from tests.optimization.solvers.driver import ACKLEY, ROSENBROCK, SPHERE, box, drive, evaluation
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import SolverError, known_solvers, make_solver
-from vtbdrake.optimization.solvers.nlopt_algorithms import DERIVATIVE_FREE, WITH_DERIVATIVES
+from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS
 
 COUNT = Parameter("count", 1, 6, integer=True)
 KIND = Choice("kind", ["up", "down"])
@@ -63,9 +63,9 @@ def test_an_unknown_option_is_never_ignored():
         ("LN_BOBYQA", {"space": [KIND]}, "LN_BOBYQA varies numbers, but kind is one of .*; TPE or grid"),
         ("CMA-ES", {"space": [X, KIND]}, "CMA-ES varies numbers, but kind"),
         ("IPOPT", {"objectives": 2}, "IPOPT takes one objective, not 2; NSGA-II"),
-        ("LN_BOBYQA", {"constraints": 1}, "LN_BOBYQA knows no constraints, and there are 1; CMA-ES"),
-        ("LD_MMA", {"constraints": 1}, "LD_MMA knows no constraints"),
-        ("QMC", {"constraints": 2}, "QMC knows no constraints"),
+        ("LN_BOBYQA", {"constraints": 1}, "LN_BOBYQA takes no constraints, and there are 1; CMA-ES"),
+        ("LD_MMA", {"constraints": 1}, "LD_MMA takes no constraints"),
+        ("QMC", {"constraints": 2}, "QMC takes no constraints"),
         ("LN_PRAXIS", {}, "LN_PRAXIS needs at least two parameters, and there is one; LN_COBYLA can do that"),
         ("LN_NEWUOA", {}, "at least two parameters"),
         ("bayesian", {"batch": 0}, "batch is a number of points, at least one, not 0"),
@@ -114,7 +114,7 @@ def test_every_algorithm_that_drake_lists_is_offered_or_known_to_be_of_no_use():
     listed = set(re.findall(r"\b[A-Z][A-Z0-9_]+", str(caught.value).split("valid choices are:")[1]))
     useless = {"AUGLAG", "AUGLAG_EQ", "G_MLSL", "G_MLSL_LDS", "LN_NEWUOA_BOUND", "GN_ORIG_DIRECT", "GN_ORIG_DIRECT_L"}
     useless |= {name for name in listed if re.search("LD_(LBFGS|VAR|TNEWTON)", name)}
-    assert set(DERIVATIVE_FREE) | set(WITH_DERIVATIVES) == listed - useless
+    assert set(ALGORITHMS) == listed - useless
 
 
 def test_optuna_is_silenced_for_itself_only():

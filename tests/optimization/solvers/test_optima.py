@@ -18,13 +18,7 @@ from tests.optimization.solvers.driver import (
 )
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import make_solver
-from vtbdrake.optimization.solvers.nlopt_algorithms import (
-    DERIVATIVE_FREE,
-    SEEDED_BY_CLOCK,
-    UNTIL_LIMIT,
-    WITH_CONSTRAINTS,
-    WITH_DERIVATIVES,
-)
+from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS
 
 pytestmark = pytest.mark.usefixtures("short_model")
 
@@ -41,10 +35,10 @@ def test_it_converges_to_the_minimum_of_a_valley(name, function):
     assert -best.values[0] == pytest.approx(0.0, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", [name for name in (*DERIVATIVE_FREE, *WITH_DERIVATIVES) if name not in UNTIL_LIMIT])
+@pytest.mark.parametrize("name", [name for name, algorithm in ALGORITHMS.items() if not algorithm.until_limit])
 def test_every_algorithm_of_nlopt_comes_near_the_minimum(name):
     solver, best = solve(name, SPHERE, limit=1500)
-    np.testing.assert_allclose(best.point, SPHERE.best, atol=0.5 if name in SEEDED_BY_CLOCK else 0.05)
+    np.testing.assert_allclose(best.point, SPHERE.best, atol=0.5 if ALGORITHMS[name].clock else 0.05)
 
 
 @pytest.mark.parametrize("name", ["auto", "differential-evolution"])
@@ -60,9 +54,10 @@ def test_global_solvers_find_the_value_of_branin(name):
     assert -best.values[0] == pytest.approx(BRANIN.lowest, abs=0.1 if name == "TPE" else 2e-3)
 
 
-@pytest.mark.parametrize(
-    "name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *sorted(WITH_CONSTRAINTS)]
-)
+CONSTRAINED_NLOPT = sorted(name for name, algorithm in ALGORITHMS.items() if algorithm.constraints)
+
+
+@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *CONSTRAINED_NLOPT])
 def test_under_a_constraint_it_finds_the_kkt_point_and_keeps_the_constraint(name):
     options = {"tolerance": 1e-5} if name == "differential-evolution" else {}
     solver, best = solve(name, CONSTRAINED, violations=half_plane, limit=4000, **options)

@@ -14,7 +14,7 @@ from tests.optimization.solvers.driver import CONSTRAINED, ROSENBROCK, SPHERE, d
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import Evaluation, Solver, SolverError, known_solvers, make_solver
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
-from vtbdrake.optimization.solvers.search import Search
+from vtbdrake.optimization.solvers.solver import Search
 
 INSTALLED = [name for name in known_solvers() if name != "GP" or importlib.util.find_spec("torch")]
 REPRODUCIBLE = [name for name in INSTALLED if make_solver(name, SPHERE.space).reproducible]
@@ -301,7 +301,7 @@ def test_a_program_ends_although_a_method_never_returns():
         "from vtbdrake.optimization.solvers import Evaluation\n"
         "from vtbdrake.optimization.parameter import Parameter\n"
         "from vtbdrake.optimization.solvers.blocking import BlockingSolver\n"
-        "from vtbdrake.optimization.solvers.search import Search\n"
+        "from vtbdrake.optimization.solvers.solver import Search\n"
         "class Stuck(BlockingSolver):\n"
         "    grace = 0.05\n"
         "    def _solve(self):\n"
@@ -324,7 +324,7 @@ def test_a_method_that_goes_round_in_circles_is_ended():
     solver = Circling(Search(SPHERE.space), name="circling")
     log = drive(solver, SPHERE.cost)
     assert len(log) == 1
-    assert (solver.success, solver.message) == (False, "it called 10000 times in a row for points that it knew")
+    assert (solver.success, solver.message) == (False, "it asked 10000 times in a row for known points only")
 
 
 def test_an_exception_of_any_kind_reaches_ask_as_itself():

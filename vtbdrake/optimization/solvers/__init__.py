@@ -1,6 +1,96 @@
 """Solvers of problem (18), behind one interface: ask for points, and be told how good they are."""
 
-from vtbdrake.optimization.solvers.catalogue import known_solvers, make_solver
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, SolverError
+from __future__ import annotations
 
-__all__ = ["Evaluation", "Point", "Solver", "SolverError", "known_solvers", "make_solver"]
+import difflib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.solvers.auto import Auto
+from vtbdrake.optimization.solvers.bayesian import Bayesian
+from vtbdrake.optimization.solvers.designs import Grid, LatinHypercube, RandomSearch, Sobol
+from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS, Ipopt, Nlopt, Snopt
+from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution
+from vtbdrake.optimization.solvers.optuna_samplers import SAMPLERS, OptunaSolver
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
+
+__all__ = ["CATALOGUE", "Evaluation", "Point", "Solver", "SolverError", "known_solvers", "make_solver"]
+
+# All solvers by their names.
+CATALOGUE: Mapping[str, Callable[..., Solver]] = {
+    "auto": Auto,
+    "grid": Grid,
+    "sobol": Sobol,
+    "latin-hypercube": LatinHypercube,
+    "random": RandomSearch,
+    "bayesian": Bayesian,
+    "CMA-ES": CmaEs,
+    "differential-evolution": DifferentialEvolution,
+    **dict.fromkeys(SAMPLERS, OptunaSolver),
+    "SNOPT": Snopt,
+    "IPOPT": Ipopt,
+    **dict.fromkeys(ALGORITHMS, Nlopt),
+}
+
+
+def known_solvers() -> tuple[str, ...]:
+    """Return the names that `make_solver` takes; case and punctuation do not matter (CMA-ES, cmaes, cma_es)."""
+    return tuple(CATALOGUE)
+
+
+def make_solver(
+    name: str,
+    space: Sequence[Dimension],
+    *,
+    objectives: int = 1,
+    constraints: int = 0,
+    seed: int = 0,
+    budget: int | None = None,
+    start: Point | None = None,
+    **options: Any,
+) -> Solver:
+    """Return a solver for a problem.
+
+    Args:
+        name: one of `known_solvers`.
+        space: the parameters.
+        objectives: how many values an evaluation has.
+        constraints: how many violations an evaluation has.
+        seed: of the solver's random numbers, in [0, 2^32).
+        budget: how many evaluations it may ask for; None: until it ends by itself, if it does.
+        start: where a local method starts; None: in the middle of the ranges.
+        options: of the solver, as its class says.
+
+    Raises:
+        SolverError: there is no such solver or option, or the solver cannot solve such a problem.
+        ModuleNotFoundError: the solver needs a package that is not installed.
+    """
+    canonical = _find(name)
+    factory = CATALOGUE[canonical]
+    allowed = [option for option in inspect.signature(factory).parameters if option not in ("search", "name")]
+    for option in options:
+        if option not in allowed:
+            near = difflib.get_close_matches(option, allowed, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise SolverError(f"{canonical} has no option {option!r}{hint}; it has {allowed}")
+    search = Search(
+        space=tuple(space), objectives=objectives, constraints=constraints, seed=seed, budget=budget, start=start
+    )
+    return factory(search, name=canonical, **options)
+
+
+def _find(name: str) -> str:
+    if not isinstance(name, str):
+        raise SolverError(f"a solver is given by its name, one of {', '.join(CATALOGUE)}, not by {name!r}")
+    names = {_plain(known): known for known in CATALOGUE}
+    if _plain(name) in names:
+        return names[_plain(name)]
+    near = difflib.get_close_matches(_plain(name), names, n=1, cutoff=0.5)
+    hint = f"; did you mean {names[near[0]]!r}?" if near else ""
+    raise SolverError(f"there is no solver {name!r}{hint} Known are: {', '.join(CATALOGUE)}")
+
+
+def _plain(name: str) -> str:
+    return "".join(character for character in name.lower() if character.isalnum())

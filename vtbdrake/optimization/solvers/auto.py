@@ -1,4 +1,4 @@
-"""The default: a solver chosen from the problem, and changed when it makes no more progress."""
+"""The default solver: it chooses its methods by the problem, and changes them when they make no more progress."""
 
 from __future__ import annotations
 
@@ -9,34 +9,30 @@ from dataclasses import replace
 import numpy as np
 
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
-from vtbdrake.optimization.solvers.batch import BatchSolver
 from vtbdrake.optimization.solvers.bayesian import Bayesian
-from vtbdrake.optimization.solvers.cmaes_solver import CmaEs, default_population
 from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
-from vtbdrake.optimization.solvers.drake_solvers import NloptDerivativeFree
-from vtbdrake.optimization.solvers.ranking import best_of, rank_key
-from vtbdrake.optimization.solvers.scipy_solvers import DifferentialEvolution
-from vtbdrake.optimization.solvers.search import SEEDS, Search
-from vtbdrake.optimization.solvers.solver import Evaluation, Point
+from vtbdrake.optimization.solvers.drake_solvers import Nlopt
+from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution, default_population
+from vtbdrake.optimization.solvers.solver import SEEDS, Evaluation, Point, Search, Solver, best_of, rank_key
 
 MODEL = "bayesian"
 
-# Where all parameters are whole or categorical, and there is no budget: up to so many points are all tried.
+# Without a budget, whole and categorical parameters with up to this many combinations are searched exhaustively.
 EXHAUSTIVE = 256
 # A change of the best value is progress if it exceeds this part of the spread of the values found by the model.
 PROGRESS = 1e-6
-# So many methods in a row without progress are an end.
+# The solver ends after this many starts in a row without progress.
 PATIENCE = 5
-# A Gaussian process of more parameters is no help, and a quadratic model of more is not cheap any more.
+# A Gaussian process helps with up to this many parameters; beyond, a quadratic model is expensive, too.
 MODEL_SIZE = 20
-# The model takes so many points for each parameter and one more, and so many at most.
+# Points of the model: per parameter and one more, and in all.
 MODEL_POINTS, MODEL_LIMIT = 25, 120
-# A local search runs in a box around the best point, so many of the ranges to each side: after the model, and last.
+# Half widths of the boxes of local searches, as parts of the ranges: after the model, and last.
 LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
 
 
-class Auto(BatchSolver):
-    """Chooses by the problem:
+class Auto(Solver):
+    """A solver that chooses its methods by the problem:
 
     * whole and categorical parameters only, with no more combinations than the budget (256 without one), and one
       objective: a grid;
@@ -46,23 +42,17 @@ class Auto(BatchSolver):
       generations of it are left, what is left goes to Bayesian optimization instead;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
-    So the first points, which matter most where rollouts are expensive, are chosen with care, and thousands of points
-    are chosen quickly. Bayesian optimization asks for 4 points at a time; with less than 100 evaluations in all, for
-    fewer.
+    Bayesian optimization asks for 4 points at a time; with less than 100 evaluations in all, for fewer.
 
     CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
-    Then it starts anew at a random point with twice the population (IPOP); every third start is differential evolution,
-    since no global method alone is reliable. Five starts in a row that do not improve the best value by as much are the
-    end, with success. Last, if the best point is better than that of the model, a tenth of the budget at most goes into
-    another local search, and what is left then into Bayesian optimization.
+    Then it starts anew at a random point with twice the population (IPOP); every third start is differential evolution.
+    After five starts in a row without such an improvement the solver ends, with success. Last, if the best point is
+    better than that of the model, a tenth of the budget at most goes into another local search, and the rest into
+    Bayesian optimization.
 
     The local searches (BOBYQA, or COBYLA with constraints or one continuous parameter) stay in a box around the best
-    point and hold its integers. They take place with at most 20 parameters of which at least one is continuous.
-
-    Args:
-        search: what is searched.
-        name: in the catalogue.
+    point and hold its integers. They need at most 20 parameters, of which at least one is continuous.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
     """
@@ -74,14 +64,14 @@ class Auto(BatchSolver):
         self._count = 0
         self._method = ""
         self._changes: list[tuple[int, str]] = []
-        self._solver: BatchSolver
+        self._solver: Solver
         self._patience = math.inf
         self._limit = math.inf
-        # The best point that a local search began from: its integers are not varied.
+        # The start of a local search, whose integers are held.
         self._held: Point | None = None
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
-        # What was told before the model began.
+        # The evaluations of the first stages: what a new model is told.
         self._before: list[Evaluation] = []
         self._plan = self._stages()
         next(self._plan)
@@ -92,13 +82,13 @@ class Auto(BatchSolver):
 
     @property
     def changes(self) -> tuple[tuple[int, str], ...]:
-        """The methods in their order, each with the number of evaluations asked for before it began."""
+        """The methods used so far, each with the number of evaluations asked for before it began."""
         return tuple(self._changes)
 
-    # ------------------------------------------------------------------------------ the plan
+    # -- the plan
 
     def _stages(self) -> Iterator[None]:
-        """Each stage begins a method; the caller comes back when that has ended or stalled."""
+        """Yield once per method; the caller resumes when that has ended or stalled."""
         search = self.search
         discrete = not any(parameter.is_continuous for parameter in search.space)
         if search.objectives == 1 and discrete and discrete_size(search.space) <= (search.budget or EXHAUSTIVE):
@@ -107,14 +97,14 @@ class Auto(BatchSolver):
             return self._one(MODEL, Bayesian(search, name=MODEL, batch=self._batch))
         return self._global_stages()
 
-    def _one(self, method: str, solver: BatchSolver) -> Iterator[None]:
+    def _one(self, method: str, solver: Solver) -> Iterator[None]:
         self._begin(method, solver)
         yield
         self._end(bool(solver.success), solver.message)
 
     @property
     def _batch(self) -> int:
-        """How many points the model asks for at a time: one where there are few, so that it learns from each."""
+        """The number of points that the model asks for at a time; one if there are few, so that it learns from each."""
         return 4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4)
 
     def _global_stages(self) -> Iterator[None]:
@@ -141,14 +131,13 @@ class Auto(BatchSolver):
         if fruitless == PATIENCE:
             self._end(True, f"{PATIENCE} starts in a row found nothing better")
             return
-        # The last local search did not take place, or has converged.
         while self._left:
             self._begin_model()
             yield
         self._spent()
 
     def _begin_model(self) -> None:
-        """The Gaussian process, or of many parameters a design."""
+        """Begin the Gaussian process, or for many parameters a design."""
         search, size, left = self.search, self.search.size, math.inf if self._left is None else self._left
         if size > MODEL_SIZE:
             points = int(min(2 * (size + 1), max(1, left // 2)))
@@ -158,14 +147,14 @@ class Auto(BatchSolver):
         if left < points + 10 * default_population(size):
             points = int(left)
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
-        # They took from the budget already.
+        # These evaluations are charged already.
         known = [*self._before, *([] if self._best is None else [self._best])]
         model.tell([replace(evaluation, effort=0.0) for evaluation in known])
-        # With racing, the budget may allow for many more points.
+        # With racing, the budget may allow many more points: the number of points is limited, too.
         self._begin(MODEL, model, limit=points)
 
     def _begin_global(self, start: int) -> None:
-        """The start-th global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
+        """Begin a global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
         left = self._left_but_polish()
         search = replace(
             self.search,
@@ -198,23 +187,23 @@ class Auto(BatchSolver):
 
     @property
     def _continuous(self) -> list[int]:
-        """Which parameters are continuous, by their places."""
+        """The indices of the continuous parameters."""
         return [i for i, parameter in enumerate(self.search.space) if parameter.is_continuous]
 
     @property
     def _local_limit(self) -> int:
-        """How many evaluations a local search takes at most."""
+        """The largest number of evaluations of a local search."""
         return 20 * (len(self._continuous) + 1)
 
     def _left_but_polish(self) -> float:
-        """The evaluations that are left for global methods."""
+        """Return the number of evaluations left for global methods."""
         if self._left is None or self.search.budget is None:
             return math.inf
         reserve = min(self.search.budget // 10, self._local_limit) if self._has_local else 0
         return self._left - reserve
 
     def _begin_local(self, *, radius: float, limit: float) -> None:
-        """A local search that begins at the best point, whose integers are held."""
+        """Begin a local search at the best point, whose integers are held."""
         assert self._best is not None
         best, varied = self._best.point, self._continuous
         u = self.search.unit(best)
@@ -225,21 +214,19 @@ class Auto(BatchSolver):
         name = "LN_COBYLA" if self.search.constraints or len(varied) == 1 else "LN_BOBYQA"
         budget = int(max(1, min(limit, self._local_limit)))
         search = replace(self.search, space=box, start=tuple(best[i] for i in varied), budget=budget)
-        self._begin(f"{name} around the best", NloptDerivativeFree(search, name=name))
+        self._begin(f"{name} around the best", Nlopt(search, name=name))
         self._held = best
 
-    # ------------------------------------------------------------------------------ its steps
+    # -- its steps
 
-    def _begin(
-        self, method: str, solver: BatchSolver, *, generation: int | None = None, limit: float = math.inf
-    ) -> None:
+    def _begin(self, method: str, solver: Solver, *, generation: int | None = None, limit: float = math.inf) -> None:
         """Begin a method.
 
         Args:
             method: its name, for the user.
-            solver: works by it.
-            generation: points per generation, of a method that may stall.
-            limit: after how many points it ends.
+            solver: runs it.
+            generation: points per generation of a method that may stall; None: it cannot.
+            limit: the number of points after which it ends.
         """
         self._method = method
         self._held = None
@@ -251,7 +238,7 @@ class Auto(BatchSolver):
         self._patience = math.inf if generation is None else 20.0 * generation + 30.0 * self.search.size
 
     def _next(self) -> list[Point]:
-        while self._success is None:
+        while self.success is None:
             ended = self._without_progress > self._patience or self._count >= self._limit
             points = [] if ended else [self._with_held(point) for point in self._solver.ask()]
             if points:
@@ -262,7 +249,7 @@ class Auto(BatchSolver):
         return []
 
     def _with_held(self, point: Point) -> Point:
-        """A point of the method, with the integers that are held."""
+        """Return a point of the method, completed by the integers that are held."""
         if self._held is None:
             return point
         varied = dict(zip(self._continuous, point, strict=True))
@@ -287,7 +274,7 @@ class Auto(BatchSolver):
         self._best = best_of([*([self._best] if self._best else []), *asked, *given])
 
     def _progress(self, before: Evaluation | None, after: Evaluation | None) -> bool:
-        """Whether the best has become better by more than a trifle."""
+        """Return whether the best has improved by more than `PROGRESS`."""
         if after is None or before is None:
             return after is not None
         (kind, cost), (kind_before, cost_before) = rank_key(after), rank_key(before)
@@ -298,6 +285,6 @@ class Auto(BatchSolver):
 
 
 def _between(parameter: Dimension, lower: float, upper: float) -> Parameter:
-    """The parameter between two ends; with its own where they are equal, in a range of a few floating-point numbers."""
+    """Return the parameter with other ends; unchanged if they are equal, in a range of few floating-point numbers."""
     assert isinstance(parameter, Parameter)
     return replace(parameter, lower=lower, upper=upper) if lower < upper else parameter

@@ -1,4 +1,4 @@
-"""Bayesian optimization: a Gaussian process says where an improvement is to be expected."""
+"""Bayesian optimization: a Gaussian process predicts where the values improve."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtri
 
 from vtbdrake.optimization.parameter import Choice
-from vtbdrake.optimization.solvers.batch import BatchSolver
-from vtbdrake.optimization.solvers.ranking import rank_key, usable
-from vtbdrake.optimization.solvers.search import Search
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError, rank_key
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -23,32 +20,33 @@ if TYPE_CHECKING:
 SPREAD, AROUND, REFINED = 500, 200, 10
 BEST = 5
 WIDTHS = (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003)
-# Prior of the logarithms of the kernel's numbers (signal, length scales as parts of the ranges, noise): median, width.
+# Prior of the logarithms of the kernel's hyperparameters (signal, length scales as parts of the ranges, noise): median,
+# width.
 SIGNAL, LENGTH, NOISE = (1.0, 1.0), (0.5, 1.0), (1e-4, 3.0)
 # Draws of the posterior of several objectives.
 DRAWS = 64
 
 
-class Bayesian(BatchSolver):
-    """Asks for the points of the largest expected improvement (EI), as Gaussian processes predict it.
+class Bayesian(Solver):
+    """Bayesian optimization: asks for the points of the largest expected improvement (EI) of Gaussian processes.
 
-    The first points are a Sobol design. After each batch, a Gaussian process is fitted to every objective and to every
-    constraint. A random search with shrinking steps then looks for the point of the largest EI, times the probability
-    that all constraints hold. Within a batch, the model takes its own prediction of the earlier points for known.
-    Several objectives are weighed at random for every point (ParEGO), so that the whole Pareto front is looked for.
+    The first points are a Sobol design. After each batch, a Gaussian process is fitted to every objective and every
+    constraint. A random search with shrinking steps then maximizes the EI times the probability that all constraints
+    hold. Within a batch, the model takes its own predictions of the earlier points as known. Several objectives are
+    weighed at random for every point (ParEGO), which covers the whole Pareto front.
 
-    The kernel is Matern 5/2, with a length scale per parameter, and noise; its numbers are those of the largest
-    posterior density. Choices are coded one-hot. Objectives are brought near to a normal distribution (Yeo and
-    Johnson). A failed simulation counts as the worst value so far. To choose a point takes tens of milliseconds: where
-    a rollout takes less, CMA-ES may be the better choice.
+    The kernel is Matern 5/2, with a length scale per parameter, and noise; its hyperparameters are those of the largest
+    posterior density. Choices are coded one-hot. Objectives are transformed towards a normal distribution (Yeo and
+    Johnson). A failed simulation counts as the worst value so far. Choosing a point takes tens of milliseconds: where a
+    rollout takes less, CMA-ES may be the better choice.
 
     Args:
-        search: what is searched: any parameters, objectives and constraints; 20 parameters at most are reasonable.
+        search: any parameters (20 at most are reasonable), objectives and constraints.
         name: in the catalogue.
-        initial: points of the design; left away: 2 (n + 1), and half of the budget at most. If as many points were
-            given by hand before, there is no design.
+        initial: points of the design; by default 2 (n + 1), and half of the budget at most. There is no design if as
+            many points were given by hand before.
         batch: how many points it asks for at a time.
-        memory: the model is fitted to so many points, to the best ones and the latest, so that it stays quick.
+        memory: how many points the model is fitted to at most: the best ones and the latest.
 
     Jones, D. R., Schonlau, M. and Welch, W. J. (1998): Efficient global optimization of expensive black-box functions,
     J. Global Optimization 13. Knowles, J. (2006): ParEGO, IEEE Trans. Evolutionary Computation 10.
@@ -77,7 +75,7 @@ class Bayesian(BatchSolver):
         begun, self._begun = self._begun, True
         if not begun and len(self._evaluations) < self._initial:
             return self._design()
-        # With several threads, the last digits of the linear algebra would depend on their number.
+        # The last digits of the linear algebra depend on the number of threads.
         from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1, user_api="blas"):
@@ -87,18 +85,18 @@ class Bayesian(BatchSolver):
         return points
 
     def _design(self) -> list[Point]:
-        # Imported here, since it takes long.
+        # Imported here because it is slow.
         from scipy.stats import qmc
 
         units = qmc.Sobol(self.search.size, rng=self.search.seed).random(1 << (self._initial - 1).bit_length())
         start = [] if self.search.start is None else [self.search.start]
         return list(dict.fromkeys([*start, *(self.search.point(u) for u in units)]))[: self._initial]
 
-    # ------------------------------------------------------------------------------ proposals
+    # -- proposals
 
     def _proposals(self) -> list[Point]:
         remembered = self._remembered()
-        if not any(usable(evaluation) for evaluation in remembered):
+        if not any(evaluation.usable for evaluation in remembered):
             drawn = (self.search.point(self._rng.random(self.search.size)) for _ in range(self._batch))
             return [point for point in dict.fromkeys(drawn) if point not in self._evaluations]
         units = np.array([self.search.unit(evaluation.point) for evaluation in remembered])
@@ -123,17 +121,17 @@ class Bayesian(BatchSolver):
         return min(BEST if self.search.objectives == 1 else 4 * BEST, available)
 
     def _remembered(self) -> list[Evaluation]:
-        """The points that the model is fitted to: all, or half of them the best, and half of them the latest."""
+        """Return the points that the model is fitted to: all, or the best and the latest, half each."""
         told = list(self._evaluations.values())
         if len(told) <= self._memory:
             return told
-        costs = np.array([[-value for value in e.values] if usable(e) else [np.inf] * len(e.values) for e in told])
+        costs = np.array([[-value for value in e.values] if e.usable else [np.inf] * len(e.values) for e in told])
         ranks = self._best_first(told, costs)[: self._memory // 2].tolist()
         latest = [i for i in range(len(told) - 1, -1, -1) if i not in set(ranks)][: self._memory - len(ranks)]
         return [told[i] for i in sorted([*ranks, *latest])]
 
     def _best_first(self, told: Sequence[Evaluation], costs: np.ndarray) -> np.ndarray:
-        """Indices of ``told``, the best first; of several objectives, by how many others are better in all of them."""
+        """Return indices of ``told``, the best first; of several objectives, by the number of points that dominate."""
         if self.search.objectives == 1:
             return np.array(sorted(range(len(told)), key=lambda i: rank_key(told[i])))
         costs = costs[:, : self.search.objectives]
@@ -141,10 +139,9 @@ class Bayesian(BatchSolver):
         return np.lexsort((_domination(costs)[feasible].sum(axis=0), ~feasible))
 
     def _targets(self, told: Sequence[Evaluation]) -> np.ndarray:
-        """What the models are fitted to, shape (k, objectives + constraints): costs, and violations around 0."""
+        """Return the models' targets, shape (k, objectives + constraints): costs, and violations scaled around 0."""
         rows = [
-            [*(-value for value in e.values), *e.violations] if usable(e) else [np.nan] * len(self._models)
-            for e in told
+            [*(-value for value in e.values), *e.violations] if e.usable else [np.nan] * len(self._models) for e in told
         ]
         table = np.array(rows)
         table[~np.isfinite(table)] = np.nan
@@ -158,10 +155,10 @@ class Bayesian(BatchSolver):
     def _acquisition(
         self, X: np.ndarray, targets: np.ndarray, counted: np.ndarray
     ) -> Callable[[np.ndarray], np.ndarray]:
-        """The logarithm of what is to be maximized, as a function of places in the unit cube, shape (k, n) -> (k,)."""
+        """Return the logarithm of EI and feasibility as a function of places in the unit cube, shape (k, n) -> (k,)."""
         objectives = self._models[: self.search.objectives]
         constraints = self._models[self.search.objectives :]
-        # Where nothing is feasible yet, only that is looked for.
+        # While no point is feasible, only feasibility counts.
         improvement = None
         if counted.any():
             improvement = (
@@ -181,7 +178,7 @@ class Bayesian(BatchSolver):
         return acquisition
 
     def _weighed_improvement(self, models: Sequence[_Model], costs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """The logarithm of the EI of max_i(w_i c_i) + 0.05 sum_i(w_i c_i), with weights w drawn at random."""
+        """Return log EI of max_i(w_i c_i) + 0.05 sum_i(w_i c_i), with weights w drawn at random."""
         weights = self._rng.dirichlet(np.ones(len(models)))
         front = costs[~_domination(costs).any(axis=0)]
         lowest, width = front.min(axis=0), np.ptp(front, axis=0)
@@ -190,7 +187,7 @@ class Bayesian(BatchSolver):
         draws = [self._rng.permutation(quantiles) for _ in models]
 
         def weighed(each: Sequence[np.ndarray]) -> np.ndarray:
-            """The weighed costs, of one array per objective."""
+            """Return the weighed costs of one array per objective."""
             parts = [w * (c - low) / span for w, c, low, span in zip(weights, each, lowest, width, strict=True)]
             return np.asarray(np.maximum.reduce(parts) + 0.05 * np.add.reduce(parts))
 
@@ -200,17 +197,17 @@ class Bayesian(BatchSolver):
             means, deviations = zip(*(model.predict(places) for model in models), strict=True)
             drawn = [m[:, np.newaxis] + d[:, np.newaxis] * z for m, d, z in zip(means, deviations, draws, strict=True)]
             gains = np.maximum(best - weighed(drawn), 0.0)
-            # The small part leads to where a draw might improve, if none does.
+            # The small term leads to where a draw might improve, if none does.
             return np.asarray(np.log(gains.mean(axis=1) + 1e-9 * np.exp(np.minimum(best - weighed(means), 0.0))))
 
         return improvement
 
-    # ------------------------------------------------------------------------------ candidates
+    # -- candidates
 
     def _maximize(
         self, acquisition: Callable[[np.ndarray], np.ndarray], centres: np.ndarray, *, known: Set[Point]
     ) -> np.ndarray | None:
-        """The best place found that is not known, shape (n,); None if all are."""
+        """Return the best place found that is not known, shape (n,); None if all are known."""
         around = [self._moved(np.repeat(centres, AROUND // len(centres), axis=0), width) for width in (0.1, 0.01)]
         units = np.vstack([self._rng.random((SPREAD, self.search.size)), *around])
         units = self._snapped(units)
@@ -224,7 +221,7 @@ class Bayesian(BatchSolver):
         return next((u for u in (*best, *spare) if self.search.point(u) not in known), None)
 
     def _moved(self, units: np.ndarray, width: float) -> np.ndarray:
-        """Normal steps along at least half of the coordinates; steps of integers and choices may go anywhere."""
+        """Return normal steps along at least half of the coordinates; integers and choices may jump anywhere."""
         along = self._rng.random(units.shape) < max(0.5, 2.0 / self.search.size)
         moved = np.clip(units + width * along * self._rng.standard_normal(units.shape), 0.0, 1.0)
         for i, parameter in enumerate(self.search.space):
@@ -237,7 +234,7 @@ class Bayesian(BatchSolver):
         return self._snapped(moved)
 
     def _snapped(self, units: np.ndarray) -> np.ndarray:
-        """Integers and choices in the middle of their shares of the unit cube."""
+        """Move integers and choices to the middle of their shares of the unit cube."""
         snapped = units.copy()
         for i, parameter in enumerate(self.search.space):
             if not parameter.is_continuous:
@@ -245,7 +242,7 @@ class Bayesian(BatchSolver):
         return snapped
 
     def _encoded(self, units: np.ndarray) -> np.ndarray:
-        """What the kernel sees of places in the unit cube: numbers as they are, choices one-hot."""
+        """Return the kernel's input for places in the unit cube: numbers unchanged, choices one-hot."""
         columns = []
         for parameter, column in zip(self.search.space, units.T, strict=True):
             if isinstance(parameter, Choice):
@@ -256,18 +253,18 @@ class Bayesian(BatchSolver):
         return np.hstack(columns)
 
 
-# -------------------------------------------------------------------------------------- the model
+# -- the model
 
 
 class _Model:
-    """A Gaussian process of one number, of mean 0."""
+    """A Gaussian process of one output, of mean 0."""
 
     def __init__(self) -> None:
         self._process: GaussianProcessRegressor | None = None
         self._fitted = 0
 
     def fit(self, X: np.ndarray, y: np.ndarray) -> None:
-        """Fits it to ``y``, shape (k,), at ``X``, shape (k, m); the kernel's numbers only if there is enough news."""
+        """Fit the process to ``y``, shape (k,), at ``X``, shape (k, m); the kernel only if enough points are new."""
         from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
         if self._process is None:
@@ -285,19 +282,19 @@ class _Model:
         from sklearn.gaussian_process import GaussianProcessRegressor
 
         with warnings.catch_warnings():
-            # Of numbers at their bounds.
+            # Hyperparameters may lie at their bounds.
             warnings.filterwarnings("ignore", module="sklearn")
             self._process = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=optimizer).fit(X, y)
 
     def believe(self, x: np.ndarray) -> None:
-        """Takes what it expects at ``x``, shape (1, m), for known."""
+        """Take the prediction at ``x``, shape (1, m), as known."""
         process = self._process
         assert process is not None
         X, y = np.vstack([process.X_train_, x]), np.append(process.y_train_, process.predict(x))
         self._set(process.kernel_, X, y, optimizer=None)
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation without the noise, both of shape (k,)."""
+        """Return mean and standard deviation without the noise, both of shape (k,)."""
         assert self._process is not None
         mean, deviation = self._process.predict(X, return_std=True)
         noise = self._process.kernel_.k2.noise_level
@@ -305,7 +302,7 @@ class _Model:
 
 
 def _most_probable(objective: Any, start: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float]:
-    """Minimizes the negative logarithm of the posterior density of a kernel's numbers, which are logarithms too."""
+    """Minimize the negative log posterior density of a kernel's hyperparameters, given as logarithms."""
     from scipy.optimize import minimize
 
     lengths = len(start) - 2
@@ -322,7 +319,7 @@ def _most_probable(objective: Any, start: np.ndarray, bounds: np.ndarray) -> tup
 
 
 def _expected_improvement(model: _Model, known: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """The logarithm of the EI over the least mean at the ``known`` places."""
+    """Return the logarithm of the EI over the least mean at the ``known`` places."""
     best = model.predict(known)[0].min()
 
     def improvement(places: np.ndarray) -> np.ndarray:
@@ -333,7 +330,7 @@ def _expected_improvement(model: _Model, known: np.ndarray) -> Callable[[np.ndar
 
 
 def _log_h(z: np.ndarray) -> np.ndarray:
-    """log(phi(z) + z Phi(z)) of the standard normal distribution, by its asymptote phi(z) / z^2 where that is tiny."""
+    """Return log(phi(z) + z Phi(z)) of the standard normal distribution; by its asymptote phi(z) / z^2 if tiny."""
     log_phi = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
     near = np.maximum(z, -6.0)
     exact = np.log(np.exp(-0.5 * near**2) / np.sqrt(2.0 * np.pi) + near * np.exp(log_ndtr(near)))
@@ -341,13 +338,13 @@ def _log_h(z: np.ndarray) -> np.ndarray:
 
 
 def _domination(costs: np.ndarray) -> np.ndarray:
-    """Whether row i of ``costs``, shape (k, m), dominates row j: nowhere worse, somewhere better; shape (k, k)."""
+    """Return whether row i of ``costs``, shape (k, m), dominates row j: nowhere worse, somewhere better; (k, k)."""
     no_worse = np.logical_and.reduce([column[:, np.newaxis] <= column for column in costs.T])
     return np.asarray(no_worse & ~no_worse.T)
 
 
 def _normal(costs: np.ndarray) -> np.ndarray:
-    """Costs brought near to a standard normal distribution, in their order; shape (k,)."""
+    """Transform costs, shape (k,), monotonically towards a standard normal distribution."""
     from scipy.stats import yeojohnson
 
     deviation = costs.std()
@@ -358,6 +355,6 @@ def _normal(costs: np.ndarray) -> np.ndarray:
 
 
 def _scaled(violations: np.ndarray) -> np.ndarray:
-    """Violations on a scale that is linear near 0, where they change their sign, and logarithmic far from it."""
+    """Return violations on a scale that is linear near 0 and logarithmic far from it."""
     scale = np.median(np.abs(violations)) or 1.0
     return np.asarray(np.sign(violations) * np.log1p(np.abs(violations) / scale))

@@ -1,4 +1,4 @@
-"""Solvers that call the function themselves, made to ask and be told."""
+"""Solvers that call the function themselves, adapted to ask and tell by a thread."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from vtbdrake.optimization.solvers.batch import BatchSolver
-from vtbdrake.optimization.solvers.ranking import usable
-from vtbdrake.optimization.solvers.search import Search
-from vtbdrake.optimization.solvers.solver import Evaluation, Point
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver
 
 _log = logging.getLogger(__name__)
 
-# A method that calls so often in a row for points that it knows goes round in circles.
+# A method that asks so often in a row for known points only is ended.
 CIRCLES = 10_000
 
 P = ParamSpec("P")
@@ -26,24 +23,23 @@ R = TypeVar("R")
 
 
 class Stopped(Exception):  # noqa: N818
-    """Ends a solver from within its callback, once it is closed."""
+    """An exception that ends a closed solver from within its callback."""
 
 
-class BlockingSolver(BatchSolver):
-    """A method that runs from its start to its end in one call (`_solve`), in a thread of its own.
+class BlockingSolver(Solver):
+    """A method that runs from start to end in one call (`_solve`), in a thread of its own.
 
-    The thread only ever waits: either the method computes its next points or the driver judges them. So what is asked
-    for depends on what was told, and not on timing. When it is closed before its end, the callback raises `Stopped`,
-    which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and the thread is joined. A method that
-    does not return within `grace` seconds is left behind in its thread, which does not keep the program from ending.
-    A method that calls `CIRCLES` times in a row for points that it knows is ended, without success.
+    Method and driver take turns, so that the points asked for do not depend on timing. When the solver is closed
+    early, the callback raises `Stopped`, which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and
+    the thread is joined. A method that does not return within `grace` seconds stays behind in its daemon thread. A
+    method that asks `CIRCLES` times in a row for known points only is ended, without success.
 
-    Failed simulations: these methods need a number. A failed point counts as worse than the worst point so far, by the
-    spread of the values so far (at least 1), and keeps that number. So does one that racing dropped, as it breaks a
-    constraint, before anything was known of its value. What was given by hand is ignored.
+    These methods need a number for every point. A failed simulation counts as worse than the worst point so far, by the
+    spread of the values so far (at least 1). So does a point without any bound that racing dropped. Points given by
+    hand are ignored.
     """
 
-    # Most methods end within milliseconds when they are closed, a few after thousands of calls (`NO_EXCEPTIONS`).
+    # In seconds. Most methods end within milliseconds when they are closed, a few after thousands of calls.
     grace = 10.0
 
     def __init__(self, search: Search, *, name: str) -> None:
@@ -60,12 +56,12 @@ class BlockingSolver(BatchSolver):
 
     @abstractmethod
     def _solve(self) -> tuple[bool, str]:
-        """Runs the method, in its thread; returns whether it converged, and how it ended."""
+        """Run the method, in its thread; return whether it converged, and how it ended."""
 
-    # ---------------------------------------------------------------- in the method's thread
+    # -- in the method's thread
 
     def _evaluate(self, U: np.ndarray) -> None:
-        """Has the points of the unit cube judged that are not known yet, shape (k, n), as one batch."""
+        """Have the unknown ones among points of the unit cube, shape (k, n), evaluated as one batch."""
         new = list({u.tobytes(): u for u in U if u.tobytes() not in self._known}.values())
         self._circling = 0 if new else self._circling + 1
         if self._circling >= CIRCLES:
@@ -85,9 +81,9 @@ class BlockingSolver(BatchSolver):
         return answer
 
     def _numbers(self, evaluation: Evaluation) -> tuple[float, np.ndarray]:
-        """The cost and the violations that the method sees."""
+        """Return the cost and the violations that the method sees."""
         violations = self._broken
-        if usable(evaluation):
+        if evaluation.usable:
             cost, violations = -evaluation.values[0], np.array(evaluation.violations)
             self._broken = np.maximum(self._broken, violations)
             if np.isfinite(cost):
@@ -98,12 +94,12 @@ class BlockingSolver(BatchSolver):
         return self._highest + max(self._highest - self._lowest, 1.0), violations
 
     def _at(self, u: np.ndarray) -> tuple[Evaluation, float, np.ndarray]:
-        """The evaluation at ``u``, shape (n,), and its cost and violations, shape (constraints,)."""
+        """Return the evaluation at ``u``, shape (n,), and its cost and violations, shape (constraints,)."""
         self._evaluate(u[np.newaxis])
         return self._known[u.tobytes()]
 
     def _callback(self, function: Callable[P, R]) -> Callable[P, R]:
-        """``function``, whose exceptions are kept: some libraries swallow or wrap them."""
+        """Wrap a function to keep its exceptions: some libraries swallow or wrap them."""
 
         def kept(*args: P.args, **kwargs: P.kwargs) -> R:
             try:
@@ -121,16 +117,16 @@ class BlockingSolver(BatchSolver):
         except BaseException as error:
             outcome = error
         if self._circling >= CIRCLES:
-            outcome = (False, f"it called {CIRCLES} times in a row for points that it knew")
+            outcome = (False, f"it asked {CIRCLES} times in a row for known points only")
         elif self._error is not None:
             outcome = self._error
         self._requests.put(outcome)
 
-    # ---------------------------------------------------------------- in the driver's thread
+    # -- in the driver's thread
 
     def _next(self) -> list[Point]:
         if self._thread is None:
-            # A daemon, so that a program ends that forgot to close it.
+            # A daemon thread does not keep a program from ending that forgot to close the solver.
             self._thread = threading.Thread(target=self._run, name=f"solver {self.name}", daemon=True)
             self._thread.start()
         request = self._requests.get()
@@ -147,7 +143,7 @@ class BlockingSolver(BatchSolver):
             self._answers.put(asked)
 
     def close(self) -> None:
-        """Ends the method and its thread, and an `ask` that waits in another thread; harmless if they have ended."""
+        """End the method and its thread, and an `ask` that waits in another thread."""
         self._stopping = True
         if self._thread is None:
             return

@@ -1,32 +1,27 @@
-"""Designs: points that are fixed before the first is judged."""
+"""Designs: points that are fixed before the first is evaluated."""
 
 from __future__ import annotations
 
 import itertools
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from math import prod
 
 import numpy as np
 
-from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
-from vtbdrake.optimization.solvers.batch import BatchSolver
-from vtbdrake.optimization.solvers.search import Search
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 
 # A power of two, so that a Sobol sequence is balanced batch by batch; enough to keep a machine busy.
 BATCH = 64
 
 
-class Design(BatchSolver):
-    """Asks for its points in batches and ends when there are no more.
-
-    Any parameters, any objectives, any constraints: a design does not look at what it is told.
+class Design(Solver):
+    """A fixed sequence of points, asked for in batches; any parameters, objectives and constraints.
 
     Args:
         search: what is searched.
         name: in the catalogue.
-        as_budgeted: it goes on until the budget is spent; otherwise it is as long as it is.
+        as_budgeted: whether it goes on until the budget is spent; otherwise it ends with its points.
     """
 
     def __init__(self, search: Search, *, name: str, as_budgeted: bool = False) -> None:
@@ -36,9 +31,9 @@ class Design(BatchSolver):
             self._budget = None
         self._points = self._generate()
 
-    @abstractmethod
     def _generate(self) -> Iterator[Point]:
-        """All its points."""
+        """Return all points."""
+        raise NotImplementedError
 
     def _next(self) -> list[Point]:
         points = list(itertools.islice(self._points, BATCH if self._left is None else min(BATCH, self._left)))
@@ -59,9 +54,8 @@ class Grid(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: how many values a continuous parameter has: one number for all, one per parameter, or by address.
-            Left away: as many as the budget allows, and 11 without one. It thins out integers too where it names them
-            by address.
+        points: how many values a continuous parameter has: one number for all, one per parameter, or by address. By
+            default as many as the budget allows, and 11 without one. By address, it thins out integers too.
 
     Raises:
         SolverError: the grid is larger than the budget, or ``points`` does not fit the parameters.
@@ -83,13 +77,7 @@ class Grid(Design):
 
 
 class Listed(Design):
-    """Points that are known.
-
-    Args:
-        search: what is searched.
-        name: in the catalogue.
-        points: in the order in which they are to be judged.
-    """
+    """Given points, in their order."""
 
     def __init__(self, search: Search, *, name: str, points: Sequence[Point]) -> None:
         self._listed = points
@@ -107,8 +95,7 @@ class Sobol(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: how many; left away: until the budget is spent, or without one the first power of two that is at least
-            64 n.
+        points: how many; by default until the budget is spent, or without one the first power of two >= 64 n.
 
     Owen, A. B. (1998): Scrambling Sobol' and Niederreiter-Xing points. Journal of Complexity 14.
     """
@@ -119,7 +106,7 @@ class Sobol(Design):
         super().__init__(search, name=name, as_budgeted=as_budgeted)
 
     def _generate(self) -> Iterator[Point]:
-        # Imported here, since it takes long.
+        # Imported here because it is slow.
         from scipy.stats import qmc
 
         sequence = qmc.Sobol(self.search.size, scramble=True, rng=self.search.seed)
@@ -134,8 +121,8 @@ class LatinHypercube(Design):
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: N; left away: what the budget allows if no point is dropped, or without one the first power of two that
-            is at least 64 n.
+        points: N; by default what the budget allows if no point is dropped, or without one the first power of two
+            >= 64 n.
 
     McKay, M. D., Beckman, R. J. and Conover, W. J. (1979), Technometrics 21.
     """
@@ -147,19 +134,19 @@ class LatinHypercube(Design):
     def _generate(self) -> Iterator[Point]:
         from scipy.stats import qmc
 
-        # What points given by hand have taken before the first is not there any more.
+        # Points given by hand may have taken from the budget before the first.
         count = self._count if self._left is None else self._left
         for u in qmc.LatinHypercube(self.search.size, rng=self.search.seed).random(count):
             yield self.search.point(u)
 
 
 class RandomSearch(Design):
-    """Independent uniform points: what every other solver has to beat.
+    """Independent uniform points: the baseline of every other solver.
 
     Args:
         search: what is searched.
         name: in the catalogue.
-        points: how many; left away: until the budget is spent, or without one no end.
+        points: how many; by default until the budget is spent, or without one no end.
     """
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
@@ -182,19 +169,18 @@ def _count(search: Search, points: int | None) -> int:
     return points
 
 
-def _axes(search: Search, points: int | Sequence[int] | Mapping[str, int] | None) -> list[list[float] | list[object]]:
+def _axes(search: Search, points: int | Sequence[int] | Mapping[str, int] | None) -> list[list[object]]:
     space = search.space
     if isinstance(points, Mapping):
         unknown = set(points) - {parameter.address for parameter in space}
         if unknown:
             raise SolverError(f"points are given for {sorted(unknown)}, which is no parameter")
         counts = [points.get(parameter.address) for parameter in space]
-    elif isinstance(points, Sequence):
-        if len(points) != len(space):
-            raise SolverError(f"points has one number per parameter, {len(space)}, not {len(points)}")
-        counts = [count if parameter.is_continuous else None for count, parameter in zip(points, space, strict=True)]
     else:
-        counts = [points if parameter.is_continuous else None for parameter in space]
+        each = points if isinstance(points, Sequence) else [points] * len(space)
+        if len(each) != len(space):
+            raise SolverError(f"points has one number per parameter, {len(space)}, not {len(each)}")
+        counts = [count if parameter.is_continuous else None for count, parameter in zip(each, space, strict=True)]
     fair = _fair_count(search)
     return [_axis(parameter, count, fair) for parameter, count in zip(space, counts, strict=True)]
 
@@ -214,7 +200,7 @@ def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
 
 
 def _fair_count(search: Search) -> int:
-    """How many values each continuous parameter has where the user says nothing."""
+    """Return how many values each continuous parameter has if the user names no number."""
     if search.budget is None:
         return 11
     continuous = sum(parameter.is_continuous for parameter in search.space)
@@ -226,9 +212,9 @@ def _fair_count(search: Search) -> int:
 
 
 def discrete_size(space: Sequence[Dimension]) -> int:
-    """The number of combinations of the parameters that are not continuous."""
+    """Return the number of combinations of the parameters that are not continuous."""
     return prod(
-        len(parameter.options) if isinstance(parameter, Choice) else int(parameter.upper) - int(parameter.lower) + 1
-        for parameter in space
-        if isinstance(parameter, Choice) or (isinstance(parameter, Parameter) and parameter.integer)
+        len(p.options) if isinstance(p, Choice) else int(p.upper) - int(p.lower) + 1
+        for p in space
+        if not p.is_continuous
     )

@@ -11,16 +11,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.optimization.parameter import Choice, Dimension
-from vtbdrake.optimization.solvers.batch import BatchSolver
-from vtbdrake.optimization.solvers.ranking import usable
-from vtbdrake.optimization.solvers.search import Search
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 
 if TYPE_CHECKING:
     import optuna
     from optuna.distributions import BaseDistribution
 
-# By name: Optuna's class, its options besides seed, and how many points a batch has where the user does not say.
+# By name: Optuna's class, its options besides the seed, and the default size of a batch.
 SAMPLERS: Mapping[str, tuple[str, Mapping[str, Any], int]] = {
     "TPE": ("TPESampler", {"constant_liar": True, "multivariate": True}, 4),
     "GP": ("GPSampler", {}, 1),
@@ -31,18 +28,18 @@ SAMPLERS: Mapping[str, tuple[str, Mapping[str, Any], int]] = {
 ONE_OBJECTIVE = frozenset({"QMC"})
 
 
-class OptunaSolver(BatchSolver):
+class OptunaSolver(Solver):
     """A sampler of Optuna: continuous, whole and categorical parameters, several objectives, constraints.
 
-    It has no end of its own: it asks until its budget is spent. A failed simulation is told as a failed trial, without
-    a value of any kind. Points given by hand are added to the study from which it learns.
+    It asks until its budget is spent. A failed simulation is told as a failed trial, without a value. Points given by
+    hand are added to the study from which it learns.
 
     Args:
         search: what is searched.
         name: in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
-        batch: how many points it asks for at a time: left away, 4 for TPE, a population for NSGA, 1 for GP, 16 for
-            QMC. It belongs to the method: another batch is another search.
-        sampler_options: more options of Optuna's sampler, by its own names (``n_startup_trials``, ``population_size``).
+        batch: how many points it asks for at a time; by default 4 for TPE, a population for NSGA, 1 for GP, 16 for QMC.
+            Another batch is another search.
+        sampler_options: further options of Optuna's sampler (``n_startup_trials``, ``population_size``, ...).
 
     Raises:
         ModuleNotFoundError: Optuna is not installed (or, for GP, torch).
@@ -107,7 +104,7 @@ class OptunaSolver(BatchSolver):
                 for trial, evaluation in zip(self._trials, asked, strict=True):
                     self._tell(trial, evaluation)
             for evaluation in given:
-                if usable(evaluation):
+                if evaluation.usable:
                     self._study.add_trial(
                         self._optuna.create_trial(
                             params=self._parameters(evaluation.point),
@@ -118,7 +115,7 @@ class OptunaSolver(BatchSolver):
                     )
 
     def _tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
-        if not usable(evaluation):
+        if not evaluation.usable:
             self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
             return
         for i, violation in enumerate(evaluation.violations):
@@ -127,10 +124,10 @@ class OptunaSolver(BatchSolver):
 
 
 def import_optuna(name: str) -> Any:
-    """Optuna, for the sake of the sampler or the other purpose ``name``.
+    """Return the module optuna for a purpose or a sampler ``name``.
 
     Raises:
-        ModuleNotFoundError: it is not installed (or, for GP, torch).
+        ModuleNotFoundError: Optuna (or, for GP, torch) is not installed.
     """
     try:
         module = importlib.import_module("optuna")
@@ -145,10 +142,10 @@ def import_optuna(name: str) -> Any:
 
 
 def distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
-    """The range of a parameter as Optuna states it; that of a choice holds the indices of its options."""
+    """Return the range of a parameter as Optuna's distribution; that of a choice holds the indices of its options."""
     distributions = optuna.distributions
     if isinstance(parameter, Choice):
-        # By index: Optuna holds 1 and True for equal.
+        # By index: for Optuna, 1 and True are equal.
         return distributions.CategoricalDistribution(range(len(parameter.options)))
     kind = distributions.IntDistribution if parameter.integer else distributions.FloatDistribution
     return kind(parameter.lower, parameter.upper, log=parameter.log)
@@ -156,7 +153,7 @@ def distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Holds back what Optuna says on this thread about its study in memory and its experimental parts."""
+    """Suppress Optuna's log messages on this thread, and its warnings about experimental parts."""
     thread = threading.get_ident()
     handlers = logging.getLogger("optuna").handlers
 

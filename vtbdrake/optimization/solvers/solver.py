@@ -1,23 +1,31 @@
-"""What every solver of problem (18) is: something that asks for points and is told how good they are."""
+"""The interface of all solvers of problem (18): a solver asks for points, and is told how good they are."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isinf, isnan
 from typing import Any
 
+import numpy as np
+
+from vtbdrake.optimization.parameter import Choice, Dimension
+
 # A point s^0: one value per parameter, in their order.
 Point = tuple[Any, ...]
+
+# Seeds are below this, as numpy's legacy generators require (cmaes, Optuna).
+SEEDS = 2**32
 
 
 class SolverError(ValueError):
     """A solver that is unknown, or cannot solve the problem."""
 
 
-class Judged:
-    """What can be said of anything with values and violations; see `Evaluation`."""
+class PointValues:
+    """The predicates that an `Evaluation` and a `Trial` share."""
 
     values: tuple[float, ...]
     violations: tuple[float, ...]
@@ -25,35 +33,36 @@ class Judged:
 
     @property
     def failed(self) -> bool:
-        """Whether it has no value: a bound that is infinite is one, of a point of which little is known yet."""
+        """Whether the point has no value because a simulation failed."""
+        # An infinite bound is no failure: it belongs to a dropped point of which little is known.
         return any(isnan(value) or (self.exact and isinf(value)) for value in self.values)
 
     @property
     def feasible(self) -> bool:
-        """Whether it has a value, or a bound of it, and keeps all constraints, as far as is known."""
+        """Whether the point has values, or bounds of them, and keeps all constraints as far as is known."""
         return not self.failed and all(violation <= 0.0 for violation in self.violations)
 
     @property
     def counts(self) -> bool:
-        """Whether it can be the best: it is feasible, and its values are no mere bounds."""
+        """Whether the point can be the best: it is feasible, and its values are exact."""
         return self.exact and self.feasible
 
 
 @dataclass(frozen=True)
-class Evaluation(Judged):
-    """How good a point is.
+class Evaluation(PointValues):
+    """What a solver is told of a point.
 
     Attributes:
         point: s^0.
-        values: one number per objective, larger is better whatever the user's direction (a cost appears negated); NaN
-            if the point has none, since a simulation failed.
-        violations: one number per constraint, at most 0 where it holds; NaN if the simulation failed.
-        gradient: of the first value, shape (n,), where the solver asked for it.
-        exact: False if racing dropped the point before it had met all conditions. ``values`` then bounds it from above
-            (by infinity if nothing bounds it, and it was dropped since it breaks a constraint), ``violations`` from
-            below.
-        effort: the rollouts that this evaluation took, divided by the number of conditions: 1 if the point met all of
-            them for the first time, less if racing dropped it, 0 if it was known already.
+        values: one number per objective, larger is better whatever the user's direction (a cost is negated); NaN if a
+            simulation failed.
+        violations: one number per constraint, at most 0 where it holds; NaN if a simulation failed.
+        gradient: of the first value, shape (n,), if the solver wants it.
+        exact: False if racing dropped the point before all its conditions had run. ``values`` is then an upper bound
+            (infinite if the point was dropped for a violated constraint and nothing bounds its value), ``violations`` a
+            lower bound.
+        effort: the rollouts that this evaluation took, divided by the number of conditions: 1 for a new point, less if
+            racing dropped it, 0 if it was known before.
     """
 
     point: Point
@@ -63,66 +72,275 @@ class Evaluation(Judged):
     exact: bool = True
     effort: float = 1.0
 
+    @property
+    def usable(self) -> bool:
+        """Whether the simulation gave numbers, feasible or not."""
+        return not self.failed and not any(isnan(violation) for violation in self.violations)
+
+    @property
+    def total_violation(self) -> float:
+        """The sum of the violated constraints' violations."""
+        return sum(max(violation, 0.0) for violation in self.violations)
+
+
+# Deb's rule: a feasible point is better than an infeasible one; of two feasible points the one of larger value is
+# better, of two infeasible ones the one of smaller total violation; a failed simulation is worse than both.
+# Deb, K. (2000): An efficient constraint handling method for genetic algorithms. Comput. Methods Appl. Mech. Eng. 186.
+
+
+def rank_key(evaluation: Evaluation) -> tuple[int, float]:
+    """Return a sort key by Deb's rule, the best first; points that racing dropped follow the exact ones."""
+    if not evaluation.usable:
+        return 3, 0.0
+    if not evaluation.feasible:
+        return 2, evaluation.total_violation
+    return (0 if evaluation.exact else 1), -evaluation.values[0]
+
+
+def best_of(evaluations: Iterable[Evaluation]) -> Evaluation | None:
+    """Return the best evaluation of one objective by Deb's rule; None if all failed."""
+    return min((evaluation for evaluation in evaluations if evaluation.usable), key=rank_key, default=None)
+
+
+def costs(evaluations: Sequence[Evaluation]) -> list[float]:
+    """Return costs in the order of Deb's rule, smaller is better; of feasible points, the negated value."""
+    feasible = [-evaluation.values[0] for evaluation in evaluations if evaluation.feasible]
+    floor = max(feasible, default=0.0)
+    worst = floor + max((e.total_violation for e in evaluations if e.usable), default=0.0) + 1.0
+    return [worst if not e.usable else -e.values[0] if e.feasible else floor + e.total_violation for e in evaluations]
+
+
+@dataclass(frozen=True)
+class Search:
+    """The task of a solver: a search over the unit cube [0, 1]^n, one coordinate per parameter.
+
+    Attributes:
+        space: the n parameters.
+        objectives: how many values an evaluation has.
+        constraints: how many violations an evaluation has.
+        seed: of all random numbers, in [0, 2^32).
+        budget: the number of evaluations that may be asked for; None: as many as the method needs.
+        start: where a local method starts; None: in the middle of the ranges.
+
+    Raises:
+        SolverError: a number is out of range, or the start lies outside the space.
+    """
+
+    space: tuple[Dimension, ...]
+    objectives: int = 1
+    constraints: int = 0
+    seed: int = 0
+    budget: int | None = None
+    start: Point | None = None
+
+    def __post_init__(self) -> None:
+        if not self.space:
+            raise SolverError("there is no parameter to vary; give at least one")
+        for name, lowest in (("objectives", 1), ("constraints", 0)):
+            if getattr(self, name) < lowest:
+                raise SolverError(f"the number of {name} is at least {lowest}, not {getattr(self, name)}")
+        if not 0 <= self.seed < SEEDS:
+            raise SolverError(f"a seed is a whole number in [0, 2^32), not {self.seed}")
+        if self.budget is not None and self.budget < 1:
+            raise SolverError(f"a budget is at least one evaluation, not {self.budget}")
+        if self.start is not None:
+            if len(self.start) != self.size:
+                raise SolverError(f"a start has one value per parameter, {self.size}, not {len(self.start)}")
+            try:
+                start = tuple(parameter.check(value) for parameter, value in zip(self.space, self.start, strict=True))
+            except ValueError as error:
+                raise SolverError(f"the start lies outside of the space: {error}") from error
+            object.__setattr__(self, "start", start)
+
+    @property
+    def size(self) -> int:
+        """The number of parameters, n."""
+        return len(self.space)
+
+    def point(self, u: Any) -> Point:
+        """Return the point at ``u`` in the unit cube, shape (n,); coordinates outside are clipped."""
+        return tuple(parameter.from_unit(x) for parameter, x in zip(self.space, u, strict=True))
+
+    def unit(self, point: Point) -> np.ndarray:
+        """Return the place of a point in the unit cube, shape (n,)."""
+        return np.array([parameter.to_unit(value) for parameter, value in zip(self.space, point, strict=True)])
+
+    def start_unit(self) -> np.ndarray:
+        """Return the start in the unit cube, shape (n,)."""
+        return np.full(self.size, 0.5) if self.start is None else self.unit(self.start)
+
+    def slope(self, point: Point) -> np.ndarray:
+        """Return dx/du of continuous parameters at a point, shape (n,), in their units."""
+        return np.array(
+            [
+                value * math.log(p.upper / p.lower) if p.log else p.upper - p.lower
+                for p, value in zip(self.space, point, strict=True)
+                if not isinstance(p, Choice)
+            ]
+        )
+
+    def require(
+        self,
+        name: str,
+        *,
+        continuous: bool = False,
+        ordered: bool = False,
+        one_objective: bool = False,
+        no_constraints: bool = False,
+        no_start: bool = False,
+        several: bool = False,
+    ) -> None:
+        """Check that a method can do this search.
+
+        Args:
+            name: the method's name, for the message.
+            continuous: it needs continuous parameters.
+            ordered: it needs numbers, continuous or whole.
+            one_objective: it takes one objective only.
+            no_constraints: it takes no constraints.
+            no_start: it does not start at a point.
+            several: it needs at least two parameters.
+
+        Raises:
+            SolverError: names what the method cannot do, and a solver that can.
+        """
+        for parameter in self.space:
+            if isinstance(parameter, Choice) and (continuous or ordered):
+                raise SolverError(
+                    f"{name} varies numbers, but {parameter.address} is one of {parameter.range_text}; "
+                    f"TPE or grid can do that"
+                )
+            if continuous and not parameter.is_continuous:
+                raise SolverError(
+                    f"{name} varies continuous parameters, but {parameter.address} is an integer; CMA-ES can do that"
+                )
+        if one_objective and self.objectives > 1:
+            raise SolverError(f"{name} takes one objective, not {self.objectives}; NSGA-II can do that")
+        if no_constraints and self.constraints:
+            raise SolverError(f"{name} takes no constraints, and there are {self.constraints}; CMA-ES can do that")
+        if several and self.size < 2:
+            raise SolverError(f"{name} needs at least two parameters, and there is one; LN_COBYLA can do that")
+        if no_start and self.start is not None:
+            raise SolverError(f"{name} does not start at a point; leave start out, or tell the solver of that point")
+
 
 class Solver(ABC):
-    """Asks for batches of points, and is told of each batch before it asks for the next.
+    """A method that asks for batches of points, and is told of each batch before it asks for the next.
 
-    What it asks for depends on its seed and on what it was told, and on nothing else: not on the number of workers, and
-    not on time. So a study is the same in series and in parallel, and can be resumed by telling it again.
+    What it asks for depends on its seed and on what it was told, and on nothing else: neither on the number of workers
+    nor on time. So a study is the same in series and in parallel, and is resumed by telling a new solver again.
 
-    A budget counts evaluations under all conditions. One that took less (`Evaluation.effort`) leaves budget for others,
-    and points given by hand take from it: a solver that plans its budget goes by the efforts that it was told.
+    A solver asks until its evaluations have taken ``search.budget``. Each point is charged in full when it is asked
+    for; what it did not take (`Evaluation.effort`) is given back when it is told, and points given by hand are charged
+    then. A batch that exceeds the budget is cut; the rest follows if budget comes back, and the method learns when the
+    batch is complete.
 
-    In each step a study first judges the points that were given by hand, if there are any, and tells them by
-    themselves; then it asks, judges and tells.
+    A subclass implements `_next` and `_learn`.
 
     Attributes:
         name: as the catalogue spells it.
+        search: what is searched.
         wants_gradient: whether `Evaluation.gradient` is to be filled.
-        reproducible: False for the few algorithms whose library draws its random numbers from the clock: those ask for
-            other points each time, whatever the seed.
+        reproducible: False for the few algorithms whose library seeds its random numbers from the clock.
+        success: whether it ended by its own criterion (converged, or its design is complete); None while it works.
+        message: how it ended, in its own words.
     """
 
-    name: str
     wants_gradient: bool = False
     reproducible: bool = True
 
+    def __init__(self, search: Search, *, name: str) -> None:
+        self.name = name
+        self.search = search
+        self.success: bool | None = None
+        self.message = ""
+        self._asked: list[Point] = []
+        self._budget: float | None = search.budget
+        # Of the method's present batch: the points to be asked for yet, and what was told.
+        self._rest: list[Point] = []
+        self._told: list[Evaluation] = []
+        self._given: list[Evaluation] = []
+
     @property
     def method(self) -> str:
-        """What it works with at the moment; a solver that changes its method names the present one."""
+        """The name of the method in use at the moment."""
         return self.name
 
     @abstractmethod
-    def ask(self) -> list[Point]:
-        """The points to be judged next; empty when it is finished.
-
-        Raises:
-            SolverError: it was not told yet of the points that it asked for before.
-            Exception: what the method itself raised, as it is.
-        """
+    def _next(self) -> list[Point]:
+        """Return the next batch; an empty one after a call of `_end`."""
 
     @abstractmethod
-    def tell(self, evaluations: Sequence[Evaluation]) -> None:
-        """The evaluations of the last batch, in its order, and after them any that were given by hand.
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        """Learn from a complete batch (empty before the first), and from points given by hand."""
 
-        Points given by hand may also be told by themselves, before any `ask`. TPE and its kin learn from them, and so
-        does `auto` when it begins anew; a local method, a design and CMA-ES go on as they would have without.
+    def _end(self, success: bool, message: str) -> None:
+        self.success = success
+        self.message = message
+        self.close()
+
+    def _spent(self) -> None:
+        self._end(False, f"the budget of {self.search.budget} evaluations is spent")
+
+    @property
+    def _left(self) -> int | None:
+        """The number of evaluations that may be asked for; None: any number."""
+        # Efforts are fractions, whose sum is not exact.
+        return None if self._budget is None else max(0, int(self._budget + 1e-6))
+
+    def ask(self) -> list[Point]:
+        """Return the points to be evaluated next; an empty list when the solver has ended.
 
         Raises:
-            SolverError: the batch is not complete or not in its order, or there are not as many values or violations as
-                the problem has.
+            SolverError: the solver was not told yet of the points that it asked for before.
+            Exception: whatever the method itself raised.
         """
+        if self._asked:
+            raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
+        if self.success is None and self._left == 0:
+            self._spent()
+        if self.success is not None:
+            return []
+        if not self._rest:
+            self._rest = list(self._next())
+        points, self._rest = self._rest[: self._left], self._rest[self._left :] if self._left is not None else []
+        if self._budget is not None:
+            self._budget -= len(points)
+        self._asked = points
+        return list(points)
 
-    @property
-    def success(self) -> bool | None:
-        """Whether it ended by its own criterion (converged, or its design is complete); None while it works."""
-        return None
+    def tell(self, evaluations: Sequence[Evaluation]) -> None:
+        """Tell the evaluations of the last batch, in its order, and after them any of points given by hand.
 
-    @property
-    def message(self) -> str:
-        """How it ended, in its own words."""
-        return ""
+        Points given by hand may also be told by themselves, before any `ask`. TPE and its kin learn from them, and so
+        does `auto` when it begins a new method; local methods, designs and CMA-ES ignore them.
+
+        Raises:
+            SolverError: the batch is incomplete or in another order, or has another number of values or violations than
+                the problem.
+        """
+        count = len(self._asked)
+        if [evaluation.point for evaluation in evaluations[:count]] != self._asked:
+            raise SolverError(
+                f"{self.name} asked for {count} points and is to be told of those first, in their order; "
+                f"it was told of {len(evaluations)}"
+            )
+        for evaluation in evaluations:
+            for name, numbers, expected in (
+                ("values", evaluation.values, self.search.objectives),
+                ("violations", evaluation.violations, self.search.constraints),
+            ):
+                if len(numbers) != expected:
+                    raise SolverError(f"an evaluation of this problem has {expected} {name}, not {len(numbers)}")
+        self._asked = []
+        if self._budget is not None:
+            self._budget += count - sum(evaluation.effort for evaluation in evaluations)
+        self._told += evaluations[:count]
+        self._given += evaluations[count:]
+        if not self._rest:
+            told, given, self._told, self._given = self._told, self._given, [], []
+            self._learn(told, given)
 
     def close(self) -> None:
-        """Gives back what it holds; it is not asked again."""
+        """Release what the solver holds; it is not asked again."""
         return

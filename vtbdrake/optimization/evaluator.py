@@ -1,0 +1,222 @@
+"""Evaluates points of a problem: the rollouts that they take, their values over all conditions, their gradients."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from math import ceil, inf, nan
+
+import numpy as np
+
+from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.risk import aggregate
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
+from vtbdrake.optimization.study_file import Outcome, RolloutKey
+from vtbdrake.rollout.derivative import DerivativeRunner
+from vtbdrake.rollout.runner import split
+from vtbdrake.rollout.task import FAILED
+
+# Racing goes through the conditions in rounds of at least this many rollouts, enough for several workers. It does not
+# depend on their number: a study is the same with any.
+_ROUND = 8
+
+# The step of a quality by which the slope of the risk is taken.
+_STEP = 1e-7
+
+
+class Evaluator:
+    """Evaluates batches of points by rollouts that are known, or are run.
+
+    Args:
+        problem: what is asked.
+        known: the outcomes known so far; ``run`` adds to them.
+        run: runs the rollouts of some keys.
+        racing: drop a point as soon as it can no longer be better than the best one, whatever the conditions that have
+            not run would give. The winner is never dropped: the risk does not fall when a quality rises, and a quality
+            is at most `Quality.upper` (a cost at least 0). Under the mean, say, a quality without ``upper`` can be
+            anything, and no point is dropped for its value.
+        budget: how many rollouts the points may take together; only as many points run side by side as it allows to
+            finish.
+
+    Attributes:
+        best: the best evaluation so far; None if there are several qualities.
+
+    Raises:
+        ValueError: racing, but several qualities.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        known: Mapping[RolloutKey, Outcome],
+        run: Callable[[Sequence[RolloutKey]], None],
+        *,
+        racing: bool = False,
+        budget: float = inf,
+    ) -> None:
+        if racing and len(problem.objectives) > 1:
+            raise ValueError("racing compares one quality, but the problem has several: leave racing out")
+        self._problem = problem
+        self._known = known
+        self._run = run
+        self._racing = racing and len(problem.conditions) > 1
+        self._budget = budget
+        self._conditions = range(len(problem.conditions))
+        self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
+        self.best: Evaluation | None = None
+        # Not the known ones, of which a resumed study has more.
+        self._needed: set[RolloutKey] = set()
+        # The number of rollouts that each point has needed since it was last told.
+        self._untold: Counter[Point] = Counter()
+
+    def evaluate(self, points: Sequence[Point]) -> list[Evaluation]:
+        """Return one evaluation per point, in their order."""
+        evaluations: dict[Point, Evaluation] = {}
+        waiting = list(dict.fromkeys(points))
+        while waiting:
+            count = len(waiting)
+            if self._racing:
+                left = (self._budget - len(self._needed)) / len(self._conditions)
+                count = max(1, int(min(left, count)))
+            evaluations |= self._evaluate_together(waiting[:count])
+            waiting = waiting[count:]
+        return [
+            replace(evaluations[point], effort=self._untold.pop(point, 0) / len(self._conditions)) for point in points
+        ]
+
+    def _evaluate_together(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
+        if self._racing:
+            evaluations = self._race(points)
+        else:
+            self._complete([(point, condition) for point in points for condition in self._conditions])
+            evaluations = {point: self.evaluation(point) for point in points}
+        for evaluation in evaluations.values():
+            self._remember(evaluation)
+        return evaluations
+
+    def _complete(self, keys: Sequence[RolloutKey]) -> None:
+        new = dict.fromkeys(key for key in keys if key not in self._needed)
+        self._needed.update(new)
+        self._untold.update(point for point, _ in new)
+        missing = [key for key in keys if key not in self._known]
+        if missing:
+            self._run(missing)
+
+    def _race(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
+        """Evaluate points in rounds, and drop those that have lost.
+
+        Only the conditions of the rounds so far count: an interrupted study may know more.
+        """
+        if self.best is None and len(points) > 1:
+            self._find_incumbent(points)
+        order = self._order()
+        evaluations: dict[Point, Evaluation] = {}
+        alive = list(points)
+        done = 0
+        while alive and done < len(order):
+            share = ceil(_ROUND / len(alive))
+            self._complete([(point, condition) for point in alive for condition in order[done : done + share]])
+            done += share
+            evaluations |= {point: self.evaluation(point, order[:done]) for point in alive}
+            alive = [point for point in alive if not self._lost(evaluations[point])]
+        return evaluations
+
+    def _find_incumbent(self, points: Sequence[Point]) -> None:
+        """Run the best point of the first condition under all others, as the point to beat."""
+        first = list(self._conditions)[:1]
+        self._complete([(point, condition) for point in points for condition in first])
+        leads = [point for point in points if self.evaluation(point, first).feasible]
+        if leads:
+            leader = max(leads, key=lambda point: self._known[point, first[0]].value * self._signs[0])
+            self._complete([(leader, condition) for condition in self._conditions])
+            self._remember(self.evaluation(leader))
+
+    def _order(self) -> list[int]:
+        """Return the conditions, those first in which the best point is worst: they distinguish most."""
+        if self.best is None:
+            return list(self._conditions)
+        h = [self._known[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
+        return sorted(self._conditions, key=lambda condition: h[condition])
+
+    def _lost(self, evaluation: Evaluation) -> bool:
+        """Return whether a point, given an upper bound of its value, cannot become the best."""
+        if evaluation.failed:
+            return True
+        if self.best is None or evaluation.point == self.best.point:
+            return False
+        return not evaluation.feasible or evaluation.values[0] <= self.best.values[0]
+
+    def evaluation(self, point: Point, conditions: Collection[int] | None = None) -> Evaluation:
+        """Return the evaluation of a point by its known outcomes.
+
+        Args:
+            point: s^0.
+            conditions: the numbers of those that count; None: all. The others, and the unknown ones, count as the best
+                possible.
+        """
+        counted = self._conditions if conditions is None else conditions
+        outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
+        seen = [outcome for outcome in outcomes if outcome is not None]
+        exact = len(seen) == len(outcomes)
+        constraints = len(self._problem.constraints)
+        if any(outcome.end == FAILED for outcome in seen):
+            # After one failed simulation the other conditions change nothing.
+            return Evaluation(point, (nan,) * self._signs.size, (nan,) * constraints, exact=exact)
+        values, violations = aggregate(
+            outcomes,
+            risk=self._problem.risk,
+            minimize=[quality.minimize for quality in self._problem.objectives],
+            constraints=constraints,
+            bounds=[quality.bound(self._problem.task.horizon) for quality in self._problem.objectives],
+        )
+        return Evaluation(point, values, violations, exact=exact)
+
+    def in_user_terms(self, evaluation: Evaluation) -> tuple[float, ...]:
+        """Return the values in the user's terms: a cost as a cost."""
+        # Adding 0 makes 0 of -0.
+        return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
+
+    def _remember(self, evaluation: Evaluation) -> None:
+        if len(self._signs) > 1 or not evaluation.counts:
+            return
+        if self.best is None or evaluation.values[0] > self.best.values[0]:
+            self.best = evaluation
+
+
+class Gradients:
+    """Derivatives of a problem's first quality, over all conditions, by its parameters.
+
+    A gradient takes one simulation with AutoDiffXd under each condition, whatever the number of parameters.
+
+    Raises:
+        SolverError: a parameter is not continuous, or is a field of the scenario, which needs another diagram.
+        DerivativeError: the testbed does not convert to AutoDiffXd, or its integrator controls its error.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        for parameter in problem.parameters:
+            if parameter.is_field or not parameter.is_continuous:
+                raise SolverError(f"there is no derivative by {parameter.address}: use gradient='central'")
+        self._problem = problem
+        self._addresses = [parameter.address for parameter in problem.parameters]
+        placed = [problem.placed(problem.task, condition) for condition in problem.conditions]
+        # Converting a testbed takes longer than simulating it: most conditions share one.
+        distinct = {id(testbed): (task, testbed) for task, testbed in placed}
+        runners = {key: DerivativeRunner(*pair) for key, pair in distinct.items()}
+        self._runners = [runners[id(testbed)] for _, testbed in placed]
+
+    def at(self, point: Point) -> tuple[float, ...]:
+        """Return the gradient of the value that a solver is told (larger is better), shape (n,)."""
+        problem = self._problem
+        sign = -1.0 if problem.objectives[0].minimize else 1.0
+        values, slopes = [], []
+        for condition, runner in enumerate(self._runners):
+            parameters = split(problem.values(point, condition=condition))[1]
+            value, slope = runner.run(parameters, self._addresses)
+            values.append(sign * value)
+            slopes.append(sign * slope)
+        h = np.array(values)
+        base = problem.risk(h)
+        weights = [(problem.risk(h + _STEP * unit) - base) / _STEP for unit in np.eye(h.size)]
+        return tuple((np.array(weights) @ np.array(slopes)).tolist())
