@@ -1,4 +1,4 @@
-"""``vtbdrake hub`` as its users run it."""
+"""The command ``vtbdrake hub``."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ from vtbdrake.lcm.hub import HubStatistics
 
 @contextlib.contextmanager
 def running(*arguments: object):
-    """The program, and the URL that it has printed."""
+    """Run the program; yield it and the URL that it has printed."""
     command = [sys.executable, "-m", "vtbdrake.cli", "hub", *map(str, arguments)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
         try:
@@ -27,7 +27,7 @@ def running(*arguments: object):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_prints_its_url_relays_and_ends_cleanly(number: signal.Signals) -> None:
+def test_hub_prints_its_url_and_ends_cleanly(number: signal.Signals) -> None:
     with running("--port", 0, "--protect", "COMMAND") as (program, url):
         first, second = lcm.LCM(url), lcm.LCM(url)
         received: list[bytes] = []
@@ -47,7 +47,7 @@ def test_it_prints_its_url_relays_and_ends_cleanly(number: signal.Signals) -> No
     assert "Traceback" not in stderr
 
 
-def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
+def test_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         program = run("hub", "--port", port)
@@ -56,17 +56,17 @@ def test_a_port_in_use_is_one_line_and_exit_code_2() -> None:
     assert program.stderr.count("\n") == 1
 
 
-def test_it_runs_on_the_processors_that_it_is_told() -> None:
+def test_hub_runs_on_the_given_processors() -> None:
     cpu = max(os.sched_getaffinity(0))
     with running("--port", 0, "--cpu", cpu) as (program, url):
         bus = lcm.LCM(url)
         bus.subscribe("VTB_HUB", lambda *_: None)
-        assert bus.handle_timeout(30_000)  # it serves
+        assert bus.handle_timeout(30_000)
         assert os.sched_getaffinity(program.pid) == {cpu}
 
 
 def protected(url: str) -> set[str]:
-    """The channels that the hub says it protects."""
+    """Return the protected channels in the published status."""
     bus, found = lcm.LCM(url), []
     bus.subscribe("VTB_HUB", lambda _, data: found.append(set(HubStatistics.from_json(data).protected)))
     while not found:
@@ -84,7 +84,7 @@ def protected(url: str) -> set[str]:
         (("--unprotected",), set(), False),
     ],
 )
-def test_what_is_protected_by_default(arguments: tuple[str, ...], channels: set[str], warns: bool) -> None:
+def test_default_protection(arguments: tuple[str, ...], channels: set[str], warns: bool) -> None:
     with running("--port", 0, *arguments) as (program, url):
         assert protected(url) == channels
         program.send_signal(signal.SIGINT)
@@ -94,7 +94,7 @@ def test_what_is_protected_by_default(arguments: tuple[str, ...], channels: set[
         assert channel in stderr
 
 
-def test_a_hub_without_a_scenario_needs_nothing_of_drake() -> None:
+def test_hub_without_scenario_does_not_import_drake() -> None:
     code = "import sys, vtbdrake.cli.hub; print([name for name in sys.modules if 'pydrake' in name])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout == "[]\n"

@@ -1,22 +1,27 @@
-"""Clients of a hub: unmodified LCM, raw sockets, and LCM in processes that can be stopped and killed."""
+"""Clients of a hub for tests: unmodified LCM, raw sockets, and LCM in processes that can be stopped and killed."""
 
 import contextlib
 import json
+import os
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import lcm
 
-from vtbdrake.lcm.hub import HubStatistics
+from vtbdrake.lcm.hub import Hub, HubStatistics
+from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
 TIMEOUT = 30.0
+MEBIBYTE = 1024 * 1024
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)
+WELCOME = struct.pack(">II", 0x287617FA, 0x0100)
 
 _PROGRAM = """
 import json, lcm, sys
@@ -30,7 +35,7 @@ for line in sys.stdin:
 
 
 class Client:
-    """An unmodified LCM client, and what it has received."""
+    """An unmodified LCM client that keeps the messages it receives."""
 
     def __init__(self, url: str, *patterns: str) -> None:
         self.bus = lcm.LCM(url)
@@ -49,7 +54,7 @@ class Client:
         return [data for name, data in self.received if name == channel]
 
     def sync(self) -> None:
-        """Returns when the hub has handled all that this client has sent, and this client all that the hub had sent."""
+        """Wait until hub and client have handled all messages that they had sent to each other."""
         self._turns += 1
         seen: list[str] = []
         subscription = self.bus.subscribe(f"SYNC_{id(self)}_{self._turns}", lambda channel, _: seen.append(channel))
@@ -58,14 +63,14 @@ class Client:
         self.bus.unsubscribe(subscription)
 
     def wait(self, condition: Callable[[], bool]) -> None:
-        """Takes in messages until the condition holds."""
+        """Receive messages until the condition holds."""
         deadline = time.monotonic() + TIMEOUT
         while not condition():
-            assert time.monotonic() < deadline, "waited in vain"
+            assert time.monotonic() < deadline, "timeout"
             self.bus.handle_timeout(100)
 
     def wait_for_status(self, condition: Callable[[HubStatistics], bool]) -> HubStatistics:
-        """What the hub publishes, as soon as the condition holds."""
+        """Return the first published status for which the condition holds."""
         found: list[HubStatistics] = []
 
         def look(_: str, data: bytes) -> None:
@@ -93,13 +98,13 @@ class ClientProcess:
         self._await("ready")
 
     def begin(self, *messages: tuple[str, str]) -> None:
-        """Tells it to publish, and does not wait."""
+        """Begin to publish without waiting."""
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(messages) + "\n")
         self.process.stdin.flush()
 
     def publish(self, *messages: tuple[str, str]) -> None:
-        """Returns when it has published."""
+        """Publish, and wait until it is done."""
         self.begin(*messages)
         self.end()
 
@@ -130,21 +135,41 @@ def address(url: str) -> tuple[str, int]:
 
 
 @contextlib.contextmanager
-def raw_client(url: str, greeting: bytes = GREETING):
-    """A socket on which the test speaks itself."""
-    with socket.create_connection(address(url), timeout=TIMEOUT) as sock:
-        sock.sendall(greeting)
+def raw_client(url: str, greeting: bytes = GREETING, *, unix: bool = False) -> Iterator[socket.socket]:
+    """Connect a socket, by TCP or by the shortcut, on which the test speaks tcpq itself."""
+    sock = connect_shortcut(*address(url)) if unix else socket.create_connection(address(url))
+    assert sock is not None
+    with sock:
+        sock.settimeout(TIMEOUT)
+        if greeting:  # Sending nothing fails, too, once the hub has closed the connection.
+            sock.sendall(greeting)
         yield sock
 
 
+@contextlib.contextmanager
+def stopped(hub: Hub) -> Iterator[None]:
+    """Stop the process of the hub meanwhile."""
+    os.kill(hub.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(hub.pid, signal.SIGCONT)
+
+
+def resident(pid: int) -> int:
+    """Return the resident memory of a process in bytes."""
+    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS"))
+    return 1024 * int(line.split()[1])
+
+
 def record(kind: int, channel: bytes, data: bytes | None = None) -> bytes:
-    """As LCM's ``lcm_tcpq.c`` writes it."""
+    """Return a record as LCM's ``lcm_tcpq.c`` writes it."""
     text = struct.pack(">II", kind, len(channel)) + channel
     return text if data is None else text + struct.pack(">I", len(data)) + data
 
 
 def receive(sock: socket.socket, size: int) -> bytes:
-    """So many bytes, and no fewer."""
+    """Receive exactly ``size`` bytes."""
     data = bytearray()
     while len(data) < size:
         part = sock.recv(size - len(data))
@@ -154,7 +179,7 @@ def receive(sock: socket.socket, size: int) -> bytes:
 
 
 def is_disconnected(sock: socket.socket) -> bool:
-    """Waits for the hub to hang up, or for more than the hub would ever send."""
+    """Return whether the hub closes the connection before it sends more than any test expects."""
     try:
         for _ in range(1000):
             if not sock.recv(65536):
@@ -167,5 +192,5 @@ def is_disconnected(sock: socket.socket) -> bool:
 def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + TIMEOUT
     while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, "timeout"
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""What the hub does with messages that a client does not take at once."""
+"""The backlog of a client."""
 
 import random
 import socket
@@ -19,7 +19,7 @@ def by_tcp() -> tuple[socket.socket, socket.socket]:
 
 
 @pytest.mark.parametrize("connected", [by_tcp, socket.socketpair])
-def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted(
+def test_backlog_arrives_complete_and_in_order_except_dropped(
     connected: Callable[[], tuple[socket.socket, socket.socket]],
 ) -> None:
     choose = random.Random(1)
@@ -38,12 +38,12 @@ def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted(
             dropped += hub.send(messages, 0.0)
             assert hub.queued <= MAX_QUEUE
             if choose.random() < 0.5:
-                received += taken(client)
+                received += receive_some(client)
                 hub.flush(0.0)
         while hub.queued:
-            received += taken(client)
+            received += receive_some(client)
             hub.flush(0.0)
-        received += taken(client)
+        received += receive_some(client)
     whole = [part + b"\xff" for part in received.split(b"\xff")[:-1]]
     assert received.endswith(b"\xff")
     numbers = [int(part[:5]) for part in whole]
@@ -52,7 +52,7 @@ def test_what_is_taken_late_comes_whole_and_in_order_and_the_rest_is_counted(
     assert 0 < dropped == len(sent) - len(whole)
 
 
-def taken(client: socket.socket) -> bytes:
+def receive_some(client: socket.socket) -> bytes:
     try:
         return client.recv(1 << 16)
     except BlockingIOError:

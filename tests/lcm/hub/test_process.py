@@ -1,4 +1,4 @@
-"""The hub as a process, as a thread, and where it listens."""
+"""The hub as a process and as a thread."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ from vtbdrake.lcm.hub import Hub, HubAddressError, HubConfig, HubError, HubServe
 
 
 def listening(pid: int) -> list[str]:
-    """Local addresses of the TCP sockets on which a process listens, as hexadecimal ``address:port``."""
+    """Return the addresses of the listening TCP sockets of a process, as hexadecimal ``address:port``."""
     inodes = {os.readlink(fd) for fd in Path(f"/proc/{pid}/fd").iterdir()}
     rows = [
         line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/{pid}/net/{name}").read_text().splitlines()
@@ -31,13 +31,13 @@ def is_gone(pid: int) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def test_it_listens_on_loopback_only(hub) -> None:
+def test_hub_listens_on_loopback_only(hub) -> None:
     host, port = address(hub.url)
     assert host == "127.0.0.1"
     assert listening(hub.pid) == [f"0100007F:{port:04X}"]
 
 
-def test_another_address_is_asked_for_by_name() -> None:
+def test_hub_listens_on_the_configured_address() -> None:
     with Hub(host="127.0.0.2", port=0) as hub:
         assert address(hub.url)[0] == "127.0.0.2"
         client = Client(hub.url, "A")
@@ -45,7 +45,7 @@ def test_another_address_is_asked_for_by_name() -> None:
         client.wait(lambda: bool(client.received))
 
 
-def test_a_port_in_use_is_an_error_that_says_so(hub) -> None:
+def test_port_in_use_is_an_error(hub) -> None:
     port = address(hub.url)[1]
     for attempt in (lambda: Hub(port=port).start(), lambda: HubServer(HubConfig(port=port))):
         with pytest.raises(HubAddressError, match=f"127.0.0.1:{port} .Address already in use"):
@@ -54,12 +54,12 @@ def test_a_port_in_use_is_an_error_that_says_so(hub) -> None:
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", "::1"])
-def test_an_address_that_is_not_ours_is_an_error_that_names_it(host: str) -> None:
+def test_address_of_another_machine_is_an_error(host: str) -> None:
     with pytest.raises(HubAddressError, match=host):
         Hub(host=host, port=0).start()
 
 
-def test_it_ends_with_the_block_and_can_be_started_again() -> None:
+def test_hub_ends_with_the_block_and_restarts() -> None:
     hub = Hub(port=0)
     for _ in range(2):
         with hub:
@@ -73,7 +73,7 @@ def test_it_ends_with_the_block_and_can_be_started_again() -> None:
                 use()
 
 
-def test_it_ends_when_the_process_that_started_it_is_killed() -> None:
+def test_hub_ends_with_its_parent() -> None:
     program = "from vtbdrake.lcm.hub import Hub\nhub = Hub(port=0)\nhub.start()\nprint(hub.pid, flush=True)\ninput()"
     with subprocess.Popen(
         [sys.executable, "-c", program],
@@ -89,7 +89,7 @@ def test_it_ends_when_the_process_that_started_it_is_killed() -> None:
     wait_until(lambda: is_gone(pid))
 
 
-def test_a_hub_that_was_killed_says_so() -> None:
+def test_killed_hub_is_an_error() -> None:
     with Hub(port=0) as hub:
         os.kill(hub.pid, signal.SIGKILL)
         with pytest.raises(HubError, match=f"the hub at {hub.url} does not answer"):
@@ -97,18 +97,18 @@ def test_a_hub_that_was_killed_says_so() -> None:
                 hub.statistics()
 
 
-def test_ctrl_c_is_the_business_of_the_process_that_started_it(hub) -> None:
+def test_hub_process_ignores_ctrl_c(hub) -> None:
     lines = Path(f"/proc/{hub.pid}/status").read_text().splitlines()
     ignored = next(int(line.split()[1], 16) for line in lines if line.startswith("SigIgn"))
     assert ignored >> (signal.SIGINT - 1) & 1
 
 
-def test_a_misspelt_field_is_an_error() -> None:
+def test_misspelled_field_is_an_error() -> None:
     with pytest.raises(TypeError, match="protected"):
         Hub(protected=["A"])
 
 
-def test_it_runs_in_a_thread_for_clients_of_other_processes() -> None:
+def test_hub_server_runs_in_a_thread() -> None:
     server = HubServer(HubConfig(port=0))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -125,18 +125,18 @@ def test_it_runs_in_a_thread_for_clients_of_other_processes() -> None:
     server.close()
 
 
-def test_hub_runs_on_the_processors_that_it_is_told() -> None:
+def test_hub_runs_on_the_configured_processors() -> None:
     cpu = max(os.sched_getaffinity(0))
     with Hub(port=0, cpus=[cpu]) as hub:
         assert os.sched_getaffinity(hub.pid) == {cpu}
 
 
-def test_hub_that_is_told_processors_that_are_not_there_runs_on_any() -> None:
+def test_hub_ignores_missing_processors() -> None:
     with Hub(port=0, cpus=[1023]) as hub:
         assert os.sched_getaffinity(hub.pid) == os.sched_getaffinity(0)
 
 
-def test_real_time_scheduling_is_asked_for_and_not_insisted_on() -> None:
+def test_hub_uses_real_time_priority_if_granted() -> None:
     attempt = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))"
     granted = subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode == 0
     with Hub(port=0, priority=3) as hub:
