@@ -1,4 +1,4 @@
-"""What comes by sockets, put together again; compiled."""
+"""Compiled buffers that reassemble what arrives on sockets."""
 
 from cpython.bytes cimport PyBytes_FromStringAndSize
 from cpython.exc cimport PyErr_CheckSignals, PyErr_SetFromErrno
@@ -15,7 +15,9 @@ cdef extern from "<sys/socket.h>" nogil:
     ssize_t recv(int, void*, size_t, int)
 
 cdef class Stream:
-    """What has come by a stream and is not cut yet. Its memory grows with what has arrived, not with what was announced.
+    """A buffer of received bytes that are not processed yet.
+
+    Its memory grows with what has arrived, not with a length that the sender announces.
     """
 
     def __dealloc__(self):
@@ -23,18 +25,18 @@ cdef class Stream:
 
     @property
     def partial(self):
-        """Whether something has begun and not ended."""
+        """True while there are unprocessed bytes."""
         return self.end > self.begin
 
     cdef char* _space(self, Py_ssize_t size) except NULL:
-        """Where so many bytes more, at least one, may be written."""
+        """Return where ``size`` more bytes (at least one) may be written."""
         cdef Py_ssize_t have = self.end - self.begin
         cdef Py_ssize_t room = self.room
         if self.begin and have <= self.begin:
             memcpy(self.buffer, self.buffer + self.begin, have)
             self.begin, self.end = 0, have
         if not have and room > 4 * size:
-            room = 0  # A large message has gone by.
+            room = 0  # It was large because of a message that is processed: give the memory back.
         if self.end + size > room:
             room = 2 * (self.end + size)
         if room != self.room:
@@ -44,23 +46,27 @@ cdef class Stream:
             self.buffer, self.room = buffer, room
         return self.buffer + self.end
 
-    cdef int _came(self, Py_ssize_t size) except -1:
-        """So many have been written there."""
+    cdef int _received(self, Py_ssize_t size) except -1:
+        """Add bytes that were written there."""
         self.end += size
         return 0
 
     def append(self, const unsigned char[::1] data):
-        """Adds what has come."""
+        """Add received bytes."""
         cdef Py_ssize_t size = data.shape[0]
         if size:
             memcpy(self._space(size), &data[0], size)
-            self._came(size)
+            self._received(size)
 
     def receive(self, int fileno, int limit):
-        """Adds what has come by a socket, without waiting, ``limit`` bytes at most; says how many.
+        """Receive bytes from a socket without waiting.
+
+        Args:
+            fileno: descriptor of the socket.
+            limit: the most bytes to receive.
 
         Returns:
-            0 if the other side has closed the connection, -1 if nothing has come.
+            The number of bytes; 0 if the other side has closed the connection, -1 if nothing has arrived.
 
         Raises:
             OSError: the connection is lost.
@@ -68,12 +74,12 @@ cdef class Stream:
         """
         cdef ssize_t size
         if limit < 1:
-            raise ValueError(f"the most that is received is a positive number of bytes, not {limit}")
+            raise ValueError(f"limit is a positive number of bytes, not {limit}")
         while True:
-            # Every time anew: a signal's handler may have read from here, too.
+            # In every pass: a signal's handler may have received into this buffer, too.
             size = recv(fileno, self._space(limit), limit, MSG_DONTWAIT)
             if size >= 0:
-                self._came(size)
+                self._received(size)
                 return size
             if errno == EAGAIN:
                 return -1
@@ -83,10 +89,10 @@ cdef class Stream:
 
 
 cdef class Frames(Stream):
-    """Puts frames together again, each its length (64 bits, little-endian) and its bytes, from pieces cut anywhere."""
+    """Reassembles frames, each its length (64 bits, little-endian) and its bytes."""
 
     def frame(self):
-        """The next frame; None if it is not there yet."""
+        """Return the next frame; None if it is not complete yet."""
         cdef Py_ssize_t have = self.end - self.begin
         cdef uint64_t size
         if have < 8:

@@ -175,24 +175,25 @@ class LcmBridge(Bridge):
                 raise ValueError(f"there is no actuator signal {name}; there are {', '.join(self.sent)}")
         self._utime = utime = max(self._utime + 1, int((self._time_of_day + time.monotonic()) * 1e6))
         messages = [
-            (writer, data) for writer in self._writers if (data := writer.message(actuation, utime)) is not None
+            (writer.channel, *message)
+            for writer in self._writers
+            if (message := writer.message(actuation, utime)) is not None
         ]
-        if not messages:
-            return tuple(actuation)
         if self._watch:
-            for writer, data in messages:
-                self._foreign.expect(writer.channel, data)
-        sent = self.link.publish(*[(writer.channel, data) for writer, data in messages])
+            for channel, _, data in messages:
+                self._foreign.expect(channel, data)
+        sent = bool(messages) and self.link.publish(*[(channel, data) for channel, _, data in messages])
         passed: set[str] = set()
-        for writer, data in messages:
+        for channel, names, data in messages:
             # A refused message was sent all the same: the hub lets it pass as soon as the channel is free.
-            refused = "refused" if writer.channel in self._foreign.blocked else ""
+            refused = "refused" if channel in self._foreign.blocked else ""
             problem = refused if sent else "no bus"
-            writer.count(problem)
+            for name in names:
+                self.sent[name].record(problem)
             if not problem:
-                passed.update(writer.named)
+                passed.update(names)
             if sent and self.tap is not None:
-                self.tap(writer.channel, data)
+                self.tap(channel, data)
         return () if len(passed) == len(actuation) else tuple(name for name in actuation if name not in passed)
 
     def _tapped(self, reader: ChannelReader) -> Handler:
@@ -300,18 +301,16 @@ class SentSignal:
     count: int = 0
     withheld: dict[str, int] = field(default_factory=dict)
 
-    def withhold(self, reason: str) -> None:
-        """Count an actuator command that was not sent."""
-        self.withheld[reason] = self.withheld.get(reason, 0) + 1
+    def record(self, problem: str) -> None:
+        """Count an actuator command as sent, or as withheld because of a problem."""
+        if problem:
+            self.withheld[problem] = self.withheld.get(problem, 0) + 1
+        else:
+            self.count += 1
 
 
 class ChannelWriter:
-    """Makes the messages of one channel.
-
-    Attributes:
-        channel: name of the channel.
-        named: the signals of the last message.
-    """
+    """Makes the messages of one channel; ``channel`` is its name."""
 
     def __init__(self, map: LcmMap, signals: Sequence[Signal], sent: Mapping[str, SentSignal]) -> None:
         """Prepare the encoder.
@@ -319,46 +318,39 @@ class ChannelWriter:
         Args:
             map: the map of the channel.
             signals: the signals of the map, in its order.
-            sent: what to count in, by signal.
+            sent: counts what is withheld, by signal.
 
         Raises:
             ValueError: the map cannot carry the signals.
         """
         self.channel = map.channel
-        self.named: list[str] = []
         self._encode = map.encoder(signals)
         self._ranges = {signal.name: ValueRange(signal) for signal in signals}
         self._sent = sent
 
-    def message(self, actuation: Mapping[str, Any], utime: int) -> bytes | None:
-        """Return the message with this channel's actuator commands; None if there are none, or one must not be sent."""
+    def message(self, actuation: Mapping[str, Any], utime: int) -> tuple[list[str], bytes] | None:
+        """Return the signals and the bytes of the message with this channel's actuator commands.
+
+        None if there are no such commands, or if one of them must not be sent: then all are withheld.
+        """
         values, faults = {}, {}
         for name, range in self._ranges.items():
             if name in actuation:
                 values[name] = actuation[name]
                 if reason := range.check(values[name]):
                     faults[name] = reason
-        self.named = list(values)
         if not values:
             return None
         if not faults:
             try:
-                return self._encode(values, utime)
+                return list(values), self._encode(values, utime)
             except LookupError:
                 faults = dict.fromkeys(values, "incomplete")
             except (Exception, SystemExit):
                 faults = dict.fromkeys(values, "encode")
         for name in values:
-            self._sent[name].withhold(faults.get(name, "companion"))
+            self._sent[name].record(faults.get(name, "companion"))
         return None
-
-    def count(self, problem: str) -> None:
-        """Count the last message as sent, or as withheld because of the problem."""
-        for name in self.named:
-            if problem:
-                self._sent[name].withhold(problem)
-            else:
-                self._sent[name].count += 1
 
 
 class ForeignCommands:

@@ -89,23 +89,6 @@ class Connection(ABC):
         """Close the connection."""
 
 
-def connect(url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> Connection:
-    """Connect to a bus and subscribe to channels.
-
-    Args:
-        url: the LCM URL of the bus.
-        handlers: by channel, what takes its messages.
-        timeout: seconds to wait for a hub.
-        stamped: whether the kernel shall stamp what arrives; it does so for tcpq, over TCP.
-
-    Raises:
-        OSError: there is no bus.
-    """
-    if url.startswith("tcpq://"):
-        return TcpqConnection(url, handlers, timeout, stamped=stamped)
-    return LibraryConnection(url, handlers)
-
-
 class LibraryConnection(Connection):
     """A connection by liblcm: udpm, mpudpm, memq, file."""
 
@@ -141,6 +124,15 @@ class TcpqConnection(Connection):
     liblcm's client is not used because it blocks: it sends a message in five parts, waits in the middle of a message
     for as long as the hub does, and reconnects (and waits) in any call after a loss, even in its destructor. It also
     believes any length that it is told.
+
+    Args:
+        url: ``tcpq://host:port``; both have defaults.
+        handlers: by channel, what takes its messages.
+        timeout: seconds to wait for the hub.
+        stamped: whether the kernel shall stamp what arrives; it does so for TCP only.
+
+    Raises:
+        OSError: there is no hub.
     """
 
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
@@ -301,11 +293,20 @@ class LcmLink:
     def __init__(
         self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float, stamped: bool = False
     ) -> None:
-        """Prepare the link; `open` connects. The arguments are those of `connect`."""
+        """Prepare the link; `open` connects.
+
+        Args:
+            url: the LCM URL of the bus.
+            handlers: by channel, what takes its messages.
+            connect_timeout: seconds to wait for a hub.
+            stamped: whether the kernel shall stamp what arrives; see `TcpqConnection`.
+        """
         self.url = url
         self.losses = 0
         self.reconnections = 0
-        self._connect = partial(connect, url, handlers, connect_timeout, stamped=stamped)
+        self._connect: Callable[[], Connection] = partial(LibraryConnection, url, handlers)
+        if url.startswith("tcpq://"):
+            self._connect = partial(TcpqConnection, url, handlers, connect_timeout, stamped=stamped)
         self._connection: Connection | None = None
         self._search: _Search | None = None
 

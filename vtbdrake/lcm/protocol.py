@@ -1,4 +1,4 @@
-"""What a machine speaks: the maps between its LCM channels and the signals of the scenario that plays it."""
+"""The LCM protocol of a machine: the maps between its channels and the signals of its scenario."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Protocol:
         sense: what the machine publishes; each sensor signal in one map.
         act: what it listens to; each actuator signal in one map.
         commands: commands u that reach the controller over LCM; the machine has no part in them.
-        reported: by actuator signal, the name under which a map of ``sense`` carries the command that the machine says
-            acts on it: the command of its cycle that has just ended.
+        reported: by actuator signal, the name under which a map of ``sense`` carries the actuator command that the
+            machine says it executed in the cycle that has just ended.
         periods: by channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named.
     """
 
@@ -44,7 +44,13 @@ class Protocol:
     periods: Mapping[str, float] = field(default_factory=dict)
 
     def bridge(self, interface: Interface, url: str, **options: Any) -> LcmBridge:
-        """The controller's end, not yet open; ``options`` are those of `LcmBridge`."""
+        """Return the controller's end, not yet open.
+
+        Args:
+            interface: the DPS's signals.
+            url: the LCM URL of the bus.
+            **options: further arguments of `LcmBridge`.
+        """
         return LcmBridge(
             interface,
             url,

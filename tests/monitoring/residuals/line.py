@@ -31,7 +31,7 @@ class Ear(Bridge):
         self.heard: deque[tuple[str, bytes]] = deque()
         signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
         receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
-        self._inlets = {
+        self._readers = {
             map.channel: ChannelReader(map, [signals[name] for name in map.signals], receptions, 0.1)
             for map in protocol.sense
         }
@@ -50,7 +50,7 @@ class Ear(Bridge):
         count = len(self.heard)
         while self.heard:
             channel, data = self.heard.popleft()
-            self._inlets[channel].take(channel, data)
+            self._readers[channel].take(channel, data)
         return count
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
@@ -72,7 +72,7 @@ class Line(Ear):
         self.ears: list[Ear] = []
         signals = {signal.name: signal for signal in self.interface.act}
         sent = {name: SentSignal() for name in signals}
-        self._outlets = [
+        self._writers = [
             ChannelWriter(map, [signals[n] for n in map.signals], sent) for map in protocol_of(scenario).act
         ]
         self._begun = False
@@ -90,10 +90,10 @@ class Line(Ear):
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         self._utime += 1
-        for outlet in self._outlets:
-            data = outlet.message(actuation, self._utime)
-            assert data is not None
-            self.machine.receive(outlet.channel, data)
+        for writer in self._writers:
+            message = writer.message(actuation, self._utime)
+            assert message is not None
+            self.machine.receive(writer.channel, message[1])
         return ()
 
 

@@ -158,13 +158,13 @@ cdef class TcpqReader(Stream):
         PyByteArray_Resize(self.large, self.filled + size)
         return PyByteArray_AS_STRING(self.large) + self.filled
 
-    cdef int _came(self, Py_ssize_t size) except -1:
+    cdef int _received(self, Py_ssize_t size) except -1:
         if self.large is None or self.filled == self.size:
-            return Stream._came(self, size)
+            return Stream._received(self, size)
         cdef Py_ssize_t beyond = self.filled + size - self.size
         if beyond > 0:  # bytes of the next record
             memcpy(Stream._space(self, beyond), PyByteArray_AS_STRING(self.large) + self.size, beyond)
-            Stream._came(self, beyond)
+            Stream._received(self, beyond)
         self.filled += size - max(beyond, 0)
         if self.filled == self.size:
             PyByteArray_Resize(self.large, self.size)
