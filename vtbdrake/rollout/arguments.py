@@ -7,7 +7,8 @@ from typing import Any
 
 
 def as_number(name: str, value: Any) -> float:
-    """
+    """Return ``value`` as a float; raise a ValueError if it is no number (a string is none, nor is True).
+
     Raises:
         ValueError: it is no number; a text is none, nor is True.
     """
@@ -20,7 +21,8 @@ def as_number(name: str, value: Any) -> float:
 
 
 def as_whole(name: str, value: Any) -> int:
-    """
+    """Return ``value`` as an int; raise a ValueError if it is no whole number (1e4 is one, 1.5 is none).
+
     Raises:
         ValueError: it is no whole number; 1e4 is one, 1.5 is none.
     """
@@ -30,7 +32,7 @@ def as_whole(name: str, value: Any) -> int:
 
 
 def as_addresses(name: str, values: Any) -> tuple[str, ...]:
-    """One address, or several.
+    """Return one address, or several, as a tuple; raise a ValueError for anything else.
 
     Raises:
         ValueError: it is neither.
@@ -39,7 +41,7 @@ def as_addresses(name: str, values: Any) -> tuple[str, ...]:
 
 
 def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
-    """The values, each of which is a ``kind``.
+    """Return the values as a tuple, after a check that each is a ``kind``.
 
     Args:
         name: of the argument.

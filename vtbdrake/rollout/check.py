@@ -30,7 +30,7 @@ Sample = Mapping[str, tuple[Any, ...]]
 
 @dataclass(frozen=True)
 class Check:
-    """What a check has found.
+    """The findings of `check_rollouts`.
 
     Attributes:
         findings: one sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
@@ -44,7 +44,7 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing was found."""
+        """Return whether nothing was found."""
         return not self.findings
 
     def __str__(self) -> str:
@@ -87,7 +87,7 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
 
 
 def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:
-    """The numbers of all systems at each sample time, and what ended it, at the time before."""
+    """Yield the numbers of all systems at each sample time, and at last what ended the rollout."""
     systems = list(leaves(runner.testbed.diagram))
     t = 0.0
     try:
@@ -102,7 +102,7 @@ def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[fl
 
 
 def _within(budget: float, trace: Iterator[tuple[float, Sample]]) -> Iterator[tuple[float, Sample]]:
-    """A few samples at least, and those of ``budget`` seconds."""
+    """Yield at least three samples, and as many as take ``budget`` seconds."""
     end = time.thread_time() + budget
     for count, sample in enumerate(trace):
         yield sample
@@ -117,7 +117,7 @@ def _first(trace: Iterator[tuple[float, Sample]], *, count: int) -> list[tuple[f
 def _side_by_side(
     runner: RolloutRunner, point: Mapping[str, Any], neighbour: RolloutRunner, other: Mapping[str, Any], count: int
 ) -> list[tuple[float, Sample]]:
-    """``count`` samples of one rollout, while another one takes its steps in turn."""
+    """Return ``count`` samples of one rollout, while another one takes its steps in turn."""
     pairs = zip_longest(_trace(neighbour, other), _trace(runner, point))
     return [mine for _, (_, mine) in zip(range(count), pairs, strict=False) if mine is not None]
 
@@ -129,7 +129,7 @@ def _compare(
     changed: Sequence[str],
     what: str,
 ) -> Iterator[str]:
-    """At most one finding: where the two part first."""
+    """Yield at most one finding: where the two rollouts differ first."""
     for (t, expected), (_, found) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
         parted = [path for path in {**expected, **found} if not _same(expected.get(path), found.get(path))]
         if not parted:
@@ -159,7 +159,7 @@ def _same(a: tuple[Any, ...] | None, b: tuple[Any, ...] | None) -> bool:
 
 
 def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
-    """By name, the attributes of the systems in Python: as bytes, or their identity where they do not pickle."""
+    """Return the attributes of the systems in Python, by name: as bytes, or their identity where they do not pickle."""
     return {
         f"self.{name} of {path} ({type(system).__name__})": _fingerprint(value)
         for path, system in leaves(testbed.diagram)
@@ -177,7 +177,7 @@ def _fingerprint(value: Any) -> Any:
 
 
 def _unsendable(task: RolloutTask) -> Iterator[str]:
-    """What of the task cannot be pickled, as deep as it can be named."""
+    """Yield at most one finding: the part of the task that cannot be pickled."""
     parts: dict[str, Any] = {}
     for measure in (*([task.quality] if task.quality is not None else []), *task.measures):
         function = measure.f
@@ -201,7 +201,7 @@ def _unsendable(task: RolloutTask) -> Iterator[str]:
 
 
 def _elsewhere(task: RolloutTask, runner: RolloutRunner, point: Mapping[str, Any], *, alone: bool) -> Iterator[str]:
-    """A rollout in another process; ``alone`` says whether rollouts agree in this one."""
+    """Compare with a rollout in another process; ``alone`` says whether rollouts agree in this one."""
     here = _run(lambda: runner.run(point))
     with ProcessExecutor(1) as executor:
         there = _run(lambda: next(iter(executor.run(task, [point])))[1])

@@ -17,7 +17,7 @@ NAMES = ("auto", "serial", "threads", "processes", "dask")
 
 
 def choose_executor(testbed: VirtualTestbed) -> str:
-    """The kind of executor that suits a testbed: threads, or processes where systems in Python have work to do."""
+    """Return the executor that suits a testbed: threads, or processes where systems in Python have work to do."""
     return "processes" if testbed.python_systems else "threads"
 
 
@@ -29,7 +29,7 @@ def make_executor(
     workers: int | None = None,
     time_limit: float | None = None,
 ) -> Executor:
-    """The executor that is asked for; who closes it leaves a pool or client of the user open.
+    """Return the requested executor. Closing it leaves a pool or client of the user open.
 
     Args:
         executor: ``auto``, ``serial``, ``threads``, ``processes`` or ``dask``; an Executor of ours; any

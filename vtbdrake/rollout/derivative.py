@@ -30,7 +30,7 @@ class DerivativeError(ValueError):
 
 
 class DerivativeRunner:
-    """The number that a rollout's quality is read as, and its derivatives by the parameters.
+    """Runs rollouts and their derivatives: the number that the quality is read as, by the parameters.
 
     The simulation runs once with AutoDiffXd, at fixed steps: with error control the steps would depend on the
     parameters, and the derivatives would be garbage. At the sample times the state and its derivatives ds/dp are
@@ -72,7 +72,14 @@ class DerivativeRunner:
         self._readers = [testbed.reader(address) for address in self._quality.of]
 
     def run(self, parameters: Mapping[str, Any], by: Sequence[str]) -> tuple[float, np.ndarray]:
-        """(the number, its derivatives of shape (n,)) at ``parameters`` (address -> value), by those named in ``by``.
+        """Run one rollout with derivatives.
+
+        Args:
+            parameters: address -> value, set in s0.
+            by: the n addresses of the parameters of the derivatives.
+
+        Returns:
+            The number that the quality is read as, and its derivatives, shape (n,).
 
         Raises:
             DerivativeError: a parameter is not part of the numeric groups of the context.
@@ -104,7 +111,7 @@ class DerivativeRunner:
         return context
 
     def _direction(self, parameters: Mapping[str, Any], address: str) -> dict[tuple[str, str, int], np.ndarray]:
-        """How the numeric groups move with a parameter: a central difference of what writing it does to them."""
+        """Return how writing a parameter changes the numeric groups: a central difference."""
         variable = self.testbed.variables()[address]
         if variable.carried_by:
             raise DerivativeError(
@@ -182,7 +189,6 @@ class DerivativeRunner:
 
 
 def _entries(leaf: Any, group: str, index: int) -> np.ndarray:
-    """A numeric group of a context of AutoDiffXd."""
     if group == "continuous":
         return np.array(leaf.get_continuous_state_vector().CopyToVector())
     if group == "discrete":

@@ -26,11 +26,11 @@ Parameters = Mapping[str, Any]
 
 
 class WorkerError(RuntimeError):
-    """Workers cannot do what they are asked for."""
+    """An error of the workers, not of a rollout."""
 
 
 def cores() -> int:
-    """The processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
@@ -43,7 +43,7 @@ class Executor(ABC):
 
     @abstractmethod
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """Runs one rollout per point and yields (index of the point, result) as they finish.
+        """Run one rollout per point, and yield (index of the point, result) as they finish.
 
         A point is a mapping address -> value; ``scenario.<field>`` is a field of the task's scenario, for which
         another testbed is built, and kept. A rollout that fails is a result, also when no testbed can be built with
@@ -52,7 +52,7 @@ class Executor(ABC):
         """
 
     def close(self) -> None:
-        """Gives back what it holds."""
+        """Release threads, processes and testbeds."""
         return
 
     def __enter__(self) -> Self:
@@ -85,7 +85,7 @@ class SerialExecutor(Executor):
 
 @dataclass(frozen=True)
 class _Job:
-    """One rollout for a thread; it puts exactly one item into ``done``."""
+    """One rollout for a thread, which puts exactly one item into ``done``."""
 
     task: RolloutTask
     index: int
@@ -166,7 +166,7 @@ def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
 
 
 def checked_workers(workers: int | None) -> int:
-    """How many workers; the number of cores if left out.
+    """Return the number of workers; the number of cores if ``workers`` is None.
 
     Raises:
         ValueError: there are none, or it is no number.
@@ -188,7 +188,7 @@ def run_rollouts(
     progress: bool = True,
     description: str = "rollouts",
 ) -> list[RolloutResult | None]:
-    """One result per point, in the order of ``points``.
+    """Return one result per point, in the order of ``points``, and show a progress bar.
 
     Ctrl-C ends the rollouts that run and hands out no more; the list then has None where there is no result.
 
@@ -213,5 +213,5 @@ def run_rollouts(
 
 
 def watched() -> bool:
-    """True in a terminal and in a notebook."""
+    """Return whether somebody watches the output: in a terminal or a notebook."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

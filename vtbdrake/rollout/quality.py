@@ -37,7 +37,8 @@ READINGS: dict[str, Reading] = {"best": _best, "worst": _worst, "end": _end, "in
 
 
 def check_reading(reading: str) -> str:
-    """
+    """Return ``reading``; raise a ValueError if it is unknown.
+
     Raises:
         ValueError: it is unknown.
     """
@@ -47,7 +48,7 @@ def check_reading(reading: str) -> str:
 
 
 class QualityError(ValueError):
-    """A quality function that raises, or returns what is not a quality."""
+    """A quality function that raises, or returns a value that is not a quality."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -86,14 +87,18 @@ class Measure:
 
     @property
     def name(self) -> str:
-        """Of its function."""
+        """Return the name of the function."""
         return str(getattr(self.f, "__name__", type(self.f).__name__))
 
     def __call__(self, values: Sequence[Any], *, time: float) -> float:
-        """f of the quality variables' values at ``time``.
+        """Return f of the quality variables.
+
+        Args:
+            values: those of the quality variables, in the order of ``of``.
+            time: of the sample, in seconds, for error messages.
 
         Raises:
-            QualityError: f raises, or returns what is not a number, is NaN or infinite.
+            QualityError: f raises, or returns something that is not a finite number.
         """
         try:
             sample = float(self.f(*values))
@@ -112,7 +117,7 @@ class Measure:
 
     @abstractmethod
     def read(self, times: np.ndarray, samples: np.ndarray) -> float:
-        """The one number that the samples at ``times`` are read as."""
+        """Return the number that the samples, shape (n,), at ``times`` are read as."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,14 +156,14 @@ class Quality(Measure):
             raise QualityError(f"{where()} is {sample}, more than its stated upper end of {self.upper:g}")
 
     def quality(self, samples: np.ndarray) -> np.ndarray:
-        """f' >= 0, larger is better, of samples of f or of the cost."""
+        """Return f' >= 0, larger is better, for samples of f or of the cost."""
         return 1.0 / (1.0 + np.asarray(samples)) if self.minimize else np.asarray(samples)
 
     def read(self, times: np.ndarray, samples: np.ndarray) -> float:
         return READINGS[self.reading](times, samples, not self.minimize)[1]
 
     def bound(self, horizon: float) -> float:
-        """The best that `read` can return for a rollout of ``horizon`` seconds."""
+        """Return the best value that `read` can return for a rollout of ``horizon`` seconds."""
         if self.minimize:
             return 0.0
         return self.upper * horizon if self.reading == "integral" else self.upper
@@ -166,7 +171,7 @@ class Quality(Measure):
 
 @dataclass(frozen=True, repr=False)
 class Constraint(Measure):
-    """What a rollout has to keep: f(q(t)) at most, or at least, a limit; by default at every sample time.
+    """A condition of a rollout: f(q(t)) is at most, or at least, a limit; by default at every sample time.
 
     Attributes:
         at_most, at_least: the limits, in the unit of f; one of them or both.
@@ -186,7 +191,7 @@ class Constraint(Measure):
             raise QualityError(f"a constraint takes at_most, at_least or both, in this order, not {limits}")
 
     def read(self, times: np.ndarray, samples: np.ndarray) -> float:
-        """The violation: at most 0 where the constraint holds."""
+        """Return the violation: at most 0 where the constraint holds."""
         violations = []
         if self.at_most < inf:
             violations.append(READINGS[self.reading](times, samples, False)[1] - self.at_most)
@@ -196,7 +201,7 @@ class Constraint(Measure):
 
 
 def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = False) -> np.ndarray:
-    """Which samples exceed the threshold, strictly: f above it or, with ``minimize``, the cost below it.
+    """Return which samples exceed the threshold, strictly: f above it or, with ``minimize``, the cost below it.
 
     A cost is compared itself, and not as 1 / (1 + cost), where small costs that differ are equal to the last bit.
     """
@@ -207,6 +212,8 @@ def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = Fa
 
 
 def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize: bool = False) -> int:
-    """The sample at t*, equations (14) to (16): the first that exceeds ``threshold``, else the first of the best."""
+    """Return the index of the sample at t*, equations (14) to (16): the first that exceeds ``threshold``, else the
+    first of the best.
+    """
     found = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
     return int(found[0]) if found.size else int(np.argmin(samples) if minimize else np.argmax(samples))

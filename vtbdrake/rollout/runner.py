@@ -21,11 +21,11 @@ from vtbdrake.testbed.interrupt import Interruptible
 
 
 class SimulationError(Exception):
-    """A simulation that cannot go on; it becomes the outcome of its rollout."""
+    """A simulation that cannot continue; it becomes the outcome of its rollout."""
 
 
 class CancelledError(Exception):
-    """The rollout was told to stop; it has no outcome."""
+    """A rollout that was told to stop; it has no outcome."""
 
 
 class RolloutRunner:
@@ -67,11 +67,15 @@ class RolloutRunner:
         self._changed: set[str] | None = None
 
     def run(self, parameters: Mapping[str, Any], *, cancel: threading.Event | None = None) -> RolloutResult:
-        """One rollout from s0 with ``parameters`` (address -> value) set in it.
+        """Run one rollout from s0.
+
+        Args:
+            parameters: address -> value, set in s0.
+            cancel: stops the rollout when it is set.
 
         Raises:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
-            CancelledError: ``cancel`` was set meanwhile.
+            CancelledError: ``cancel`` was set.
         """
         begin = time.perf_counter()
         samples = _Samples(self)
@@ -113,13 +117,13 @@ class RolloutRunner:
                 return
 
     def measured(self, t: float) -> list[float]:
-        """f and the other measures as they are now, at the sample time ``t``."""
+        """Return f and the other measures in the present state, at the sample time ``t``."""
         with _FailuresAsOutcomes():
             values = {address: read(self.context) for address, read in self._readers.items()}
         return [_sample(measure, [values[a] for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float) -> Any:
-        """s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
+        """Return s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
 
         Raises:
             ValueError: ``t`` is not a sample time.
@@ -179,17 +183,17 @@ class RolloutRunner:
 
     @property
     def steps(self) -> int:
-        """How many steps the integrator took in the last rollout."""
+        """Return how many steps the integrator took in the last rollout."""
         return int(self._simulator.get_num_steps_taken())
 
     @property
     def context(self) -> Context:
-        """The context of the last rollout, at its end."""
+        """Return the context of the last rollout, at its end."""
         return self._context
 
 
 def same_scenario(testbed: VirtualTestbed, task: RolloutTask) -> bool:
-    """Whether the testbed is that of the task."""
+    """Return whether the testbed was built from the scenario of the task."""
     return testbed.scenario is not None and testbed.scenario.record() == task.scenario.record()
 
 
@@ -213,7 +217,7 @@ class _FailuresAsOutcomes:
 
 
 class _Samples:
-    """The samples of the rollout that is running."""
+    """The samples of the present rollout."""
 
     def __init__(self, runner: RolloutRunner) -> None:
         self._runner = runner
@@ -223,7 +227,7 @@ class _Samples:
         self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
 
     def take(self, t: float) -> bool:
-        """Samples f, the measures and what is to be recorded; says whether the threshold is exceeded."""
+        """Sample f, the measures and the records; return whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
         with _FailuresAsOutcomes():
             recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
@@ -289,7 +293,7 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
 
 
 def _t_star(f: Quality, times: np.ndarray, samples: np.ndarray, threshold: float | None) -> tuple[float, float]:
-    """(t*, f or the cost there), equations (14) to (17); for another reading than ``best``, its time and number."""
+    """Return (t*, f or the cost there), equations (14) to (17); for other readings than ``best``, time and number."""
     if f.reading != "best":
         return READINGS[f.reading](times, samples, not f.minimize)
     index = best_sample(samples, threshold=threshold, minimize=f.minimize)
@@ -308,17 +312,17 @@ _RUNNERS = 16
 
 
 class BuildError(Exception):
-    """A testbed cannot be built with these values of its scenario's fields; it becomes the outcome of the rollout."""
+    """A testbed that cannot be built with some values of its scenario's fields: the outcome of the rollout."""
 
 
 def split(point: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The scenario's fields of a point, by their names, and the variables of s0, by address."""
+    """Split a point into the scenario's fields, by their names, and the variables of s0, by address."""
     fields = {address.removeprefix(FIELD): value for address, value in point.items() if address.startswith(FIELD)}
     return fields, {address: value for address, value in point.items() if not address.startswith(FIELD)}
 
 
 def failed(point: Mapping[str, Any], message: str) -> RolloutResult:
-    """The result of a rollout that could not be run."""
+    """Return the result of a rollout that could not be run."""
     return RolloutResult(parameters=dict(point), end=FAILED, message=message, times=np.array([]), quality=np.array([]))
 
 
@@ -339,7 +343,7 @@ class Testbeds:
         self._lock = threading.Lock()
 
     def get(self, scenario: Scenario) -> VirtualTestbed:
-        """The testbed of ``scenario``. A thread that asks for one that another thread builds waits for it."""
+        """Return the testbed of ``scenario``. A thread that asks for one that another thread builds waits for it."""
         key = _key(scenario.record())
         if self._known is not None and self._known.scenario is not None and key == _key(self._known.scenario.record()):
             return self._known
@@ -359,7 +363,7 @@ class Testbeds:
         return future.result()
 
     def touch(self, testbed: VirtualTestbed) -> None:
-        """Says that ``testbed`` is used again."""
+        """Mark ``testbed`` as just used."""
         with self._lock:
             for key in [key for key, future in self._built.items() if _gave(future, testbed)]:
                 self._built.move_to_end(key)
@@ -384,7 +388,7 @@ class Runners:
         self._threads = threading.local()
 
     def get(self, task: RolloutTask, fields: Mapping[str, Any]) -> RolloutRunner:
-        """This thread's runner of ``task``, with ``fields`` (name -> value) set in its scenario.
+        """Return this thread's runner of ``task``, with ``fields`` (name -> value) set in its scenario.
 
         Raises:
             ScenarioError: there is no such field, or the scenario refuses its value.
@@ -428,7 +432,7 @@ class Runners:
         cancel: threading.Event | None = None,
         begin: Callable[[], Any] | None = None,
     ) -> RolloutResult:
-        """One rollout at ``point``, in this thread; see `RolloutRunner.run`.
+        """Run one rollout at ``point``, in this thread; see `RolloutRunner.run`.
 
         A testbed that cannot be built with the point's fields is a failed rollout; fields that the scenario refuses
         are an error.
@@ -448,7 +452,7 @@ class Runners:
             return replace(result, parameters=dict(point)) if fields else result
 
     def clear(self) -> None:
-        """Forgets the runners of all threads, and the testbeds."""
+        """Forget the runners of all threads, and the testbeds."""
         self._threads = threading.local()
         self._testbeds.clear()
 

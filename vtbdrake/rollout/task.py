@@ -74,11 +74,11 @@ class RolloutResult:
 
     @property
     def failed(self) -> bool:
-        """Whether the simulation failed."""
+        """Return whether the rollout failed."""
         return self.end == FAILED
 
     def identical(self, other: RolloutResult) -> bool:
-        """True if nothing but the wall time differs, to the last bit."""
+        """Return whether nothing but the wall time differs, to the last bit."""
         return (
             (self.end, self.message) == (other.end, other.message)
             and self.parameters.keys() == other.parameters.keys()
@@ -192,24 +192,25 @@ class RolloutTask:
 
     @property
     def minimize(self) -> bool:
-        """Whether f is a cost."""
+        """Return whether f is a cost."""
         return self.quality is not None and self.quality.minimize
 
     @property
     def f_m(self) -> float:
-        """The threshold of f', as equations (14) to (16) have it; infinite if there is none."""
+        """Return the threshold of f', as in equations (14) to (16); infinite if there is none."""
         if self.threshold is None:
             return inf
         return 1.0 / (1.0 + self.threshold) if self.minimize else self.threshold
 
     def sample_times(self) -> np.ndarray:
-        """From 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
+        """Return the sample times from 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
         times = np.arange(np.floor(self.horizon / self.sample_period * (1.0 + 1e-12)) + 1.0) * self.sample_period
         rest = self.horizon - times[-1]
         return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
 
     def instants(self, t0: float, timings: Sequence[tuple[float, float]]) -> np.ndarray:
-        """The simulator's clock at the sample times: t0 + t or, where an event is meant to coincide, its instant.
+        """Return the simulator's clock at the sample times: t0 + t or, where an event is meant to coincide, its
+        instant.
 
         Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
         advanced to the one would take another step, of 1e-16 s, to the other.

@@ -43,7 +43,7 @@ def write_archive(
 
 
 def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return what `write_archive` would write."""
+    """Return the bytes that `write_archive` writes."""
     buffer = io.BytesIO()
     _write(buffer, kind, version, header, arrays)
     return buffer.getvalue()
@@ -112,7 +112,8 @@ def read_archive(
 
 
 def _check_entries(archive: zipfile.ZipFile) -> None:
-    """
+    """Reject entries that `write_archive` has not written, and those that would take too much memory.
+
     Raises:
         ValueError: there is an entry that `write_archive` has not written, or all would take too much memory.
     """
@@ -131,7 +132,8 @@ def _check_entries(archive: zipfile.ZipFile) -> None:
 
 
 def _array(data: bytes) -> np.ndarray:
-    """
+    """Return the array of an entry, unless its data are not what its header declares.
+
     Raises:
         ValueError: the data are not the array that their header declares.
     """
@@ -150,7 +152,9 @@ def _array(data: bytes) -> np.ndarray:
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a path beside ``path`` to write to; what was written there takes its place at the end, unless it fails."""
+    """Yield a path beside ``path`` to write to; at the end, that file replaces ``path``, unless an exception was
+    raised.
+    """
     target = Path(path)
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     try:

@@ -17,7 +17,7 @@ from vtbdrake.state.systems import class_name, is_camera, is_plant, is_scene_gra
 
 
 def codec_of(model: Any, *, varying: bool = False) -> Codec:
-    """The codec for values like ``model``, exact to the last bit.
+    """Return the codec for values like ``model``, exact to the last bit.
 
     An array, a number, a text, a pose, a rotation, one of Drake's images or a point cloud is one array or a few; a
     dataclass is one array per field, by its name; its fields are arrays and numbers.
@@ -52,7 +52,7 @@ def codec_of(model: Any, *, varying: bool = False) -> Codec:
 
 
 def array_codec(shape: tuple[int, ...], dtype: Any = float) -> Codec:
-    """The codec for arrays of one shape and type."""
+    """Return the codec for arrays of one shape and type."""
 
     def encode(value: Any) -> dict[str, np.ndarray]:
         array = np.asarray(value, dtype=dtype)
@@ -214,7 +214,7 @@ class AbstractState:
         return bool(self._codecs)
 
     def read(self, context: Context) -> dict[str, np.ndarray]:
-        """The arrays of the state in the system's own context, as ``<index>/<name>``.
+        """Return the state in the system's own context as arrays, by ``<index>/<name>``.
 
         Raises:
             SnapshotError: the state has become something that its codec does not take.
@@ -232,7 +232,7 @@ class AbstractState:
         return {f"{index}/{name}": np.asarray(array) for name, array in parts.items()}
 
     def writer(self, arrays: Arrays) -> Callable[[Context], None]:
-        """What sets the state in the system's own context to what `read` gave.
+        """Return a function that sets the state in the system's own context to what `read` gave.
 
         Raises:
             SnapshotError: the arrays are not those of such a state.
@@ -271,7 +271,7 @@ class DelayState(AbstractState):
         self._codecs = dict.fromkeys(range(context.num_abstract_states() - 1), self._codec_of(context, 0))
 
     def read(self, context: Context) -> dict[str, np.ndarray]:
-        """The arrays of the delayed values, as ``<index>/<name>``, the oldest with the index 0."""
+        """Return the delayed values as arrays, by ``<index>/<name>``; the oldest has the index 0."""
         own = self._system.CreateDefaultContext()
         own.SetStateAndParametersFrom(context)
         self._feed(own, own.get_abstract_state(0).get_value())
@@ -302,7 +302,7 @@ class DelayState(AbstractState):
 
 
 def abstract_state(path: str, system: System, context: Context) -> AbstractState:
-    """How the abstract state of the leaf system at ``path`` is read and written; ``context`` is any of its own.
+    """Return the reader and writer of the abstract state of the leaf system at ``path``.
 
     Raises:
         SnapshotError: the system keeps an abstract value that no codec can carry.

@@ -20,8 +20,14 @@ PARAMETER = "parameter"
 class Element:
     """One named piece of a numeric group of a LeafSystem's context.
 
-    ``shape`` ``()`` is a scalar. The values lie in the group ``group`` with number ``index``, from entry
-    ``start`` on, in C order. ``bounds`` hold for every entry.
+    Attributes:
+        name: last part of the address.
+        group: ``continuous``, ``discrete`` or ``parameter``.
+        index: number of the group.
+        shape: ``()`` is a scalar; arrays lie in C order.
+        start: first entry in the group.
+        unit: SI unit; ``"1"`` if it has none.
+        bounds: closed interval, for every entry.
     """
 
     name: str
@@ -42,7 +48,7 @@ def parameter(
     unit: str = "1",
     bounds: tuple[float, float] = (-inf, inf),
 ) -> Element:
-    """A piece of the numeric parameter group ``index``: part of a in s = [x, a]."""
+    """Name a piece of the numeric parameter group ``index``: part of a in s = [x, a]; see `Element`."""
     return Element(name, PARAMETER, int(index), shape, start, unit, bounds)
 
 
@@ -55,7 +61,7 @@ def discrete_state(
     unit: str = "1",
     bounds: tuple[float, float] = (-inf, inf),
 ) -> Element:
-    """A piece of the discrete state group ``index``: part of x in s = [x, a]."""
+    """Name a piece of the discrete state group ``index``: part of x in s = [x, a]; see `Element`."""
     return Element(name, DISCRETE, int(index), shape, start, unit, bounds)
 
 
@@ -67,13 +73,13 @@ def continuous_state(
     unit: str = "1",
     bounds: tuple[float, float] = (-inf, inf),
 ) -> Element:
-    """A piece of the continuous state: part of x in s = [x, a]."""
+    """Name a piece of the continuous state: part of x in s = [x, a]; see `Element`."""
     return Element(name, CONTINUOUS, 0, shape, start, unit, bounds)
 
 
 @dataclass(frozen=True)
 class Codec:
-    """How an abstract state becomes named arrays (for a snapshot) and back."""
+    """A pair of functions that turn an abstract state into named arrays and back."""
 
     encode: Callable[[Any], Mapping[str, np.ndarray]]
     decode: Callable[[Mapping[str, np.ndarray]], Any]

@@ -35,7 +35,7 @@ _POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad
 
 
 def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Variable]:
-    """Every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of the floating bases only."""
+    """Yield every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of floating bases only."""
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         if joint.num_velocities() > 0:
@@ -59,7 +59,7 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Va
 
 
 def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str, Callable[[], Variable]]:
-    """The derived pose entries of every body that is not a floating base, made when they are asked for."""
+    """Return makers of the derived pose entries of every body that is not a floating base, by address."""
 
     def demand(body: RigidBody, address: str, entry: str) -> Callable[[], Variable]:
         return lambda: _pose_entry(plant, body, address, entry)
@@ -74,7 +74,7 @@ def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str
 
 
 def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
-    """All bodies but the world, by model instance."""
+    """Yield all bodies except the world, by model instance."""
     for instance in range(1, plant.num_model_instances()):
         for index in plant.GetBodyIndices(ModelInstanceIndex(instance)):
             yield plant.get_body(index)
@@ -83,7 +83,7 @@ def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 def element_address(
     plant: MultibodyPlant, element: RigidBody | Joint | FixedOffsetFrame | JointActuator, prefix: Prefix
 ) -> str:
-    """``prefix.instance.element``, without an instance that Drake itself has named.
+    """Return ``prefix.instance.element``, without an instance that Drake itself has named.
 
     An element that bears its model instance's name is called by it alone.
     """
@@ -264,7 +264,7 @@ _FRICTION = ("material", "coulomb_friction")
 
 
 def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix: Prefix) -> Iterator[Variable]:
-    """One coefficient of friction for every body with collision geometry, and for every geometry of the world."""
+    """Yield a coefficient of friction for every body with collision geometry, and for every geometry of the world."""
     inspector = scene_graph.model_inspector()
 
     def with_friction(geometry: GeometryId) -> bool:
@@ -287,7 +287,7 @@ def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix
 def _friction(
     address: str, plant: MultibodyPlant, scene_graph: SceneGraph, geometries: list[GeometryId]
 ) -> Iterator[Variable]:
-    """``friction``, one coefficient for all, and what carries it: static and dynamic ones of each geometry.
+    """Yield ``friction``, one coefficient for all geometries, and the static and dynamic ones that carry it.
 
     What is read of ``friction`` is the first geometry's dynamic one: Drake's discrete and convex contact models use
     the dynamic coefficients only.

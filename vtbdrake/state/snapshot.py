@@ -60,7 +60,7 @@ class Snapshot:
     __hash__ = None  # type: ignore[assignment]
 
     def __getitem__(self, address: str) -> np.ndarray:
-        """The value of an addressed variable."""
+        """Return the value of an addressed variable."""
         return self.values[address]
 
     def __repr__(self) -> str:
@@ -72,7 +72,7 @@ class Snapshot:
         return list(self.values)
 
     def compare(self, other: Snapshot) -> dict[str, float]:
-        """Where two snapshots differ: the largest absolute difference by address or group.
+        """Return the largest absolute difference to another snapshot, by address or group.
 
         ``inf`` stands where only one of them has the entry, it has another shape, or it is not of real numbers. Equal
         entries (NaN equals NaN) are left out, so that ``not a.compare(b)`` says that they are identical.
@@ -87,11 +87,11 @@ class Snapshot:
         return differences
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one file (a zip of .npy arrays and a JSON header), whole or not at all."""
+        """Write one file (a zip of .npy arrays and a JSON header), whole or not at all."""
         write_archive(path, kind=KIND, version=VERSION, **self._parts())
 
     def to_bytes(self) -> bytes:
-        """What `save` would write."""
+        """Return the bytes that `save` writes."""
         return archive_bytes(kind=KIND, version=VERSION, **self._parts())
 
     def _parts(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ class Snapshot:
 
     @classmethod
     def load(cls, source: str | os.PathLike[str] | bytes) -> Snapshot:
-        """Reads what `save` wrote, or `to_bytes` gave.
+        """Return the snapshot of a file that `save` wrote, or of the bytes of `to_bytes`.
 
         Raises:
             ArchiveError: it is not a snapshot, is damaged, or was written by another version.
@@ -129,7 +129,7 @@ def _largest_difference(a: np.ndarray, b: np.ndarray) -> float:
 def take(
     diagram: Diagram, context: Context, variables: Variables, *, scenario: Mapping[str, Any] | None = None
 ) -> Snapshot:
-    """The snapshot of ``context``.
+    """Return the snapshot of ``context``.
 
     Raises:
         SnapshotError: a system keeps something abstract that neither a codec nor a hidden variable carries.
@@ -154,7 +154,7 @@ def apply(
     *,
     only: Callable[[str], bool] = lambda path: True,
 ) -> None:
-    """Sets time, state and parameters of ``context`` from ``snapshot``.
+    """Set time, state and parameters of ``context`` from ``snapshot``.
 
     Args:
         only: says of the path of a system whether it is set, and looked for in the snapshot; left out, all are.
@@ -214,7 +214,7 @@ def _as_entries(array: np.ndarray) -> str:
 
 
 def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
-    """(group, index) of all numeric groups of a leaf context."""
+    """Yield (group, index) of all numeric groups of a leaf context."""
     if leaf_context.num_continuous_states():
         yield CONTINUOUS, 0
     for index in range(leaf_context.num_discrete_state_groups()):
@@ -262,9 +262,12 @@ class StateCopier:
         ]
 
     def copy(self, source: Context, target: Context, *, hidden: Collection[str] | None = None) -> None:
-        """Makes ``target`` continue as ``source`` would.
+        """Make ``target`` continue as ``source`` would.
 
-        ``hidden`` names the hidden variables that can differ; left out, all are compared.
+        Args:
+            source: context of the source Diagram.
+            target: context of the target Diagram.
+            hidden: addresses of the hidden variables that can differ; left out, all are compared.
         """
         target.SetTime(source.get_time())
         for from_system, to_system in self._pairs:
@@ -280,7 +283,6 @@ class StateCopier:
 
 
 def _is_empty(system: System) -> bool:
-    """True for a system that has neither state nor parameters."""
     context = system.CreateDefaultContext()
     return bool(
         context.num_continuous_states() == 0

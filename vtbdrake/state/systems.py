@@ -29,7 +29,7 @@ _UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
 
 def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
-    """All leaf systems below ``diagram``, of any scalar, with their dotted paths, in the Diagram's order."""
+    """Yield all leaf systems below ``diagram``, of any scalar, with their dotted paths, in the Diagram's order."""
     for system in diagram.GetSystems():
         below = f"{path}.{system.get_name()}" if path else system.get_name()
         if hasattr(system, "GetSystems"):
@@ -39,7 +39,7 @@ def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
 
 
 def class_name(system: System) -> str:
-    """The name of a system's class, without modules, namespaces and scalar types: ``ZeroOrderHold``."""
+    """Return the name of a system's class, without modules, namespaces and scalar types: ``ZeroOrderHold``."""
     bare = re.sub(r"<.*>|\[.*\]", "", system.GetSystemType())
     return re.split(r"::|\.", bare)[-1].rstrip("_")
 
@@ -62,17 +62,17 @@ def name_systems(diagram: Diagram) -> None:
 
 
 def pose_to_array(X_PF: RigidTransform) -> np.ndarray:
-    """``[x, y, z, roll, pitch, yaw]``, in metres and radians, as in SDFormat's ``<pose>``."""
+    """Return ``[x, y, z, roll, pitch, yaw]``, in metres and radians, as in SDFormat's ``<pose>``."""
     return np.concatenate([X_PF.translation(), RollPitchYaw(X_PF.rotation()).vector()])
 
 
 def pose_from_array(value: np.ndarray) -> RigidTransform:
-    """The inverse of `pose_to_array`."""
+    """Return the pose ``[x, y, z, roll, pitch, yaw]``, in metres and radians."""
     return RigidTransform(RollPitchYaw(value[3:]), value[:3])
 
 
 def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | None = None) -> Iterator[Variable]:
-    """The variables of a leaf system that is neither a plant nor a SceneGraph.
+    """Yield the variables of a leaf system that is neither a plant nor a SceneGraph.
 
     ``declared`` names its elements where the system itself, one of Drake's, cannot.
     """
@@ -102,7 +102,7 @@ def _elements(system: System) -> Iterator[Element]:
 
 
 def group_size(context: Context, group: str, index: int) -> int:
-    """Entries of a numeric group of a leaf context; 0 if it has no such group."""
+    """Return the number of entries of a numeric group of a leaf context; 0 if it has no such group."""
     if group == CONTINUOUS:
         return int(context.num_continuous_states())
     if group == DISCRETE:
@@ -111,7 +111,7 @@ def group_size(context: Context, group: str, index: int) -> int:
 
 
 def read_group(context: Context, group: str, index: int) -> np.ndarray:
-    """A copy of a numeric group of a leaf context."""
+    """Return a copy of a numeric group of a leaf context."""
     if group == CONTINUOUS:
         return np.array(context.get_continuous_state_vector().CopyToVector())
     if group == DISCRETE:
@@ -120,7 +120,7 @@ def read_group(context: Context, group: str, index: int) -> np.ndarray:
 
 
 def write_group(context: Context, group: str, index: int, value: np.ndarray) -> None:
-    """Writes a whole numeric group of a leaf context."""
+    """Set a whole numeric group of a leaf context."""
     if group == CONTINUOUS:
         context.SetContinuousState(value)
     elif group == DISCRETE:
@@ -155,7 +155,7 @@ def _numeric(address: str, system: System, element: Element) -> Variable:
 
 
 def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
-    """``pose`` for the user, and the matrix that carries it: angles would not come back to the last bit."""
+    """Yield ``pose`` for the user, and the matrix that carries it: angles would not come back to the last bit."""
     matrix = f"{path}.pose_matrix"
 
     def read_matrix(root: Context) -> np.ndarray:
@@ -176,22 +176,22 @@ def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
 
 
 def is_python(system: System) -> bool:
-    """True for a system that is written in Python: it holds the interpreter lock while it computes."""
+    """Return whether a system is written in Python, so that it holds the interpreter lock while it computes."""
     return not type(system).__module__.startswith("pydrake")
 
 
 def is_plant(system: System) -> TypeGuard[MultibodyPlant]:
-    """Whether a system is a MultibodyPlant."""
+    """Return whether a system is a MultibodyPlant."""
     return _is_a(system, "pydrake.multibody.plant", "MultibodyPlant")
 
 
 def is_scene_graph(system: System) -> TypeGuard[SceneGraph]:
-    """Whether a system is a SceneGraph."""
+    """Return whether a system is a SceneGraph."""
     return _is_a(system, "pydrake.geometry", "SceneGraph")
 
 
 def is_camera(system: System) -> TypeGuard[RgbdSensor]:
-    """Whether a system is an RgbdSensor."""
+    """Return whether a system is an RgbdSensor."""
     return _is_a(system, "pydrake.systems.sensors", "RgbdSensor")
 
 
@@ -207,7 +207,7 @@ def collect(
     skip: Callable[[str], bool] = lambda path: False,
     extra: Iterable[Variable] = (),
 ) -> Variables:
-    """The variables of every system of ``diagram``.
+    """Return the variables of every system of ``diagram``.
 
     Args:
         plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to

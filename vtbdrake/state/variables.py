@@ -58,23 +58,23 @@ class Variable:
 
     @property
     def hidden(self) -> bool:
-        """True if copies and snapshots have to carry this very variable."""
+        """Return whether copies and snapshots have to carry this very variable."""
         return self.carried_by == self.address
 
     @property
     def derived(self) -> bool:
-        """True if it is computed from other variables and cannot be written."""
+        """Return whether the variable is computed from others, so that it cannot be written."""
         return self.write is None
 
     def get(self, context: Context) -> float | np.ndarray:
-        """The value in ``context``: a float where the shape is ``()``, else an array of that shape."""
+        """Return the value in ``context``: a float where the shape is ``()``, else an array of that shape."""
         value = self.read(context)
         if not self.shape:
             return float(value)  # type: ignore[arg-type]
         return np.array(value, dtype=float).reshape(self.shape)
 
     def check(self, value: ArrayLike) -> np.ndarray:
-        """``value`` as an array of the variable's shape.
+        """Return ``value`` as an array of the variable's shape.
 
         Raises:
             VariableError: the variable is derived, or the value has another shape, is not finite, or lies
@@ -98,13 +98,13 @@ class Variable:
         return array
 
     def bounds_text(self) -> str:
-        """The closed interval of the bounds, to be read; of an array with several, the first."""
+        """Return the closed interval of the bounds as text; of an array with several, the first."""
         lower, upper = (float(np.ravel(bound)[0]) for bound in self.bounds)
         more = ", ..." if any(np.unique(bound).size > 1 for bound in self.bounds) else ""
         return f"[{lower:g}, {upper:g}]{more}"
 
     def set(self, context: Context, value: ArrayLike) -> None:
-        """Checks ``value`` and writes it into ``context``.
+        """Check ``value`` and write it into ``context``.
 
         Raises:
             VariableError: as `check`, or the value is refused by what it is written to.
@@ -186,11 +186,11 @@ class Variables(Mapping[str, Variable]):
         return [*self._listed, *self._by_demand]
 
     def read(self, context: Context, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
-        """sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``."""
+        """Return sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``."""
         return {address: self[address].get(context) for address in addresses}
 
     def write(self, context: Context, values: Mapping[str, ArrayLike]) -> None:
-        """Checks all of ``values``, then sets the variables at their addresses.
+        """Check all of ``values`` (address -> value), then set the variables.
 
         Their order does not matter: entries of one array are set together, and what changes other variables is set
         first (a mass, which scales the inertia).
@@ -219,12 +219,12 @@ class Variables(Mapping[str, Variable]):
                 variable.set(context, whole[variable.address])
 
     def complement(self, addresses: Sequence[str]) -> list[str]:
-        """Equation (9): the addresses of all that is held constant when ``addresses`` are varied."""
+        """Return the addresses of all that is held constant when ``addresses`` are varied, equation (9)."""
         chosen = {self[address].address.partition("[")[0] for address in addresses}
         return [v.address for v in self._listed.values() if not v.derived and v.address not in chosen]
 
     def table(self, context: Context, *, pattern: str = "") -> str:
-        """The variables whose address contains ``pattern``, as a table of text."""
+        """Return a table of the variables whose address contains ``pattern``, as text."""
         rows = [("address", "kind", "shape", "unit", "bounds", "value")]
         for variable in self._listed.values():
             if pattern not in variable.address:
@@ -250,7 +250,8 @@ def _row(variable: Variable) -> tuple[str, str, str, str, str]:
 
 
 def check_address(address: object) -> None:
-    """
+    """Raise an AddressError if ``address`` is not a string.
+
     Raises:
         AddressError: ``address`` is no text.
     """
@@ -259,7 +260,7 @@ def check_address(address: object) -> None:
 
 
 def suggestion(address: str, known: Iterable[str]) -> str:
-    """What to tell someone who asked for an address that is not among those ``known``."""
+    """Return the end of an error message that suggests addresses similar to ``address``."""
     known = list(known)
     near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
     if near:
@@ -269,7 +270,6 @@ def suggestion(address: str, known: Iterable[str]) -> str:
 
 
 def _entry(variable: Variable, index: int) -> Variable:
-    """One entry of an array variable as a scalar one."""
     size = int(np.prod(variable.shape, dtype=int))
     if not variable.shape or index >= size:
         what = f"has {size} entries" if variable.shape else "is a scalar"

@@ -74,7 +74,7 @@ class AddressedDiagram:
     # -- contexts and simulators
 
     def default_context(self) -> Context:
-        """A new context: s0 from defaults."""
+        """Return a new context: s0 from defaults."""
         context = self.diagram.CreateDefaultContext()
         if self.simulator_config.use_error_control:
             # Drake looks here for how exactly an event that depends on the state (a foot that lands) is to be found.
@@ -82,7 +82,7 @@ class AddressedDiagram:
         return context
 
     def check_context(self, context: Context) -> None:
-        """Refuse a context that is not the root context of this diagram, or of a diagram that holds it.
+        """Reject a context that is not the root context of this diagram, or of a diagram that holds it.
 
         Raises:
             ValueError: it is another diagram's, or that of a part.
@@ -96,14 +96,15 @@ class AddressedDiagram:
             ) from error
 
     def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
-        """A new Drake Simulator of the testbed with its own integrator settings.
+        """Return a new Drake Simulator with the integrator of ``simulator_config``.
 
         Args:
-            restored: ``context`` continues another one; initialization events, which would overwrite its state, have
-                happened before.
+            context: a context of this diagram; a default one if left out.
+            restored: True if ``context`` continues another one: initialization events, which would overwrite its
+                state, do not happen again.
 
         Raises:
-            ValueError: ``context`` is not one of this testbed's.
+            ValueError: ``context`` belongs to another diagram.
         """
         if context is None:
             context = self.default_context()
@@ -150,7 +151,7 @@ class AddressedDiagram:
         return snapshot
 
     def event_timings(self) -> tuple[tuple[float, float], ...]:
-        """(period, offset) in seconds of the periodic discrete updates of its systems, each timing once.
+        """Return (period, offset) in seconds of the periodic discrete updates of all systems, each pair once.
 
         The n-th update is at offset + n * period. Drake does not say so of a system with several such timings, nor of
         unrestricted updates and publishing.
@@ -161,16 +162,16 @@ class AddressedDiagram:
     # -- addresses
 
     def variables(self) -> Variables:
-        """Every element of s = [x, a], by address."""
+        """Return every element of s = [x, a], by address."""
         return self._variables
 
     def read(self, context: Context, address: str) -> Any:
-        """The value of a variable, or of an output port (``path.port``), in ``context``."""
+        """Return the value of a variable, or of an output port (``path.port``), in ``context``."""
         self.check_context(context)
         return self.reader(address)(context)
 
     def write(self, context: Context, values: Mapping[str, Any]) -> None:
-        """Sets variables by address.
+        """Set variables in ``context``: all of ``values`` (address -> value), or none.
 
         Raises:
             ValueError: there is no such variable, or it does not take the value. Nothing has been set then.
@@ -179,7 +180,7 @@ class AddressedDiagram:
         self._variables.write(context, values)
 
     def reader(self, address: str) -> Callable[[Context], Any]:
-        """Reads a variable, or an output port by ``path.port``, from any context.
+        """Return a function that reads a variable, or an output port by ``path.port``, from any context.
 
         Raises:
             AddressError: there is neither.
@@ -193,7 +194,7 @@ class AddressedDiagram:
         raise AddressError(f"there is no variable and no output port {address!r}{hint}")
 
     def addresses(self) -> list[str]:
-        """Of every variable and every output port."""
+        """Return the addresses of every variable and every output port."""
         return [*self._variables, *self._ports]
 
     @cached_property
@@ -208,13 +209,14 @@ class AddressedDiagram:
     # -- s(t) as a whole
 
     def snapshot(self, context: Context) -> Snapshot:
-        """s(t) as named arrays."""
+        """Return s(t) as named arrays."""
         self.check_context(context)
         record = self.scenario.record() if self.scenario is not None else {}
         return snapshots.take(self.diagram, context, self._variables, scenario=record)
 
     def check_scenario(self, snapshot: Snapshot) -> None:
-        """
+        """Raise a SnapshotError if the snapshot is of another scenario, or no snapshot.
+
         Raises:
             SnapshotError: the snapshot is none, or is of another scenario.
         """
@@ -235,12 +237,14 @@ class AddressedDiagram:
             raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
 
     def copier_from(self, source: AddressedDiagram) -> StateCopier:
-        """Copies contexts of ``source`` (this one, or another of the same scenario) to contexts of this one."""
+        """Return a copier from contexts of ``source`` (this diagram, or another of the same scenario) to contexts of
+        this one.
+        """
         return StateCopier(source.diagram, source.variables(), self.diagram, self._variables)
 
     @cached_property
     def python_systems(self) -> tuple[str, ...]:
-        """Paths of the systems that are written in Python and have work to do while time runs."""
+        """Return the paths of the systems that are written in Python and have work to do while time runs."""
         # The board of the switches has no work to do.
         return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
 

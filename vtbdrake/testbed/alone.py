@@ -68,7 +68,7 @@ class DpsAlone(AddressedDiagram):
         self._copiers: dict[int, StateCopier] = {}
 
     def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:
-        """A context in which the DPS goes on from where it is in a context of its testbed, at the same time."""
+        """Return a context in which the DPS continues from a context of its testbed, at the same time."""
         own = self.default_context()
         if id(testbed) not in self._copiers:
             self._copiers[id(testbed)] = StateCopier(
@@ -84,7 +84,7 @@ class DpsAlone(AddressedDiagram):
         return own
 
     def restore(self, context: Context, snapshot: Snapshot) -> None:
-        """Makes ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
+        """Make ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
 
         Raises:
             SnapshotError: it is of another scenario, or of a DPS that is built in another way.
@@ -121,7 +121,8 @@ class WorldAlone(AddressedDiagram):
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """
+        """Build the world of ``scenario``.
+
         Raises:
             ScenarioError: a field of the scenario has a value that nothing can be built with.
             SignalError: the world lacks a signal of the interface.
@@ -154,14 +155,14 @@ class WorldAlone(AddressedDiagram):
         self._actuators = {s.name: (s, diagram.GetInputPort(f"act.{s.name}")) for s in parts.interface.act}
 
     def default_context(self) -> Context:
-        """A new context: s0 from defaults, every actuator with its idle command."""
+        """Return a new context: s0 from defaults, every actuator with its idle command."""
         context = super().default_context()
         for signal in self.interface.act:
             self.command(context, signal.name, signal.idle)
         return context
 
     def command(self, context: Context, name: str, value: Any) -> None:
-        """Gives the simulated actuator ``name`` a command, which lasts until the next one.
+        """Give the simulated actuator ``name`` a command, which lasts until the next one.
 
         Args:
             value: an array of shape (size,), a scalar for all entries, or a value of an abstract signal.
@@ -178,6 +179,6 @@ class WorldAlone(AddressedDiagram):
         self.feed(context)(name, np.array(value, dtype=float) if signal.is_vector else value)
 
     def feed(self, context: Context) -> Feed:
-        """What commands the simulated actuators of one context again and again, unchecked, at the lowest cost."""
+        """Return a `Feed` of the simulated actuators of one context: unchecked, at the lowest cost."""
         self.check_context(context)
         return Feed(self._actuators, context)

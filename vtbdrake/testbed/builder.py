@@ -110,7 +110,7 @@ class VirtualTestbedBuilder:
         return self.plant, self.scene_graph
 
     def place(self, instance: str, *, role: str) -> None:
-        """Says that a model instance of the plant belongs to ``sys`` or ``env``.
+        """Assign a model instance of the plant to the role ``sys`` or ``env``.
 
         Without it, what is fixed to the world and has no joints belongs to the environment.
         """
@@ -177,7 +177,7 @@ class VirtualTestbedBuilder:
         return known[name]
 
     def set_dps(self, dps: S) -> S:
-        """Adds the data processing system: one System whose ports bear the names of the interface's signals."""
+        """Add the data processing system: one System whose ports have the names of the interface's signals."""
         if not isinstance(dps, System):
             raise SignalError(f"the DPS is a System, not {dps!r}: does make_dps return it, built?")
         if self._dps is not None:
@@ -203,7 +203,7 @@ class VirtualTestbedBuilder:
     def believe(
         self, target: str, *, of: Sequence[str], by: Callable[..., ArrayLike] | None = None, age: float = 0.0
     ) -> None:
-        """Declares which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
+        """Declare which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
 
         Args:
             target: address of the simulated variable.
@@ -215,13 +215,13 @@ class VirtualTestbedBuilder:
         self.beliefs.append(Belief(target, tuple(of), by, age))
 
     def add_variable(self, variable: Variable) -> None:
-        """Lists a further variable, derived from others, say."""
+        """List a further variable, for example one that is derived from others."""
         self.extra_variables.append(variable)
 
     def build(
         self, *, mode: str = "sim", scenario: Scenario | None = None, meshcat: Meshcat | None = None, prefix: str = ""
     ) -> VirtualTestbed:
-        """Puts the switches between the parts and builds the Diagram.
+        """Put the switches between the parts and build the Diagram.
 
         Args:
             mode: where the switches stand at first: sim, shadow, real or twin.
@@ -267,7 +267,7 @@ class VirtualTestbedBuilder:
         )
 
     def build_diagram(self, name: str) -> Diagram:
-        """The Diagram of what has been added.
+        """Build the Diagram of all that has been added.
 
         Systems without a name are named by their class, see `name_systems`.
 
@@ -293,7 +293,7 @@ class VirtualTestbedBuilder:
         return diagram
 
     def finish_world(self) -> None:
-        """Finalize the plant, which may also be one that was added by Drake's own means and is called ``plant``.
+        """Finalize the plant: that of `add_plant`, or one that Drake's own functions have added as ``plant``.
 
         Raises:
             SignalError: the simulated world lacks a signal of the interface.
@@ -329,7 +329,7 @@ class VirtualTestbedBuilder:
             self.connect(port, dps.GetInputPort(name))
 
     def plant_roles(self) -> dict[str, str]:
-        """The role of every model instance of the plant: ``sys`` or ``env``."""
+        """Return the role of every model instance of the plant: ``sys`` or ``env``."""
         if self.plant is None:
             return {}
         from pydrake.multibody.tree import ModelInstanceIndex

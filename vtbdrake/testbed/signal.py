@@ -114,16 +114,17 @@ class Signal:
         return self.size is not None
 
     def vector(self, value: ArrayLike) -> np.ndarray:
-        """``value`` (a scalar or one per entry) as an array of shape (size,)."""
+        """Return ``value`` (a scalar or one per entry) as an array of shape (size,)."""
         assert self.size is not None
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), (self.size,)))
 
     def abstract_value(self) -> AbstractValue:
-        """A new container of the signal's abstract type."""
+        """Return a new container of the signal's abstract type."""
         return Value(self.model_value)
 
     def check_value(self, value: Any) -> None:
-        """
+        """Raise a SignalError if ``value`` has another size or type than the signal, or a NaN.
+
         Raises:
             SignalError: ``value`` cannot be one of the signal's: it has another size or type, or an entry is NaN.
         """
@@ -146,7 +147,8 @@ class Signal:
             raise SignalError(f"signal {self.name} carries images of {_pixels(model)}, not one of {_pixels(value)}")
 
     def check_port(self, port: InputPort | OutputPort, owner: str) -> None:
-        """
+        """Raise a SignalError if ``port`` of the system ``owner`` cannot carry this signal.
+
         Raises:
             SignalError: ``port`` cannot carry this signal.
         """
@@ -181,7 +183,7 @@ _ANY_SIZE = "0 x 0 pixels"
 
 
 def _pixels(value: Any) -> str:
-    """The size of one of Drake's images; empty for anything else."""
+    """Return the size of one of Drake's images; empty for anything else."""
     return f"{value.width()} x {value.height()} pixels" if hasattr(value, "mutable_data") else ""
 
 
@@ -246,7 +248,7 @@ class Feed:
         self._fixed: dict[str, tuple[Callable[[], Any], np.ndarray | None]] = {}
 
     def __call__(self, name: str, value: Any) -> None:
-        """Gives the port of a signal a value: for a vector signal an array of its size."""
+        """Give the port of a signal a value: for a vector signal an array of its size."""
         known = self._fixed.get(name)
         if known is None:
             signal, port = self._ports[name]

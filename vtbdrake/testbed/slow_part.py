@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 class SlowPartError(ValueError):
-    """What a slow part's function returned, or what was handed in as its result, is not what it declares."""
+    """A result of a slow part that does not match its declaration."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SlowFunction:
     makes: frozenset[str]
 
     def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
-        """The arrays of the outputs and the memory, for those of the inputs and the memory.
+        """Return the arrays of the outputs and the memory, for those of the inputs and the memory.
 
         Raises:
             SlowPartError: the function did not return what it should; what it raises itself passes.
@@ -76,7 +76,7 @@ class SlowFunction:
 
 
 def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, np.ndarray]:
-    """The values as arrays of their own, which nobody can change any more.
+    """Return the values as read-only arrays of their own.
 
     Raises:
         SlowPartError: a value is not of its codec's type.
@@ -93,7 +93,7 @@ def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, 
 
 
 def kept(arrays: Arrays) -> dict[str, np.ndarray]:
-    """The arrays, as `encode` makes them; those that cannot be changed are not copied."""
+    """Return the arrays as `encode` makes them; read-only ones are not copied."""
     return {name: _own(array) if array.flags.writeable else array for name, array in arrays.items()}
 
 
@@ -104,19 +104,19 @@ def _own(value: np.ndarray) -> np.ndarray:
 
 
 def decode(arrays: Arrays, name: str, codec: Codec) -> Any:
-    """One of the values that the arrays are of."""
+    """Return one of the values that the arrays hold."""
     return codec.decode(parts_of(arrays, name))
 
 
 def parts_of(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
-    """The arrays of one value, by part; empty if it is not there."""
+    """Return the arrays of one value, by part; empty if it is not there."""
     prefix = f"{name}."
     parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
     return {"": arrays[name]} if name in arrays else parts
 
 
 def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
-    """The arrays of the memory and those of the outputs in a result."""
+    """Return the arrays of the memory and those of the outputs in a result."""
     memory = {name: array for name, array in arrays.items() if name.partition(".")[0] == MEMORY}
     return memory, {name: array for name, array in arrays.items() if name not in memory}
 
@@ -126,7 +126,7 @@ WAITING, DONE, MISSING = range(3)
 
 @dataclass(frozen=True)
 class Work:
-    """What became of one sample.
+    """The state of one sample.
 
     Attributes:
         tick: its number.
@@ -141,7 +141,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Progress:
-    """It is never changed, and so shared by all copies of a context.
+    """The samples, results and memory of a slow part: immutable, and so shared by all copies of a context.
 
     Attributes:
         shown: the arrays of the abstract outputs.
@@ -157,12 +157,13 @@ class Progress:
         return self
 
     def find(self, tick: int) -> Work | None:
-        """The work on sample number ``tick``, if it is under way."""
+        """Return the work on sample number ``tick``, or None if it is not under way."""
         return next((work for work in self.under_way if work.tick == tick), None)
 
     def having(self, tick: int, arrays: Arrays) -> Progress:
-        """With a result, of which none but the memory counts unless it is waited for; without outputs, it is
-        missing."""
+        """Return the progress with a result: its memory, and its outputs if they are waited for; without outputs, it is
+        missing.
+        """
         memory, outputs = split_memory(arrays)
         result = Work(tick, DONE if outputs else MISSING, outputs)
         awaited = (work.tick == tick and work.status == WAITING for work in self.under_way)
@@ -170,7 +171,7 @@ class Progress:
         return replace(self, memory=memory or self.memory, under_way=under_way)
 
     def after(self, work: Work, shown: Arrays) -> Progress:
-        """When ``work`` was due: with what is shown now, and what came later."""
+        """Return the progress after ``work`` was due, with the arrays that are shown now."""
         return replace(self, shown=shown, under_way=tuple(w for w in self.under_way if w.tick > work.tick))
 
 
@@ -353,12 +354,11 @@ class SlowPart(LeafSystem):
     # -- results from outside
 
     def due(self, tick: int) -> float:
-        """When the result of sample number ``tick`` is shown, in seconds: just before a latency has passed."""
+        """Return when the result of sample number ``tick`` is shown, in seconds: just before a latency has passed."""
         return self.offset + self.latency - _EARLY + tick * self.period
 
     def waiting(self, context: Context) -> dict[int, Arrays]:
-        """The samples whose results are neither there nor declared missing: what `function` takes besides the memory,
-        by tick, in order.
+        """Return the samples whose results are neither there nor declared missing, by tick, in order.
 
         Args:
             context: of the whole Diagram; so in `memory` and `deliver`.
@@ -367,12 +367,12 @@ class SlowPart(LeafSystem):
         return {work.tick: work.arrays for work in progress.under_way if work.status == WAITING}
 
     def memory(self, context: Context) -> Arrays:
-        """The memory that the next call begins with; empty for a part without."""
+        """Return the memory that the next call begins with; empty for a part without."""
         return self._read(self.GetMyContextFromRoot(context)).memory
 
     def deliver(self, context: Context, tick: int, arrays: Arrays) -> None:
-        """Hands in the result of sample number ``tick``, which will be shown when it is due, and at once takes over
-        its memory. Of a result that is not waited for, only the memory is taken.
+        """Hand in the result of sample number ``tick``: it will be shown when it is due, and its memory counts at once.
+        Of a result that is not waited for, only the memory is taken.
 
         Args:
             arrays: what `function` returned; its memory alone; or nothing, which declares the result missing.
@@ -397,7 +397,7 @@ class SlowPart(LeafSystem):
 
 
 def slow_parts(diagram: Diagram, *, below: str = "dps") -> dict[str, SlowPart]:
-    """The slow parts in the DPS of a testbed's diagram (or below another path), by path."""
+    """Return the slow parts in the DPS of a testbed's diagram (or below another path), by path."""
     found = {path: system for path, system in leaves(diagram) if path == below or path.startswith(f"{below}.")}
     return {path: system for path, system in found.items() if isinstance(system, SlowPart)}
 

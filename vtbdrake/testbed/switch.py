@@ -37,7 +37,8 @@ T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
 
 @TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
 def SwitchBoard_(T: type) -> type:
-    """The positions of all switches, the commands u, and what an actuator gets that the DPS does not command.
+    """The state of all switches, the commands u, and the constants that an actuator gets while the DPS does not command
+    it.
 
     Every system of a Diagram costs time in each step of a simulation, whether it computes or not: so there is one for
     all of them, and its ports show its state, which needs no Python while time runs.
@@ -99,12 +100,12 @@ class Selector:
         self._flag = flag
 
     def get(self, context: Context) -> str:
-        """The position in a context of the testbed."""
+        """Return the position in a context of the testbed."""
         state = self._board.GetMyContextFromRoot(context).get_abstract_state(self._index).get_value()
         return self.positions[int(state) - 1]
 
     def set(self, context: Context, position: str) -> None:
-        """Throws the switch in a context of the testbed; ``position`` is one of `positions`."""
+        """Set the position in a context of the testbed to one of `positions`."""
         board = self._board.GetMyMutableContextFromRoot(context)
         board.SetAbstractState(self._index, _port(self.positions, position))
         if self._flag is not None:
@@ -114,7 +115,7 @@ class Selector:
             board.SetDiscreteState(group, active)
 
     def variable(self) -> Variable:
-        """The position as an element of s: 0 is sim, 1 is real, 2 is twin."""
+        """Return the position as an element of s: 0 is sim, 1 is real, 2 is twin."""
 
         def write(context: Context, value: np.ndarray) -> None:
             index = float(value)
@@ -206,7 +207,7 @@ class Switches:
         self.commands = {name: self._board.GetOutputPort(f"{COMMAND}{name}") for name in u}
 
     def command_variables(self, signals: Sequence[Signal]) -> Iterator[Variable]:
-        """The constant commands as variables ``u.<signal>``."""
+        """Yield the constant commands as variables ``u.<signal>``."""
         for index, name in enumerate(self.commands):
             signal = next(signal for signal in signals if signal.name == name)
             size = signal.vector(0.0).size
@@ -250,13 +251,13 @@ class Switches:
 
 @dataclass(frozen=True)
 class Command:
-    """What an abstract signal's port ``real.act.<signal>`` carries: a command, or none (``value`` is None)."""
+    """A value of the port ``real.act.<signal>`` of an abstract signal: a command, or none (``value`` is None)."""
 
     value: Any = None
 
 
 class AbstractSwitch(LeafSystem):
-    """PortSwitch for abstract values, which pydrake binds for vectors only. Evaluates the selected input alone.
+    """A PortSwitch for abstract values, which pydrake binds for vectors only. It evaluates the selected input alone.
 
     .. pydrake_system::
 
@@ -290,7 +291,8 @@ class AbstractSwitch(LeafSystem):
 
 
 class CommandGate(LeafSystem):
-    """What an abstract actuator signal's real port carries: a `Command`, empty while the switch is at port ``closed``.
+    """A gate before the real port of an abstract actuator signal: its output is a `Command`, empty while the switch is
+    at port ``closed``.
 
     .. pydrake_system::
 

@@ -49,7 +49,8 @@ class Belief:
             raise ValueError(f"the belief about {self.target} is of {len(self.of)} estimates: say with by= how")
 
     def check(self, variables: Variables) -> None:
-        """Looks both sides up.
+        """Raise a ValueError if an address does not exist, the target is not simulated, or an estimate is not the
+        DPS's.
 
         Raises:
             ValueError: an address does not exist, the target is not simulated, or an estimate is not the DPS's.
@@ -63,11 +64,11 @@ class Belief:
             raise ValueError(f"a belief sets a variable of the simulated world, not {self.target}")
 
     def value(self, variables: Variables, context: Context) -> ArrayLike:
-        """What the DPS in ``context`` believes the target to be."""
+        """Return what the DPS in ``context`` believes the target to be."""
         return self.value_of([variables[address].get(context) for address in self.of])
 
     def value_of(self, estimates: Sequence[ArrayLike]) -> ArrayLike:
-        """What estimates, in the order of `of`, say of the target."""
+        """Return the target's value for estimates in the order of `of`."""
         return self.by(*estimates) if self.by is not None else estimates[0]
 
 
@@ -76,7 +77,8 @@ MODES = {"sim": (SIM, SIM), "shadow": (REAL, SIM), "real": (REAL, REAL), "twin":
 
 
 def check_mode(mode: str) -> None:
-    """
+    """Raise a ValueError if ``mode`` is not a mode of a testbed.
+
     Raises:
         ValueError: ``mode`` is not a mode of a testbed.
     """
@@ -150,7 +152,7 @@ class VirtualTestbed(AddressedDiagram):
     # -- switches
 
     def positions(self, context: Context) -> dict[str, dict[str, str]]:
-        """Where every switch stands: ``{"sense": {signal: position}, "act": {signal: position}}``."""
+        """Return the positions of all switches: ``{"sense": {signal: position}, "act": {signal: position}}``."""
         self.check_context(context)
         sides = {"sense": self._sense, "act": self._act}
         return {side: {name: s.get(context) for name, s in switches.items()} for side, switches in sides.items()}
@@ -163,7 +165,7 @@ class VirtualTestbed(AddressedDiagram):
         sense: str | Mapping[str, str] | None = None,
         act: str | Mapping[str, str] | None = None,
     ) -> None:
-        """Throws switches, at any time.
+        """Throw switches, at any time.
 
         Args:
             mode: all together: ``sim``, ``real``, ``shadow`` (sense real, act sim: the DPS listens to reality and acts
@@ -215,7 +217,7 @@ class VirtualTestbed(AddressedDiagram):
     # -- s(t) as a whole
 
     def restore(self, context: Context, snapshot: Snapshot) -> None:
-        """Makes ``context`` continue from ``snapshot``: s_sim(t0) from a file.
+        """Make ``context`` continue from ``snapshot``: s_sim(t0) from a file.
 
         Raises:
             SnapshotError: it is of another scenario, or of a testbed that is built in another way.
@@ -232,11 +234,11 @@ class VirtualTestbed(AddressedDiagram):
 
     @property
     def believes(self) -> bool:
-        """Whether it declares what of its DPS sets its simulated world."""
+        """Return whether the testbed declares which estimates of its DPS set its simulated world."""
         return bool(self._beliefs)
 
     def start_from_belief(self, context: Context) -> None:
-        """s_sim(t0) from s_dps(t): sets the simulated world to what the DPS in ``context`` believes.
+        """Set the simulated world to what the DPS in ``context`` believes: s_sim(t0) from s_dps(t).
 
         An estimate beyond the bounds of what it is about (a joint a little past its stop) is taken to the bound.
 

@@ -72,7 +72,8 @@ class JointDrives(LeafSystem):
         max_delay: int = 0,
         initial: ArrayLike = 0.0,
     ) -> None:
-        """
+        """Declare the drives of ``joints``.
+
         Args:
             period: T in seconds.
             initial: the torque that was commanded, and reached, before the first sample, in N m.
@@ -144,7 +145,7 @@ class JointDrives(LeafSystem):
 
 
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
-    """[torque; m_k; r_k] of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
+    """Return [torque; m_k; r_k] as a kernel of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
 
     ``velocities`` are those of the joints in [q; v], of ``states`` entries.
     """
@@ -166,7 +167,7 @@ def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
 
 
 def _held(value: Expression, lower: Expression, upper: Expression) -> Expression:
-    """Between the limits; NaN, which fmin and fmax would pass over, stays what it is."""
+    """Limit an expression; NaN, which fmin and fmax would drop, stays NaN."""
     return casadi.if_else(value > upper, upper, casadi.if_else(value < lower, lower, value))
 
 

@@ -30,7 +30,7 @@ class CompilerError(RuntimeError):
 
 
 def compiled(function: casadi.Function) -> casadi.Function:
-    """The same function as machine code.
+    """Return the same function as machine code.
 
     The library is kept in `cache_folder` under a digest of its C code and of how it was compiled: a function is
     compiled once per machine. Processes may do so at the same time.
@@ -58,7 +58,7 @@ def compiled(function: casadi.Function) -> casadi.Function:
 
 
 def compiled_if_possible(function: casadi.Function) -> casadi.Function:
-    """The same function as machine code, or the function itself where that cannot be had; the log says why."""
+    """Return the same function as machine code, or the function itself if that fails; the log says why."""
     try:
         return compiled(function)
     except (CompilerError, ValueError, OSError) as error:
@@ -67,7 +67,7 @@ def compiled_if_possible(function: casadi.Function) -> casadi.Function:
 
 
 def cache_folder() -> Path:
-    """Where the libraries are kept: ``vtbdrake/casadi`` in XDG_CACHE_HOME, or in ``~/.cache``."""
+    """Return the folder of the compiled libraries: ``vtbdrake/casadi`` in XDG_CACHE_HOME, or in ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vtbdrake" / "casadi"
 
 

@@ -37,7 +37,7 @@ class Kernel:
     """
 
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):
-        """``y`` (m, 1) is an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other.
+        """Wrap ``y`` (m, 1), an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other.
 
         ``compile`` is that of a `CasadiSystem`.
         """
@@ -49,7 +49,7 @@ class Kernel:
         self.value = evaluator(self._buffers(self._name, y))
 
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
-        """y of AutoDiffXd, by the chain rule dy = (dy/dz) dz, where dy/dz is CasADi's."""
+        """Return y of AutoDiffXd, by the chain rule dy = (dy/dz) dz with CasADi's dy/dz."""
         z = np.concatenate(blocks)
         if not z.size:
             y = self.value(blocks)

@@ -112,12 +112,12 @@ class Model:
         self.outputs = {n: self._result(f"{prefix}_{n}", symbols, value, compile) for n, value in values.items()}
 
     def size(self, name: str) -> int:
-        """The number of entries of an argument or state."""
+        """Return the number of entries of an argument or state."""
         rows, columns = self.shapes[name]
         return rows * columns
 
     def state_index(self, name: str) -> int:
-        """The number of a state's group in the Context. All parameters are group 0, one after the other."""
+        """Return the number of a state's group in the Context. All parameters lie in group 0, one after the other."""
         return list(self.state).index(name)
 
     def _elements(self, units: Mapping[str, str], bounds: Mapping[str, tuple[float, float]]) -> Iterator[Element]:
@@ -137,7 +137,7 @@ class Model:
         return {name: kind.sym(f"a{k}", self.size(name)) for k, name in enumerate(self.shapes)}  # type: ignore[attr-defined]
 
     def _evaluated(self, function: casadi.Function) -> tuple[dict[str, Expression], dict[str, Expression]]:
-        """Symbols of all arguments, and the results; as columns that hold a matrix row after row."""
+        """Return the symbols of all arguments and the results, as columns that hold a matrix row after row."""
         symbols = self._symbols(casadi.SX if function.is_a("SXFunction") else casadi.MX)
         arguments = [casadi.reshape(symbols[n], *self.shapes[n][::-1]).T for n in function.name_in()]
         try:
@@ -155,7 +155,7 @@ class Model:
         compile: bool | None,
         always: tuple[str, ...] = (),
     ) -> Result:
-        """``y``, computed from the arguments that occur in it, and from those which it is ``always`` computed from."""
+        """Return ``y`` as a kernel of the arguments that occur in it and of those in ``always``."""
         # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
         names = {f"a{k}": name for k, name in enumerate(symbols)}
         # Of a vector a1, the entries are a1_0, a1_1, ...
@@ -212,7 +212,7 @@ def _argument_shapes(functions: Iterable[casadi.Function]) -> dict[str, Shape]:
 
 
 def _next_shapes(update: casadi.Function, shapes: Mapping[str, Shape], state: tuple[str, ...]) -> dict[str, Shape]:
-    """Of the states, after `update`."""
+    """Return the shapes of the states after `update`."""
     expected, given = [f"{name}{NEXT}" for name in state], update.name_out()
     if set(expected) != set(given):
         raise ValueError(

@@ -150,9 +150,7 @@ def CasadiSystem_(T: type) -> type:
         def _handler(
             self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None] | None, updates: bool
         ) -> Callable[[Context, Any], None]:
-            """See `handler`. It runs in every step of a simulation, where each call of a function in Python counts: so
-            there are as few as possible.
-            """
+            """Return the compiled event handler (see `handler`), which needs few calls of Python functions per step."""
             sources = {block.source for block in result.blocks}
             return handler(
                 states=tuple(self._model.state_index(b.names[0]) for b in result.blocks if b.source == STATE),

@@ -114,7 +114,8 @@ class JointTachometers(_JointSensor):
 
 
 def _check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
-    """
+    """Raise a ValueError if a joint has not exactly one degree of freedom.
+
     Raises:
         ValueError: a joint has not exactly one degree of freedom.
     """

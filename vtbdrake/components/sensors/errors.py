@@ -61,7 +61,8 @@ class ErrorModel:
     seed: int = 0
 
     def check(self, owner: str) -> None:
-        """
+        """Raise a ValueError if no sensor can have such errors.
+
         Raises:
             ValueError: a value that no sensor can have.
         """
@@ -98,7 +99,7 @@ class _Settings:
 
     @cached_property
     def exact(self) -> bool:
-        """Whether there are no errors at all."""
+        """Return whether there are no errors at all."""
         found = (self.noise, self.bias, self.drift, self.quantization)
         return not self.latency and not self.dropout and all(values is None for values in found)
 
@@ -132,7 +133,9 @@ class ErrorStage:
         period: float,
         unit: str,
     ) -> None:
-        """``noise`` as `SampledSensor` has it; ``output`` is the discrete state of ``sensor`` that it shows."""
+        """Declare state and parameters in ``sensor``; ``noise`` as in `SampledSensor`, ``output`` is the discrete state
+        that it shows.
+        """
         self._n, self._output, self._period, self._stream = default.size, output, period, stream
         self._counts = [count for count, _ in noise.values()]
         self._more = model is not None
@@ -189,7 +192,7 @@ class ErrorStage:
         settings.set_value(found)
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the sensor shows when it measures ``y``."""
+        """Return what the sensor shows when it measures ``y``."""
         settings: _Settings = self._settings(context)
         if settings.exact and not (self._more and self._remembers(context)):
             return y
@@ -199,7 +202,7 @@ class ErrorStage:
         return self._shown(context, state, y, settings, key) if self._more else y
 
     def _remembers(self, context: Context) -> bool:
-        """Whether there may be samples in transit, or the walk has led away from zero."""
+        """Return whether samples may be in transit, or the random walk has left zero."""
         return self._longest > 0 or any(context.get_discrete_state(self._memory).value().tolist())
 
     def _shown(

@@ -50,7 +50,7 @@ class ContactSensor(SampledSensor):
         stream: int = 2,
         errors: ErrorModel | None = None,
     ) -> None:
-        """``threshold`` is a force (N), and a parameter of the Context."""
+        """Declare the sensor; ``threshold`` is a force (N), and a parameter of the Context."""
         from pydrake.multibody.plant import ContactResults
 
         super().__init__(

@@ -124,7 +124,7 @@ class Imu(SampledSensor):
         return np.array((scale * x, scale * y, scale * z, *_rotate_back(q_mid, f_W)))
 
     def _motion(self, context: Context) -> tuple[Wxyz, Vector3]:
-        """q_WF and v_WF."""
+        """Return q_WF and v_WF."""
         if self._floating:
             x = self._state_port.Eval(context)
             q_WB = _unit(*x[self._q_slice].tolist())
@@ -154,7 +154,7 @@ def _unit(w: float, x: float, y: float, z: float) -> Wxyz:
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> Wxyz:
-    """Of Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll)."""
     qx = (cos(roll / 2), sin(roll / 2), 0.0, 0.0)
     qy = (cos(pitch / 2), 0.0, sin(pitch / 2), 0.0)
     qz = (cos(yaw / 2), 0.0, 0.0, sin(yaw / 2))
@@ -173,7 +173,7 @@ def _product(a: Wxyz, b: Wxyz) -> Wxyz:
 
 
 def _rotate(q: Wxyz, v: Vector3) -> Vector3:
-    """R v for the unit quaternion q of R."""
+    """Return R v for the unit quaternion q of R."""
     w, x, y, z = q
     vx, vy, vz = v
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
@@ -181,5 +181,5 @@ def _rotate(q: Wxyz, v: Vector3) -> Vector3:
 
 
 def _rotate_back(q: Wxyz, v: Vector3) -> Vector3:
-    """R' v for the unit quaternion q of R."""
+    """Return R' v for the unit quaternion q of R."""
     return _rotate((q[0], -q[1], -q[2], -q[3]), v)

@@ -16,7 +16,7 @@ _KEPT = 128
 
 
 def normal_noise(size: int, *, seed: int, stream: int, tick: int, channel: int = 0) -> NDArray[np.float64]:
-    """``size`` independent samples of N(0, 1), read-only.
+    """Return ``size`` independent samples of N(0, 1), read-only.
 
     Every ``channel`` of a stream has noise of its own, and so has every ``size``.
 
@@ -29,7 +29,7 @@ def normal_noise(size: int, *, seed: int, stream: int, tick: int, channel: int =
 
 
 def uniform_noise(*, seed: int, stream: int, tick: int, channel: int = 0) -> float:
-    """A sample of the uniform distribution over [0, 1); of the same generator as `normal_noise`."""
+    """Return a sample of the uniform distribution over [0, 1), of the same generator as `normal_noise`."""
     batch, place = divmod(tick, _ticks(1))
     return _uniform(seed, stream, batch, channel)[place]
 

@@ -119,6 +119,6 @@ class JointTorqueSensors(SampledSensor):
 
 
 def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:
-    """Where the joints' forces lie in the plant's reaction forces, which are in the order of all its joints."""
+    """Return the places of the joints' forces in the plant's reaction forces, which follow the order of its joints."""
     order = {int(index): k for k, index in enumerate(plant.GetJointIndices())}
     return [order[int(joint.index())] for joint in joints]

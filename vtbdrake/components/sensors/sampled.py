@@ -41,7 +41,9 @@ class SampledSensor(LeafSystem):
         stream: int = 0,
         errors: ErrorModel | None = None,
     ) -> None:
-        """``noise`` names the standard deviations (0 without ``errors``): for how many entries of y, and their unit."""
+        """Declare the sensor; ``noise`` names the standard deviations (0 without ``errors``): for how many entries of
+        y, and their unit.
+        """
         super().__init__()
         noise = noise or {}
         if not period > 0:
@@ -74,12 +76,12 @@ class SampledSensor(LeafSystem):
 
     @property
     def period(self) -> float:
-        """The time between two samples (s)."""
+        """Return the time between two samples (s)."""
         return self._period
 
     @abstractmethod
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        """The measurement without noise. ``state`` takes what has to be remembered until the next one."""
+        """Return the measurement without noise. ``state`` takes what has to be remembered until the next one."""
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)
@@ -89,7 +91,7 @@ class SampledSensor(LeafSystem):
 
 
 def connect_to_plant(builder: DiagramBuilder, sensor: SampledSensor, plant: MultibodyPlant) -> None:
-    """Connects every input port of ``sensor`` to the plant's output port of the same name."""
+    """Connect every input port of ``sensor`` to the plant's output port of the same name."""
     for k in range(sensor.num_input_ports()):
         port = sensor.get_input_port(k)
         builder.Connect(plant.GetOutputPort(port.get_name()), port)
