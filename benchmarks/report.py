@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.measure import Benchmark
 from diagrams.tables import Crash, Registry, chosen, run, write_json
-from vtbdrake.cli.text import number, table
+from vtbdrake.cli.output import number, table
 
 # Name -> function () -> Benchmark or list of them; the first bears the name, the others are printed beside it.
 BENCHMARKS: Registry = {

@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from diagrams.tables import Crash, Registry, chosen, run, write_json
-from vtbdrake.cli.text import number, table
+from vtbdrake.cli.output import number, table
 
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {

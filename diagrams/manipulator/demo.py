@@ -15,7 +15,7 @@ import numpy as np
 from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
 from diagrams.manipulator.safety import CARRY
 from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
-from vtbdrake.cli.text import table
+from vtbdrake.cli.output import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.runtime import Runtime

@@ -10,7 +10,7 @@ import sys
 import lcm
 import pytest
 
-from tests.cli.program import ROOT, run
+from tests.cli.program import ROOT, error_of
 from vtbdrake.lcm.hub import HubStatistics
 
 
@@ -50,10 +50,8 @@ def test_hub_prints_its_url_and_ends_cleanly(number: signal.Signals) -> None:
 def test_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        program = run("hub", "--port", port)
-    assert (program.returncode, program.stdout) == (2, "")
-    assert program.stderr.startswith(f"Error: the hub cannot listen on 127.0.0.1:{port} (Address already in use)")
-    assert program.stderr.count("\n") == 1
+        error = error_of("hub", "--port", port)
+    assert error.startswith(f"Error: the hub cannot listen on 127.0.0.1:{port} (Address already in use)")
 
 
 def test_hub_runs_on_the_given_processors() -> None:
@@ -118,11 +116,4 @@ def test_hub_without_scenario_does_not_import_drake() -> None:
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[object, ...], named: str) -> None:
-    program = run("hub", *arguments)
-    assert (program.returncode, program.stdout) == (2, "")
-    assert program.stderr.startswith("Error: ") and program.stderr.count("\n") == 1
-    assert named in program.stderr
-
-
-def test_help_shows_an_example() -> None:
-    assert "Example:\n    vtbdrake hub " in run("hub", "--help").stdout
+    assert named in error_of("hub", *arguments)

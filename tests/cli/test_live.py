@@ -60,7 +60,7 @@ def refused(url: str, *arguments: str) -> str:
 def test_a_hub_that_is_full_is_one_line(command: tuple[str, ...]) -> None:
     with Hub(port=0, max_clients=1) as bus:
         other = TcpqConnection(bus.url, {"A": lambda *_: None}, PATIENCE)
-        assert "refuses the connection: max_clients=1 reached" in refused(bus.url, *command)
+        assert "rejects the connection: max_clients=1 reached" in refused(bus.url, *command)
         other.close()
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.cli.program import ACROBOT, ROOT, run
+from tests.cli.program import ACROBOT, ROOT, error_of, run
 from tests.machine.robot import ELBOW, Listener, RobotScenario, state
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import DIED, Machine, MachineConfig
@@ -34,7 +34,7 @@ def test_machine_has_the_parameters_that_are_asked_for(hub: Hub) -> None:
     listener = Listener(hub.url)
     options = ("--set", f"{ELBOW}=0.3", "--perturb", 0.1, "--seed", 3, "--noise", "position=0.01")
     program = run("machine", ROBOT, "--url", hub.url, "--cycles", 20, *options, "--period", 0.002)
-    assert program.returncode == 0, program.stderr
+    assert program.exit_code == 0, program.stderr
 
     config = MachineConfig(values={ELBOW: 0.3}, perturb=0.1, seed=3, noise={"position": 0.01}, period=0.002)
     expected = Machine(RobotScenario(), config)
@@ -79,12 +79,4 @@ def test_machine_dies_on_request(hub: Hub) -> None:
     ],
 )
 def test_bad_input_is_one_line(hub: Hub, scenario: str, options: tuple[str, ...], code: int, message: str) -> None:
-    program = run("machine", scenario, "--url", hub.url, *options)
-    assert program.returncode == code
-    assert program.stderr.startswith("Error: ")
-    assert program.stderr.count("\n") == 1
-    assert message in program.stderr
-
-
-def test_help_shows_an_example() -> None:
-    assert "Example:\n    vtbdrake machine " in run("machine", "--help").stdout
+    assert message in error_of("machine", scenario, "--url", hub.url, *options, code=code)

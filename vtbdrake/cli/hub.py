@@ -42,7 +42,7 @@ def _option(field: str, kind: Any, metavar: str, text: str) -> Callable[[Any], A
 _POSITIVE = click.IntRange(min=1)
 
 
-@click.command("hub")
+@click.command()
 @click.argument("scenario", required=False, callback=_load_scenario)
 @_option("host", str, "ADDRESS", "Address to listen on; beyond loopback, every machine that reaches it can connect.")
 @_option("port", int, "N", "0: any free port.")
@@ -84,7 +84,7 @@ _POSITIVE = click.IntRange(min=1)
     metavar="N",
     help="Processor to run on, if the system grants it. May be repeated.",
 )
-def run_hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
+def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP until Ctrl-C, for networks without multicast.
 
     Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on VTB_SET and on

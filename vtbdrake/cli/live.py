@@ -1,81 +1,109 @@
-"""``vtbdrake set``, ``get`` and ``reset``: what others say to a DPS that runs."""
+"""``vtbdrake get``, ``set``, ``watch`` and ``reset``: read and change a DPS that runs in another process."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 
 import click
 import numpy as np
 
-from vtbdrake.cli.group import FailedError, one_line
+from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
+from vtbdrake.cli.output import finite
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
+from vtbdrake.monitoring.live.client import watch as watch_live
+
+_addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
 
 
 @click.command("set")
 @click.argument("values", nargs=-1, required=True, callback=converted(parse_setting), metavar="ADDRESS=VALUE...")
 @url_option
 @timeout_option
-def set_values(values: tuple[Setting, ...], url: str, timeout: float) -> None:
+def set_(values: tuple[Setting, ...], url: str, timeout: float) -> None:
     """Set variables of a DPS that runs by vtbdrake run: all of them between two cycles, or none.
 
-    A value is a number or a JSON list of numbers. The exit code is 1 if they are refused, or if nobody answers.
+    A value is a number or a JSON list of numbers. The exit code is 1 if they are rejected, or without an answer.
 
     \b
     Example:
       vtbdrake set --url tcpq://127.0.0.1:7700 u.motion=2 "dps.impl.stiffness=[20,20,20,900,900,900]"
     """
-    with _client(url, timeout) as client:
+    with _failures(), LiveClient(url, timeout=timeout) as client:
         client.set(settings(values))
 
 
-@click.command("get")
-@click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
+@click.command()
+@_addresses
 @url_option
 @timeout_option
-def get_values(addresses: tuple[str, ...], url: str, timeout: float) -> None:
+def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
     """Print variables and output ports of a DPS that runs by vtbdrake run, as they are between two cycles.
 
     \b
     Example:
       vtbdrake get --url tcpq://127.0.0.1:7700 u.motion dps.impl.stiffness
     """
-    with _client(url, timeout) as client:
+    with _failures(), LiveClient(url, timeout=timeout) as client:
         values = client.get(addresses)
     for address, value in values.items():
         click.echo(f"{address} = {np.asarray(value).tolist()}")
 
 
-@click.command("reset")
+@click.command()
+@_addresses
+@url_option
+@click.option(
+    "--every", type=click.IntRange(min=1), default=100, show_default=True, metavar="N", help="Print every Nth cycle."
+)
+@click.option("--count", type=click.IntRange(min=1), metavar="N", help="End after N lines.  [default: endless]")
+@timeout_option
+def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
+    """Print variables and output ports of a DPS that runs by vtbdrake run, until Ctrl-C or its end.
+
+    Each line is a JSON object with the time of the DPS in seconds and the values by address. null stands for a value
+    that is not finite.
+
+    \b
+    Example:
+      vtbdrake watch --url tcpq://127.0.0.1:7700 dps.impl.torque --every 500
+    """
+    with _failures():
+        try:
+            for time, values in islice(watch_live(url, addresses, every=every, timeout=timeout), count):
+                plain = {address: finite(np.asarray(value).tolist()) for address, value in values.items()}
+                click.echo(json.dumps({"time": time, **plain}))
+        except KeyboardInterrupt:
+            return
+
+
+@click.command()
 @url_option
 @timeout_option
-def reset_guards(url: str, timeout: float) -> None:
+def reset(url: str, timeout: float) -> None:
     """Let a DPS that runs by vtbdrake run command again, after a fault that is over.
 
-    Prints what its guards had latched for. The exit code is 1 if a cause persists, or if nobody answers.
+    Prints the faults that had latched. The exit code is 1 if a cause persists, or without an answer.
 
     \b
     Example:
       vtbdrake reset --url tcpq://127.0.0.1:7700
     """
-    with _client(url, timeout) as client:
+    with _failures(), LiveClient(url, timeout=timeout) as client:
         released = client.reset()
     for reason in released:
         click.echo(f"over: {reason}")
     if not released:
-        click.echo("nothing had latched")
+        click.echo("no fault had latched")
 
 
 @contextmanager
-def _client(url: str, timeout: float) -> Iterator[LiveClient]:
-    """
-    Raises:
-        FailedError: there is no bus, nobody answers, or what is asked for is refused.
-    """
+def _failures() -> Iterator[None]:
     try:
-        with LiveClient(url, timeout=timeout) as client:
-            yield client
+        yield
     except (BridgeError, LiveError, LiveTimeoutError) as error:
         raise FailedError(one_line(error)) from error

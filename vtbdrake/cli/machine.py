@@ -1,4 +1,4 @@
-"""``vtbdrake machine``: a process that plays the physical robot."""
+"""``vtbdrake machine``: simulate the physical robot of a scenario in a process of its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import inf
 
 import click
 
-from vtbdrake.cli.group import FailedError, one_line
+from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
     converted,
@@ -17,7 +17,7 @@ from vtbdrake.cli.options import (
     settings,
     url_option,
 )
-from vtbdrake.cli.text import number
+from vtbdrake.cli.output import number
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.machine import Machine, MachineConfig
 from vtbdrake.machine.config import BRAKES
@@ -31,13 +31,13 @@ def _parse_noise(text: str) -> tuple[str, float]:
     try:
         name, value = parse_setting(text)
     except click.BadParameter as error:
-        raise click.BadParameter(f"it takes SIGNAL=STD, a number, not {text!r}") from error
+        raise click.BadParameter(f"expected SIGNAL=STD, a number, not {text!r}") from error
     if isinstance(value, list):
         raise click.BadParameter(f"the noise of {name} is one standard deviation for all its entries, not {value}")
     return name, value
 
 
-@click.command("machine")
+@click.command()
 @scenario_argument
 @url_option
 @click.option(
@@ -46,12 +46,10 @@ def _parse_noise(text: str) -> tuple[str, float]:
     default=_DEFAULT.period,
     show_default=True,
     metavar="S",
-    help="Of a cycle, in seconds: it tells its state once in each.",
+    help="The period of a cycle, in seconds; each cycle publishes the state once.",
 )
-@click.option(
-    "--lock-step", is_flag=True, help="Begin a cycle with a command on every channel, instead of with the clock."
-)
-@click.option("--cycles", type=click.IntRange(min=0), metavar="N", help="End after so many; endless by default.")
+@click.option("--lock-step", is_flag=True, help="Begin a cycle with a command on every channel, not by the clock.")
+@click.option("--cycles", type=click.IntRange(min=0), metavar="N", help="End after N cycles.  [default: endless]")
 @set_option
 @click.option(
     "--perturb",
@@ -65,20 +63,28 @@ def _parse_noise(text: str) -> tuple[str, float]:
     callback=converted(_parse_noise),
     multiple=True,
     metavar="SIGNAL=STD",
-    help="Normal noise on a sensor signal, in its unit. May be repeated.",
+    help="Add normal noise to a sensor signal, in its unit. May be repeated.",
 )
-@click.option("--seed", type=int, default=_DEFAULT.seed, show_default=True, metavar="N", help="Of all random numbers.")
 @click.option(
-    "--sense-delay", type=float, default=0.0, metavar="MS", help="Of its messages, in milliseconds; whole cycles."
+    "--seed", type=int, default=_DEFAULT.seed, show_default=True, metavar="N", help="The seed of all random numbers."
 )
-@click.option("--act-delay", type=float, default=0.0, metavar="MS", help="Of commands, in milliseconds; whole cycles.")
+@click.option(
+    "--sense-delay",
+    type=float,
+    default=0.0,
+    metavar="MS",
+    help="The latency of sensor messages, in milliseconds; whole cycles.",
+)
+@click.option(
+    "--act-delay", type=float, default=0.0, metavar="MS", help="The latency of commands, in milliseconds; whole cycles."
+)
 @click.option(
     "--timeout",
     type=float,
     default=_DEFAULT.timeout,
     show_default=True,
     metavar="S",
-    help="Seconds without a command after which it brakes.",
+    help="Brake after S seconds without a command.",
 )
 @click.option(
     "--max-delay",
@@ -86,14 +92,14 @@ def _parse_noise(text: str) -> tuple[str, float]:
     default=_DEFAULT.max_delay,
     show_default=True,
     metavar="S",
-    help="Refuse commands that took so much longer than the quickest one, by their sender's clock; inf: none. Not in "
-    "lock-step.",
+    help="Reject commands that took S seconds longer than the quickest one, by their sender's clock; inf rejects none. "
+    "Not in lock-step.",
 )
 @click.option(
     "--brake",
     type=click.Choice(BRAKES),
-    help="Lock the joints (the default where the plant is discrete), give the idle commands (the default elsewhere) or "
-    "hold the last ones.",
+    help="Lock the joints (default for a discrete plant), apply the idle commands (default for a continuous one) "
+    "or hold the last commands.",
 )
 @click.option(
     "--priority",
@@ -101,9 +107,9 @@ def _parse_noise(text: str) -> tuple[str, float]:
     default=0,
     show_default=True,
     metavar="N",
-    help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it.",
+    help="The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",
 )
-def run_machine(
+def machine(
     scenario: Scenario,
     url: str,
     period: float,
@@ -120,10 +126,10 @@ def run_machine(
     brake: str | None,
     priority: int,
 ) -> None:
-    """Play the physical robot of a scenario over LCM, until Ctrl-C.
+    """Simulate the physical robot of a scenario over LCM, until Ctrl-C.
 
-    The scenario says by its method protocol() on which channels. Faults can be requested on VTB_MACHINE, as JSON, such
-    as {"fault": "drop", "fraction": 0.5} or {"request": "normal"}; VTB_MACHINE_STATUS says how the machine is.
+    The method deployment() of the scenario describes the channels. VTB_MACHINE takes requests for faults as JSON, such
+    as {"fault": "drop", "fraction": 0.5} or {"request": "normal"}. The status is published on VTB_MACHINE_STATUS.
 
     \b
     Example:
@@ -143,12 +149,12 @@ def run_machine(
         max_delay=max_delay,
         brake=brake or "",
     )
-    machine = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
-    for address, value in machine.perturbed.items():
+    simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
+    for address, value in simulated.perturbed.items():
         click.echo(f"{address} = {value}")
     try:
         loop = serve(
-            machine,
+            simulated,
             url,
             lock_step=lock_step,
             cycles=inf if cycles is None else cycles,
@@ -158,4 +164,4 @@ def run_machine(
     except BridgeError as error:
         raise FailedError(one_line(error)) from error
     click.echo(loop.statistics)
-    click.echo(f"{number(machine.time)} s simulated, {number(loop.lost)} s behind the clock")
+    click.echo(f"{number(simulated.time)} s simulated, {number(loop.lost)} s behind the clock")

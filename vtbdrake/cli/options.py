@@ -1,11 +1,10 @@
-"""What the commands take: scenarios, settings, ranges and files, checked before anything long begins."""
+"""Options and arguments that several commands share, with the parsers that check them before anything long begins."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -13,7 +12,7 @@ from urllib.parse import urlsplit
 import click
 
 from vtbdrake.state import Snapshot
-from vtbdrake.testbed import Scenario, load_scenario
+from vtbdrake.testbed import load_scenario
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Choice, Parameter
@@ -23,7 +22,7 @@ Setting = tuple[str, float | list[Any]]
 
 
 def converted(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """A callback that makes of the text of an option, or of each of its texts, what the command takes."""
+    """Return a click callback that parses the text of an option, or each of its texts."""
 
     def convert(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
         if ctx.resilient_parsing or value is None:
@@ -33,26 +32,11 @@ def converted(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Par
     return convert
 
 
-def parse_setting(text: str) -> Setting:
-    """``ADDRESS=VALUE``, the value a number or a JSON list of numbers."""
-    address, equals, value = (part.strip() for part in text.partition("="))
-    if not (address and equals and value):
-        raise click.BadParameter(f"it takes ADDRESS=VALUE, not {text!r}")
-    try:
-        number = json.loads(value)
-    except json.JSONDecodeError:
-        number = None
-    if isinstance(number, bool) or not isinstance(number, int | float | list):
-        raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
-    return address, number
-
-
-def parse_field(text: str) -> tuple[str, Any]:
-    """``NAME=VALUE``, the value in JSON, or else a text."""
+def _assignment(text: str, form: str) -> tuple[str, str]:
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
-        raise click.BadParameter(f"it takes NAME=VALUE, not {text!r}")
-    return name, _json_or_text(value)
+        raise click.BadParameter(f"expected {form}, not {text!r}")
+    return name, value
 
 
 def _json_or_text(value: str) -> Any:
@@ -62,91 +46,103 @@ def _json_or_text(value: str) -> Any:
         return value
 
 
+def parse_setting(text: str) -> Setting:
+    """Parse ``ADDRESS=VALUE``, where the value is a number or a JSON list of numbers."""
+    address, value = _assignment(text, "ADDRESS=VALUE")
+    number = _json_or_text(value)
+    if isinstance(number, bool) or not isinstance(number, int | float | list):
+        raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
+    return address, number
+
+
+def parse_field(text: str) -> tuple[str, Any]:
+    """Parse ``NAME=VALUE``, where the value is JSON, or else a text."""
+    name, value = _assignment(text, "NAME=VALUE")
+    return name, _json_or_text(value)
+
+
 def parse_condition(text: str) -> dict[str, Any]:
-    """Settings that hold together: ``ADDRESS=VALUE[;ADDRESS=VALUE...]``."""
+    """Parse settings that hold together: ``ADDRESS=VALUE[;ADDRESS=VALUE...]``."""
     return settings(parse_setting(part) for part in text.split(";"))
 
 
+def parse_choice(text: str) -> Choice:
+    """Parse ``ADDRESS=OPTION,OPTION,...``, where each option is JSON, or else a text."""
+    from vtbdrake.optimization import Choice
+
+    address, options = _assignment(text, "ADDRESS=OPTION,OPTION[,...]")
+    return Choice(address, [_json_or_text(option.strip()) for option in options.split(",")])
+
+
+def parse_range(text: str) -> Parameter:
+    """Parse ``ADDRESS=LOWER:UPPER``."""
+    from vtbdrake.optimization import Parameter
+
+    address, (lower, upper) = _numbers(text, (float, float), "ADDRESS=LOWER:UPPER")
+    return Parameter(address, lower, upper)
+
+
+def parse_scaled_range(text: str) -> Parameter:
+    """Parse ``ADDRESS=LOWER:UPPER``, followed by ``:log``, ``:integer`` or both."""
+    from vtbdrake.optimization import Parameter
+
+    bounds, kinds = text.split(":")[:2], [part.strip() for part in text.split(":")[2:]]
+    if len(set(kinds) & {"log", "integer"}) < len(kinds):
+        raise click.BadParameter(f"expected ADDRESS=LOWER:UPPER, then :log, :integer or both, not {text!r}")
+    address, (lower, upper) = _numbers(":".join(bounds), (float, float), "ADDRESS=LOWER:UPPER")
+    return Parameter(address, lower, upper, log="log" in kinds, integer="integer" in kinds)
+
+
+def parse_grid(text: str) -> tuple[Parameter, int]:
+    """Parse ``ADDRESS=LOWER:UPPER:POINTS``."""
+    from vtbdrake.optimization import Parameter
+
+    address, (lower, upper, points) = _numbers(text, (float, float, int), "ADDRESS=LOWER:UPPER:POINTS")
+    return Parameter(address, lower, upper), points
+
+
+def _numbers(text: str, kinds: Sequence[Callable[[str], Any]], form: str) -> tuple[str, list[Any]]:
+    address, _, values = text.rpartition("=")
+    parts = values.split(":")
+    if not address.strip() or len(parts) != len(kinds):
+        raise click.BadParameter(f"expected {form}, not {text!r}")
+    try:
+        return address.strip(), [kind(part) for kind, part in zip(kinds, parts, strict=True)]
+    except ValueError as error:
+        raise click.BadParameter(f"expected {form} with numbers, not {text!r}: {error}") from error
+
+
 def parse_url(text: str) -> str:
-    """The URL of an LCM bus."""
+    """Check the URL of an LCM bus."""
     provider, separator, _ = text.partition("://")
     if not (provider and separator):
-        raise click.BadParameter(f"the URL of a bus has the form tcpq://127.0.0.1:7700, unlike {text!r}")
+        raise click.BadParameter(f"expected the URL of an LCM bus, such as tcpq://127.0.0.1:7700, not {text!r}")
     try:
         _ = urlsplit(text).port
     except ValueError as error:
-        raise click.BadParameter(f"{text!r} has no port that there can be: {error}") from error
+        raise click.BadParameter(f"{text!r} has no valid port: {error}") from error
     return text
 
 
 def positive(value: float) -> float:
-    """A time in seconds."""
+    """Check a time in seconds."""
     if not value > 0.0:
-        raise click.BadParameter(f"it is a positive time in seconds, unlike {value:g}")
+        raise click.BadParameter(f"expected a positive time in seconds, not {value:g}")
     return value
 
 
-def parse_range(text: str) -> Parameter:
-    """``ADDRESS=LOWER:UPPER``."""
-    from vtbdrake.optimization import Parameter
-
-    (lower, upper), address = _numbers(text, (float, float), "ADDRESS=LOWER:UPPER")
-    return Parameter(address, lower, upper)
-
-
-# What may follow a range.
-SCALES = {"log", "integer"}
-
-
-def parse_scaled_range(text: str) -> Parameter:
-    """``ADDRESS=LOWER:UPPER``, and ``:log``, ``:integer`` or both after it."""
-    parts = text.split(":")
-    kinds = [part.strip() for part in parts[2:]]
-    if len(set(kinds) & SCALES) < len(kinds):
-        raise click.BadParameter(f"it takes ADDRESS=LOWER:UPPER, then :log, :integer or both, not {text!r}")
-    return replace(parse_range(":".join(parts[:2])), log="log" in kinds, integer="integer" in kinds)
-
-
-def parse_choice(text: str) -> Choice:
-    """``ADDRESS=OPTION,OPTION,...``, each in JSON, or else a text."""
-    from vtbdrake.optimization import Choice
-
-    address, equals, options = (part.strip() for part in text.partition("="))
-    if not (address and equals and options):
-        raise click.BadParameter(f"it takes ADDRESS=OPTION,OPTION[,...], not {text!r}")
-    return Choice(address, [_json_or_text(option.strip()) for option in options.split(",")])
-
-
-def parse_grid(text: str) -> tuple[Parameter, int]:
-    """``ADDRESS=LOWER:UPPER:POINTS``."""
-    from vtbdrake.optimization import Parameter
-
-    (lower, upper, points), address = _numbers(text, (float, float, int), "ADDRESS=LOWER:UPPER:POINTS")
-    return Parameter(address, lower, upper), points
-
-
-def _numbers(text: str, kinds: Sequence[Callable[[str], Any]], form: str) -> tuple[list[Any], str]:
-    address, _, values = text.rpartition("=")
-    parts = values.split(":")
-    if not address.strip() or len(parts) != len(kinds):
-        raise click.BadParameter(f"it takes {form}, not {text!r}")
-    try:
-        return [kind(part) for kind, part in zip(kinds, parts, strict=True)], address.strip()
-    except ValueError as error:
-        raise click.BadParameter(f"it takes {form} in numbers, not {text!r}: {error}") from error
-
-
 def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """A callback that checks a file to be written: its folder takes it, and its name ends as one of ``suffixes``.
+    """Return a callback that checks that a file can be written.
 
     Args:
-        new: it must not exist.
+        suffixes: The suffixes that its name may have; any by default.
+        new: Reject a file that exists.
     """
 
     def parse(text: str) -> Path:
         path = Path(text)
         if suffixes and path.suffix not in suffixes:
-            raise click.BadParameter(f"the name of the file ends in {' or '.join(suffixes)}, unlike {text!r}")
+            raise click.BadParameter(f"expected a file name that ends in {' or '.join(suffixes)}, not {text!r}")
         if path.is_dir():
             raise click.BadParameter(f"{path} is a folder")
         if not path.parent.is_dir():
@@ -160,6 +156,20 @@ def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.
     return converted(parse)
 
 
+def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping of addresses or names to values.
+
+    Raises:
+        click.UsageError: A name occurs twice.
+    """
+    values: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in values:
+            raise click.UsageError(f"{name} is set twice")
+        values[name] = value
+    return values
+
+
 scenario_argument = click.argument("scenario", callback=converted(load_scenario))
 set_option = click.option(
     "--set",
@@ -167,22 +177,14 @@ set_option = click.option(
     callback=converted(parse_setting),
     multiple=True,
     metavar="ADDRESS=VALUE",
-    help="Set a variable in s0: a number, or a JSON list. May be repeated.",
-)
-field_option = click.option(
-    "--field",
-    "fields",
-    callback=converted(parse_field),
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Set a field of the scenario: a number, true, false or a text. May be repeated.",
+    help="Set a variable in s0 to a number or a JSON list. May be repeated.",
 )
 url_option = click.option(
     "--url",
     callback=converted(parse_url),
     required=True,
     metavar="URL",
-    help="The LCM bus: tcpq://127.0.0.1:7700, of a hub, say.",
+    help="The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.",
 )
 timeout_option = click.option(
     "--timeout",
@@ -191,16 +193,16 @@ timeout_option = click.option(
     default=5.0,
     show_default=True,
     metavar="S",
-    help="Give up when nobody has answered for so long.",
+    help="Give up after so many seconds without an answer.",
 )
-horizon_option = click.option("--horizon", type=float, required=True, metavar="S", help="t_m, in seconds.")
+horizon_option = click.option("--horizon", type=float, required=True, metavar="S", help="The horizon t_m, in seconds.")
 sample_period_option = click.option(
     "--sample-period",
     type=float,
     default=0.05,
     show_default=True,
     metavar="S",
-    help="Time between two samples, in seconds.",
+    help="The time between two samples, in seconds.",
 )
 start_option = click.option(
     "--start",
@@ -208,32 +210,3 @@ start_option = click.option(
     metavar="SNAPSHOT",
     help="Take s0 from this file instead of the defaults.",
 )
-
-
-def with_fields(scenario: Scenario, pairs: Iterable[tuple[str, Any]]) -> Scenario:
-    """A copy of the scenario with these fields.
-
-    Raises:
-        click.UsageError: a field is set twice.
-        ScenarioError: the scenario refuses one.
-    """
-    values: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in values:
-            raise click.UsageError(f"the field {name} is set twice")
-        values[name] = value
-    return scenario.with_fields(values)
-
-
-def settings(pairs: Iterable[Setting]) -> dict[str, Any]:
-    """Address -> value.
-
-    Raises:
-        click.UsageError: an address is set twice.
-    """
-    values: dict[str, Any] = {}
-    for address, value in pairs:
-        if address in values:
-            raise click.UsageError(f"{address} is set twice")
-        values[address] = value
-    return values

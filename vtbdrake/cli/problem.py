@@ -1,44 +1,58 @@
-"""What the commands about problems have in common: how a problem is stated, and the results of a sweep shown."""
+"""``vtbdrake sweep`` and ``boundary``, and how the command line states a problem."""
 
 from __future__ import annotations
 
+import importlib
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 import numpy as np
 
-from vtbdrake.cli.group import FailedError, one_line
+from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
     converted,
     horizon_option,
     output,
     parse_condition,
+    parse_grid,
+    parse_range,
     sample_period_option,
     scenario_argument,
     set_option,
     settings,
     start_option,
 )
-from vtbdrake.cli.quality import make_quality
-from vtbdrake.cli.text import number, table, write_csv
-from vtbdrake.optimization import Boundary, Problem, Sweep
+from vtbdrake.cli.output import number, table, write_csv
+from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
+from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.risk import Risk
-from vtbdrake.rollout import Constraint
+from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.choice import NAMES
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_PROBLEM = (
+_FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_CALL = re.compile(rf"({_FUNCTION.pattern})\((.*)\)")
+
+
+def _all(*options: Callable[[F], F]) -> Callable[[F], F]:
+    """Combine several options to one decorator."""
+    return lambda command: reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
+
+
+problem_options: Callable[[F], F] = _all(
     scenario_argument,
     click.option(
         "--quality",
@@ -56,31 +70,42 @@ _PROBLEM = (
         callback=converted(parse_condition),
         multiple=True,
         metavar="ADDRESS=VALUE[;...]",
-        help="A condition that every point is tried under. May be repeated.",
+        help="Evaluate every point under this condition. May be repeated.",
     ),
     sample_period_option,
     start_option,
 )
-
-_EXECUTION = (
-    click.option("--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True),
+executor_options: Callable[[F], F] = _all(
     click.option(
-        "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
+        "--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True, help="Where rollouts run."
     ),
-    click.option("--save", callback=output(), metavar="FILE", help="Write all of it, for vtbdrake.Sweep.load."),
+    click.option(
+        "--workers",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="The number of threads or processes.  [default: one per core]",
+    ),
+)
+_file_options: Callable[[F], F] = _all(
+    click.option("--save", callback=output(), metavar="FILE", help="Write the sweep for vtbdrake.Sweep.load."),
     click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write the table."),
     click.option("--plot", callback=output(".png", ".svg", ".pdf"), metavar="FILE", help="Draw h and the qualities."),
 )
 
 
-def problem_options(command: F) -> F:
-    """The options that state a problem."""
-    return reduce(lambda wrapped, option: option(wrapped), reversed(_PROBLEM), command)
+def magnitude(value: float | np.ndarray) -> float:
+    """Return abs(value); of an array, the largest entry."""
+    return float(np.max(np.abs(value)))
 
 
-def execution_options(command: F) -> F:
-    """The options about where rollouts run and where the results go."""
-    return reduce(lambda wrapped, option: option(wrapped), reversed(_EXECUTION), command)
+def largest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its largest entry."""
+    return float(np.max(value))
+
+
+def smallest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its smallest entry."""
+    return float(np.min(value))
 
 
 def make_problem(
@@ -99,12 +124,12 @@ def make_problem(
     risk: str | Risk = "worst",
     constraints: Sequence[Constraint] = (),
 ) -> Problem:
-    """The problem that the options state; ``values`` hold under every condition."""
+    """Return the problem that the options state; ``values`` hold under every condition."""
     common = list(settings(values).items())
     return Problem(
         scenario=scenario,
         parameters=parameters,
-        quality=replace(make_quality(quality, of), minimize=minimize),
+        quality=replace(_quality(quality, of), minimize=minimize),
         horizon=horizon,
         threshold=threshold,
         sample_period=sample_period,
@@ -115,8 +140,162 @@ def make_problem(
     )
 
 
-def points_table(sweep: Sweep) -> str:
-    """One row per point and condition: the parameters, h, t*, how the rollout ended; below, why some failed."""
+def _quality(text: str, of: Sequence[str]) -> Quality:
+    if not _FUNCTION.fullmatch(text):
+        if of:
+            raise click.UsageError(f"--of belongs to a quality module:function; {text} is an address")
+        return Quality(magnitude, of=text)
+    if not of:
+        raise click.UsageError(f"--quality {text} needs its arguments: add --of ADDRESS for each")
+    return Quality(_function(text), of=of)
+
+
+def make_constraint(text: str, *, limit: str) -> Constraint:
+    """Return the constraint ``ADDRESS=NUMBER`` or ``module:function(ADDRESS,...)=NUMBER``.
+
+    Args:
+        text: The constraint.
+        limit: ``at_most`` or ``at_least``.
+
+    Raises:
+        click.BadParameter: The text has another form.
+        click.UsageError: The function does not exist.
+    """
+    what, _, bound = (part.strip() for part in text.rpartition("="))
+    form = "ADDRESS=LIMIT or MODULE:FUNCTION(ADDRESS,...)=LIMIT"
+    try:
+        limits: dict[str, Any] = {limit: float(bound)}
+    except ValueError as error:
+        raise click.BadParameter(f"expected {form}, LIMIT a number, not {text!r}") from error
+    call = _CALL.fullmatch(what)
+    if call is not None:
+        of = [address.strip() for address in call[2].split(",") if address.strip()]
+        return Constraint(_function(call[1]), of=of, **limits)
+    if not what or _FUNCTION.fullmatch(what):
+        raise click.BadParameter(f"expected {form}, not {text!r}")
+    return Constraint(largest if limit == "at_most" else smallest, of=what, **limits)
+
+
+def _function(text: str) -> Callable[..., Any]:
+    module_name, _, name = text.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise click.UsageError(f"cannot import {module_name} of the quality {text}: {error}") from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        raise click.UsageError(f"{module_name} has no function {name!r}")
+    return found
+
+
+@click.command()
+@problem_options
+@click.option(
+    "--vary",
+    callback=converted(parse_grid),
+    multiple=True,
+    required=True,
+    metavar="ADDRESS=LOWER:UPPER:POINTS",
+    help="An element of s0 and the values to evaluate. Once or twice.",
+)
+@click.option("--threshold", type=float, default=inf, metavar="F", help="f_m: a rollout whose f exceeds it ends there.")
+@executor_options
+@_file_options
+def sweep(
+    scenario: Scenario,
+    vary: tuple[tuple[Parameter, int], ...],
+    executor: str,
+    workers: int | None,
+    save: Path | None,
+    csv: Path | None,
+    plot: Path | None,
+    **problem: Any,
+) -> None:
+    """Simulate every point of a grid: which one is best?
+
+    With a threshold and one parameter, it also prints the boundary: the largest value up to which no rollout exceeds
+    the threshold. Ctrl-C ends the sweep and keeps the finished rollouts.
+
+    \b
+    Example:
+      vtbdrake sweep diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+          --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
+    """
+    stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
+    found = stated.sweep([points for _, points in vary], executor=executor, workers=workers)
+    click.echo(_points_table(found))
+    _write_files(found, save=save, csv=csv, plot=plot)
+    _reject_failures(found)
+    click.echo("\n" + _conclusion(found))
+    if not found.complete:
+        raise FailedError("the sweep was interrupted: the table shows the finished rollouts")
+
+
+@click.command()
+@problem_options
+@click.option(
+    "--vary",
+    callback=converted(parse_range),
+    required=True,
+    metavar="ADDRESS=LOWER:UPPER",
+    help="The element of s0 whose boundary to find, and its range.",
+)
+@click.option("--threshold", type=float, required=True, metavar="F", help="f_m: a rollout whose f exceeds it is bad.")
+@click.option("--resolution", type=float, required=True, metavar="R", help="The width of the interval to find.")
+@click.option("--coarse", type=float, required=True, metavar="C", help="The step of the first grid.")
+@click.option(
+    "--repeats",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one.  "
+    "[default: 5]",
+)
+@click.option(
+    "--jitter",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    metavar="J",
+    help="The largest change of the parameter in a repetition, as a fraction of its range.",
+)
+@executor_options
+@_file_options
+def boundary(
+    scenario: Scenario,
+    vary: Parameter,
+    resolution: float,
+    coarse: float,
+    repeats: int | None,
+    jitter: float,
+    executor: str,
+    workers: int | None,
+    save: Path | None,
+    csv: Path | None,
+    plot: Path | None,
+    **problem: Any,
+) -> None:
+    """How far may a parameter go before f exceeds the threshold?
+
+    A coarse grid over the range is refined below the first failure, under each condition.
+
+    \b
+    Example:
+      vtbdrake boundary diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+          --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
+          --quality sim.sys.climber.base.pitch --threshold 0.785
+    """
+    stated = make_problem(scenario, [vary], **problem)
+    found = stated.boundary(
+        resolution=resolution, coarse=coarse, repeats=repeats, jitter=jitter, executor=executor, workers=workers
+    )
+    assert found.sweep is not None
+    _write_files(found.sweep, save=save, csv=csv, plot=plot, boundary=found)
+    _reject_failures(found.sweep)
+    click.echo(_report(found, found.sweep))
+
+
+def _points_table(sweep: Sweep) -> str:
+    """Return a row per point and condition, and below the reasons why some rollouts failed."""
     several = len(sweep.conditions) > 1
     names = [f"{p.address} [{unit}]" for p, unit in zip(sweep.parameters, sweep.units, strict=True)]
     header = [*names, *(["condition"] if several else []), "h", "t* [s]", "end"]
@@ -128,16 +307,44 @@ def points_table(sweep: Sweep) -> str:
     return "\n".join([table(header, rows), *(f"failed ({count}): {text}" for text, count in reasons.items())])
 
 
-def condition_text(index: int, condition: Mapping[str, Any]) -> str:
-    """``condition 0 (address = value, ...)``"""
+def _conclusion(sweep: Sweep) -> str:
+    lines = [_condition(i, c) for i, c in enumerate(sweep.conditions)] if len(sweep.conditions) > 1 else []
+    try:
+        point, h = sweep.best()
+    except ValueError as error:
+        raise FailedError(one_line(error)) from error
+    at = ", ".join(f"{address} = {number(value)}" for address, value in point.items())
+    lines.append(f"best: h = {number(h)} at {at}")
+    if not why_no_boundary(sweep):
+        lines.append(f"boundary: {sweep.boundary()}")
+    return "\n".join(lines)
+
+
+def _report(found: Boundary, sweep: Sweep) -> str:
+    lines = [str(found)]
+    several = len(sweep.conditions) > 1
+    if several:
+        for i, (lower, upper) in enumerate(found.by_condition):
+            lines.append(f"  {_condition(i, sweep.conditions[i])}: {found.interval_text(lower, upper)}")
+    for chance in found.worst_chances:
+        which = f" under condition {chance.condition}" if several else ""
+        lines.append(f"  {number(chance.value)} {found.unit}: {chance}{which}")
+    if found.failed_at:
+        values = ", ".join(map(number, found.failed_at))
+        lines.append(f"counted as unsafe: the simulation failed at {values} {found.unit}")
+    rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]
+    seconds = sum(rollout.wall_time for rollout in rollouts)
+    return "\n".join([*lines, f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation"])
+
+
+def _condition(index: int, condition: Mapping[str, Any]) -> str:
     values = (f"{address} = {json.dumps(np.asarray(value).tolist())}" for address, value in condition.items())
     return f"condition {index} ({', '.join(values)})"
 
 
-def write_files(
+def _write_files(
     sweep: Sweep, *, save: Path | None, csv: Path | None, plot: Path | None, boundary: Boundary | None = None
 ) -> None:
-    """Writes what was asked for; the plot shows the boundary, if one was searched for."""
     if save is not None:
         sweep.save(save)
     if csv is not None:
@@ -146,10 +353,6 @@ def write_files(
         (sweep if boundary is None else boundary).plot().savefig(plot)
 
 
-def refuse_failures(sweep: Sweep) -> None:
-    """
-    Raises:
-        FailedError: not one rollout succeeded.
-    """
+def _reject_failures(sweep: Sweep) -> None:
     if len(sweep) and sweep.failed.all():
         raise FailedError(f"all {len(sweep)} rollouts failed; the first: {one_line(sweep.rollouts[0].message)}")

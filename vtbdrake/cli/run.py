@@ -1,4 +1,4 @@
-"""``vtbdrake run``: the DPS alone, on the robot."""
+"""``vtbdrake run``: run the DPS of a scenario on its machine."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from pathlib import Path
 
 import click
 
-from vtbdrake.cli.group import FailedError, one_line
+from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
     converted,
-    field_option,
     output,
+    parse_field,
     positive,
     scenario_argument,
     set_option,
     settings,
     url_option,
-    with_fields,
 )
-from vtbdrake.cli.text import number, write_whole
+from vtbdrake.cli.output import number, write_whole
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime, RunawayError
@@ -39,25 +38,35 @@ from vtbdrake.testbed import Scenario
 _log = logging.getLogger(__name__)
 
 PRIORITY = 75
-MOST_FAULTS = 20
-"""As many are printed in the end."""
+MOST_FAULTS = 20  # that are printed at the end
 
 
-@click.command("run")
+@click.command()
 @scenario_argument
 @url_option
 @click.option(
     "--snapshot",
     callback=converted(Snapshot.load),
     metavar="FILE",
-    help="Go on from where the DPS is in this snapshot, of the whole testbed or of a DPS alone.",
+    help="Start the DPS in the state of this snapshot, of a whole testbed or of a DPS alone.",
 )
 @set_option
-@field_option
-@click.option("--period", type=float, metavar="S", help="Of a cycle, in seconds, instead of the scenario's.")
-@click.option("--pace", metavar="SIGNAL", help="Begin a cycle with each message of this sensor, not by the clock.")
 @click.option(
-    "--seconds", type=float, callback=converted(positive), metavar="S", help="End after so long; endless by default."
+    "--field",
+    "fields",
+    callback=converted(parse_field),
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Set a field of the scenario: a number, true, false or a text. May be repeated.",
+)
+@click.option(
+    "--period", type=float, metavar="S", help="The period of a cycle, in seconds, instead of that of the scenario."
+)
+@click.option(
+    "--pace", metavar="SIGNAL", help="Begin a cycle with each message of this sensor signal, not by the clock."
+)
+@click.option(
+    "--seconds", type=float, callback=converted(positive), metavar="S", help="End after S seconds.  [default: endless]"
 )
 @click.option(
     "--wait",
@@ -66,13 +75,13 @@ MOST_FAULTS = 20
     default=60.0,
     show_default=True,
     metavar="S",
-    help="Give up if the machine is not ready then.",
+    help="Give up if the machine is not ready after S seconds.",
 )
 @click.option(
     "--take-over",
     "claim",
     is_flag=True,
-    help="Ask the hub for command channels whose owner has fallen silent: a frozen DPS, say.",
+    help="Ask the hub for command channels whose owner has fallen silent, for instance a frozen DPS.",
 )
 @click.option(
     "--priority",
@@ -80,20 +89,20 @@ MOST_FAULTS = 20
     default=PRIORITY,
     show_default=True,
     metavar="N",
-    help="Of real-time scheduling (SCHED_FIFO), 1 to 99, where the system grants it; 0 for ordinary scheduling.",
+    help="The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if granted; 0 for ordinary scheduling.",
 )
 @click.option(
     "--lock-memory/--no-lock-memory",
     default=True,
     show_default=True,
-    help="Keep memory from being paged out, all of it: what is never used becomes resident, too.",
+    help="Keep all memory resident, including memory that is never used.",
 )
 @click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set, watch and reset.")
 @click.option(
-    "--record", callback=output(".lcm", new=True), metavar="FILE", help="Record the loop: .lcm, for vtbdrake replay."
+    "--record", callback=output(".lcm", new=True), metavar="FILE", help="Record the loop for vtbdrake replay: .lcm."
 )
-@click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the loop's timing: .json.")
-def run_dps(
+@click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the timing of the loop: .json.")
+def run(
     scenario: Scenario,
     url: str,
     snapshot: Snapshot | None,
@@ -121,7 +130,7 @@ def run_dps(
     Example:
       vtbdrake run diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
-    scenario = with_fields(scenario, fields)
+    scenario = scenario.with_fields(settings(fields))
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
     # SIGTERM ends the loop as Ctrl-C does.

@@ -1,4 +1,4 @@
-"""``vtbdrake study``: runs a study, shows it, and gives it points, also while another process runs it."""
+"""``vtbdrake study``: run a study, show it, and add points to it, also while another process runs it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from typing import Any
 
 import click
 
-from vtbdrake.cli.group import FailedError
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import converted, output, parse_choice, parse_field, parse_scaled_range, settings
-from vtbdrake.cli.problem import make_problem, problem_options
-from vtbdrake.cli.quality import make_constraint
-from vtbdrake.cli.text import table, write_csv
+from vtbdrake.cli.output import table, write_csv
+from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, problem_options
 from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint
-from vtbdrake.rollout.choice import NAMES
 from vtbdrake.testbed import Scenario
 
-_file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-
-
 _LEVELS = {"quantile": Quantile, "cvar": CVaR}
+_file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+_point = click.argument(
+    "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
+)
 
 
 def _risk(text: str) -> str | Risk:
@@ -32,19 +31,14 @@ def _risk(text: str) -> str | Risk:
     if not colon:
         return text
     if name not in _LEVELS:
-        raise click.BadParameter(f"it takes worst, mean, quantile:LEVEL or cvar:LEVEL, not {text!r}")
+        raise click.BadParameter(f"expected worst, mean, quantile:LEVEL or cvar:LEVEL, not {text!r}")
     try:
         return _LEVELS[name](float(level))
     except ValueError as error:
         raise click.BadParameter(f"the level of {name} is a number in (0, 1], not {level!r}") from error
 
 
-_point = click.argument(
-    "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
-)
-
-
-@click.group("study")
+@click.group()
 def study() -> None:
     """Solve a problem, recorded rollout by rollout in a file that can be resumed.
 
@@ -56,7 +50,7 @@ def study() -> None:
     """
 
 
-@study.command("run")
+@study.command()
 @click.argument("file", callback=output())
 @problem_options
 @click.option(
@@ -79,15 +73,15 @@ def study() -> None:
     callback=converted(partial(make_constraint, limit="at_most")),
     multiple=True,
     metavar="ADDRESS=LIMIT",
-    help="A constraint: the variable (of an array, its largest entry) never exceeds the limit. Or of a Python function "
-    "of variables: MODULE:FUNCTION(ADDRESS,...)=LIMIT. May be repeated.",
+    help="A constraint: the variable (of an array, its largest entry) never exceeds the limit. Instead of a "
+    "variable, a Python function of variables: MODULE:FUNCTION(ADDRESS,...)=LIMIT. May be repeated.",
 )
 @click.option(
     "--at-least",
     callback=converted(partial(make_constraint, limit="at_least")),
     multiple=True,
     metavar="ADDRESS=LIMIT",
-    help="Likewise, that it (of an array, its smallest entry) never falls below the limit.",
+    help="A constraint: the variable (of an array, its smallest entry) never falls below the limit. May be repeated.",
 )
 @click.option("--minimize", is_flag=True, help="The quality is a cost: smaller is better.")
 @click.option(
@@ -95,37 +89,34 @@ def study() -> None:
     callback=converted(_risk),
     default="worst",
     show_default=True,
-    help="How conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
+    help="How the qualities under several conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
 )
-@click.option("--solver", metavar="NAME", help="auto if left out, or that of the file.")
+@click.option("--solver", metavar="NAME", help="The solver.  [default: auto, or that of FILE]")
 @click.option(
     "--option",
     "options",
     callback=converted(parse_field),
     multiple=True,
     metavar="NAME=VALUE",
-    help="Of the solver. May be repeated.",
+    help="An option of the solver. May be repeated.",
 )
-@click.option("--seed", type=int, metavar="N", help="Of the solver; 0 if left out, or that of the file.")
-@click.option("--rollouts", type=click.IntRange(min=1), metavar="N", help="How many the study has in the end.")
-@click.option("--seconds", type=float, metavar="S", help="Wall time of this run.")
-@click.option("--target", type=float, metavar="H", help="End when a point is at least as good.")
-@click.option("--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True)
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Threads or processes; one per core if left out."
-)
-@click.option("--time-limit", type=float, metavar="S", help="A rollout that takes longer fails.")
+@click.option("--seed", type=int, metavar="N", help="The seed of the solver.  [default: 0, or that of FILE]")
+@click.option("--rollouts", type=click.IntRange(min=1), metavar="N", help="End when the study has N rollouts.")
+@click.option("--seconds", type=float, metavar="S", help="End after S seconds of wall time.")
+@click.option("--target", type=float, metavar="H", help="End when a point is at least as good as H.")
+@executor_options
+@click.option("--time-limit", type=float, metavar="S", help="Fail a rollout that takes longer than S seconds.")
 @click.option(
     "--racing/--no-racing",
     default=None,
-    help="Drop points that can no longer win before all conditions have run; the default with several conditions.",
+    help="Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
 )
 @click.option(
     "--on-error",
     type=click.Choice(["record", "raise"]),
     default="record",
     show_default=True,
-    help="Where the quality function fails: record the rollout as failed, or end the run.",
+    help="If the quality function raises: record the rollout as failed, or end the run.",
 )
 @click.option("--allow-changed-code", is_flag=True, help="Resume although the code of the problem has changed.")
 def run(
@@ -152,9 +143,9 @@ def run(
     allow_changed_code: bool,
     **problem: Any,
 ) -> None:
-    """Begin a study, or go on with the one in FILE. Ctrl-C keeps what is finished.
+    """Begin a study, or resume the one in FILE. Ctrl-C keeps the finished rollouts.
 
-    It takes one quality, read as the best over time. Several qualities, other readings, limits of the quality and
+    The study has one quality, read as the best over time. Several qualities, other readings, limits of the quality and
     callbacks need a Python program: see Problem.study.
 
     \b
@@ -164,7 +155,7 @@ def run(
           --quality sim.sys.climber.base.x --at-most sim.sys.climber.base.pitch=0.2
     """
     if not (vary or choose):
-        raise click.UsageError("say with --vary or --choose what is varied")
+        raise click.UsageError("nothing is varied: add --vary or --choose")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     stated = make_problem(
         scenario, [*vary, *choose], **problem, minimize=minimize, risk=risk, constraints=[*at_most, *at_least]
@@ -188,14 +179,14 @@ def run(
         )
         click.echo(opened.summary())
         if opened.reason == "interrupted":
-            raise FailedError("the study was interrupted: the same command goes on with it")
+            raise FailedError("the study was interrupted: the same command resumes it")
 
 
-@study.command("show")
+@study.command()
 @_file
 @click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write all points with their attributes.")
 def show(file: Path, csv: Path | None) -> None:
-    """Show what a study has found, the points that wait, and its attributes."""
+    """Show the results of a study, its waiting points and its attributes."""
     with Study.open(file) as opened:
         click.echo(opened.summary())
         queue, attributes = opened.queue, opened.attributes
@@ -209,30 +200,30 @@ def show(file: Path, csv: Path | None) -> None:
             write_csv(csv, opened.to_dict())
 
 
-@study.command("add")
+@study.command()
 @_file
 @_point
 def add(file: Path, point: tuple[tuple[str, Any], ...]) -> None:
-    """Give a point, to be judged with the next batch."""
+    """Add a point, to be evaluated with the next batch."""
     with Study.open(file) as opened:
         opened.add(settings(point))
 
 
-@study.command("edit")
+@study.command()
 @_file
 @click.argument("number", type=int)
 @_point
 def edit(file: Path, number: int, point: tuple[tuple[str, Any], ...]) -> None:
-    """Put another point in the place of one that waits; `show` lists their numbers."""
+    """Replace a waiting point; `show` lists the numbers."""
     with Study.open(file) as opened:
         opened.edit(number, settings(point))
 
 
-@study.command("remove")
+@study.command()
 @_file
 @click.argument("number", type=int)
 def remove(file: Path, number: int) -> None:
-    """Take back a point that waits; `show` lists their numbers."""
+    """Remove a waiting point; `show` lists the numbers."""
     with Study.open(file) as opened:
         opened.remove(number)
 
@@ -240,7 +231,7 @@ def remove(file: Path, number: int) -> None:
 @study.command("attribute")
 @_file
 @click.argument("attribute", callback=converted(parse_field), metavar="KEY=VALUE")
-@click.option("--trial", type=int, metavar="NUMBER", help="Of the point of this trial, not of the study.")
+@click.option("--trial", type=int, metavar="NUMBER", help="Set it for the point of this trial, not for the study.")
 def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
     """Set an attribute of a study, or of a point."""
     with Study.open(file) as opened:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from drake import (
@@ -16,21 +17,13 @@ from drake import (
     lcmt_point_cloud,
     lcmt_point_cloud_field,
 )
-from pydrake.perception import PointCloud
-from pydrake.systems.sensors import (
-    ImageBgr8U,
-    ImageBgra8U,
-    ImageDepth16U,
-    ImageDepth32F,
-    ImageGrey8U,
-    ImageLabel16I,
-    ImageRgb8U,
-    ImageRgba8U,
-)
 
 from vtbdrake.lcm.maps import Decoder, LcmMap, VectorMap, decode, vector_map
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Signal
+
+if TYPE_CHECKING:
+    from pydrake.perception import PointCloud
 
 
 def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "IIWA_STATUS") -> VectorMap:
@@ -70,16 +63,22 @@ def _same_names(fields: Mapping[str, str] | Sequence[str]) -> Mapping[str, str]:
     return fields if isinstance(fields, Mapping) else {name: name for name in fields}
 
 
-_PIXELS = {
-    ImageBgr8U: (lcmt_image.PIXEL_FORMAT_BGR, lcmt_image.CHANNEL_TYPE_UINT8),
-    ImageBgra8U: (lcmt_image.PIXEL_FORMAT_BGRA, lcmt_image.CHANNEL_TYPE_UINT8),
-    ImageDepth16U: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_UINT16),
-    ImageDepth32F: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_FLOAT32),
-    ImageGrey8U: (lcmt_image.PIXEL_FORMAT_GRAY, lcmt_image.CHANNEL_TYPE_UINT8),
-    ImageLabel16I: (lcmt_image.PIXEL_FORMAT_LABEL, lcmt_image.CHANNEL_TYPE_INT16),
-    ImageRgb8U: (lcmt_image.PIXEL_FORMAT_RGB, lcmt_image.CHANNEL_TYPE_UINT8),
-    ImageRgba8U: (lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8),
-}
+@cache
+def _pixels() -> dict[type, tuple[int, int]]:
+    # Imported here: a controller without a camera runs without pydrake.geometry.
+    from pydrake.systems import sensors
+
+    uint8 = lcmt_image.CHANNEL_TYPE_UINT8
+    return {
+        sensors.ImageBgr8U: (lcmt_image.PIXEL_FORMAT_BGR, uint8),
+        sensors.ImageBgra8U: (lcmt_image.PIXEL_FORMAT_BGRA, uint8),
+        sensors.ImageDepth16U: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_UINT16),
+        sensors.ImageDepth32F: (lcmt_image.PIXEL_FORMAT_DEPTH, lcmt_image.CHANNEL_TYPE_FLOAT32),
+        sensors.ImageGrey8U: (lcmt_image.PIXEL_FORMAT_GRAY, uint8),
+        sensors.ImageLabel16I: (lcmt_image.PIXEL_FORMAT_LABEL, lcmt_image.CHANNEL_TYPE_INT16),
+        sensors.ImageRgb8U: (lcmt_image.PIXEL_FORMAT_RGB, uint8),
+        sensors.ImageRgba8U: (lcmt_image.PIXEL_FORMAT_RGBA, uint8),
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +97,7 @@ class ImageMap(LcmMap):
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         models = {signal.name: signal.model_value for signal in signals}
         for name, model in models.items():
-            if type(model) not in _PIXELS or not model.width() * model.height():
+            if type(model) not in _pixels() or not model.width() * model.height():
                 raise ValueError(
                     f"signal {name} on channel {self.channel} needs an image of its size as model_value, such as "
                     f"ImageRgba8U(640, 480), not {model!r}"
@@ -138,7 +137,7 @@ def _to_image(message: Any, model: Any) -> Any:
     """Return the image in an `lcmt_image`, of the type and size of ``model``."""
     image = type(model)(model.width(), model.height())
     pixels = image.mutable_data
-    if (message.pixel_format, message.channel_type) != _PIXELS[type(model)]:
+    if (message.pixel_format, message.channel_type) != _pixels()[type(model)]:
         raise MalformedError("type")
     if (message.width, message.height) != (image.width(), image.height()) or message.row_stride != pixels[0].nbytes:
         raise MalformedError("size")
@@ -179,6 +178,8 @@ class PointCloudMap(LcmMap):
     """
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        from pydrake.perception import PointCloud
+
         (signal,) = signals
         if not isinstance(signal.model_value, PointCloud):
             raise ValueError(
@@ -201,7 +202,7 @@ def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
 def _to_cloud(message: Any, model: PointCloud) -> PointCloud:
     """Return the cloud in an `lcmt_point_cloud`, with the properties of ``model``."""
     points = _points(message)
-    cloud = PointCloud(len(points), model.fields())
+    cloud = type(model)(len(points), model.fields())
     with np.errstate(over="ignore", invalid="ignore"):  # double to single precision
         if model.has_xyzs():
             cloud.mutable_xyzs()[:] = [_column(points, name) for name in ("x", "y", "z")]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 import pytest
 
-from tests.cli.program import run
+from tests.cli.program import error_of, run
 from tests.recording.servo import Servo
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
@@ -33,7 +33,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "velocity.csv"
     program = run("replay", path, *SCENARIO, "--record", "dps.velocity", "--out", out)
-    assert program.returncode == 0, program.stderr
+    assert program.exit_code == 0, program.stderr
     assert "20 cycles replayed, 0 digests of the state: identical" in program.stdout
     table = pandas.read_csv(out)
     assert len(table) == 20 and table["t"].is_monotonic_increasing
@@ -44,15 +44,17 @@ def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
     by_another_module = ("--scenario", "tests.recording.servo:ServoScenario")
     assert "identical" in run("replay", path, *by_another_module, "--on", "testbed").stdout
     program = run("replay", path, *SCENARIO, "--set", "dps.gain=1.5")
-    assert program.returncode == 0 and "not compared" in program.stdout
+    assert program.exit_code == 0 and "not compared" in program.stdout
 
 
-def test_a_damaged_log_is_replayed_up_to_the_damage_and_told(path: Path, tmp_path: Path) -> None:
+def test_a_damaged_log_is_replayed_up_to_the_damage_and_reported(
+    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     damaged = tmp_path / "damaged.lcm"
     damaged.write_bytes(path.read_bytes()[:-300])
     program = run("replay", damaged, *SCENARIO)
-    assert program.returncode == 0 and "identical" in program.stdout
-    assert "the file ends in the middle of an event" in program.stderr
+    assert program.exit_code == 0 and "identical" in program.stdout
+    assert "the file ends in the middle of an event" in caplog.text
 
 
 def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
@@ -71,8 +73,8 @@ def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
         replay(log)
     for command in (("replay", log), ("export", log, tmp_path / "a.csv"), ("replay", log, *SCENARIO)):
         program = run(*command, cwd=tmp_path)
-        assert "Traceback" not in program.stderr and not (tmp_path / "has_run").exists()
-    assert run("replay", log, "--scenario", "foreign:Scenario", cwd=tmp_path).returncode == 2
+        assert program.exit_code in (0, 2) and not (tmp_path / "has_run").exists()
+    assert run("replay", log, "--scenario", "foreign:Scenario", cwd=tmp_path).exit_code == 2
     assert (tmp_path / "has_run").exists()
 
 
@@ -80,23 +82,21 @@ def test_export_writes_every_format(path: Path, tmp_path: Path) -> None:
     for suffix in (".csv", ".parquet", ".mcap"):
         out = tmp_path / f"run{suffix}"
         program = run("export", path, out)
-        assert program.returncode == 0 and "20 cycles of 0.001 s" in program.stdout, program.stderr
+        assert program.exit_code == 0 and "20 cycles of 0.001 s" in program.stdout, program.stderr
         assert out.stat().st_size > 1000
 
 
 def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
     (tmp_path / "no.lcm").write_text("no")
-    for arguments, told in [
-        (("replay", tmp_path / "no.lcm"), "is no log of a control loop"),
+    for arguments, expected in [
+        (("replay", tmp_path / "no.lcm"), "is not a log of a control loop"),
         (("replay", tmp_path / "nowhere.lcm"), "No such file"),
         (("replay", path, "--record", "dps.gain"), "give both or neither"),
-        (("replay", path), f"if you trust it, say {' '.join(SCENARIO)}"),
+        (("replay", path), f"if you trust it, add {' '.join(SCENARIO)}"),
         (
             ("replay", path, "--scenario", "tests.testbeds:PendulumScenario"),
             "is of the scenario tests.control.scripted",
         ),
         (("export", path, tmp_path / "run.xls"), "ends in .csv or .mcap or .parquet"),
     ]:
-        program = run(*arguments)
-        assert program.returncode == 2 and told in program.stderr
-        assert len(program.stderr.splitlines()) == 1
+        assert expected in error_of(*arguments)

@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE
+from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE, error_of, run
 from tests.folders import open_folder, that_cannot_be_written
-from vtbdrake.cli import main
 
 SERVO, BUS = "tests.control.servo_machine:ServoMachineScenario", ["--url", "tcpq://127.0.0.1:1"]
 VARY = ["--vary", f"{ANGLE}=0:1:2", "--horizon", "1"]
@@ -21,21 +19,13 @@ def negative(_: float) -> float:
     return -1.0
 
 
-def error_of(arguments: list[str], code: int = 2) -> str:
-    result = CliRunner().invoke(main, arguments, prog_name="vtbdrake")
-    assert result.exit_code == code, result.output
-    assert result.stderr.startswith("Error: ")
-    assert result.stderr.count("\n") == 1
-    return result.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         (["variables", "nowhere.at_all:Scenario"], "cannot import nowhere.at_all"),
         (["variables", "tests.testbeds:Pendulum"], "it has: PendulumScenario"),
         (["variables", "tests.testbeds"], "package.module:Class"),
-        (["variables", "tests.testbeds:Scenario"], "no whole scenario: it lacks add_world, interface, make_dps"),
+        (["variables", "tests.testbeds:Scenario"], "is abstract: it lacks the methods add_world, interface, make_dps"),
         (["variables", "none.yaml"], "no scenario file none.yaml"),
         (["variables", PENDULUM, "--match", "thetta"], "no address contains 'thetta'"),
         (["variable", PENDULUM], "No such command 'variable'"),
@@ -71,51 +61,50 @@ def error_of(arguments: list[str], code: int = 2) -> str:
         ([*SWEEP, "--plot", "a.txt"], ".png or .svg or .pdf"),
         (["sweep", PENDULUM, *VARY, "--quality", "math:hypo", "--of", RATE], "math has no function 'hypo'"),
         (["sweep", PENDULUM, *VARY, "--quality", "nowhere:f", "--of", RATE], "cannot import nowhere"),
-        (["sweep", PENDULUM, *VARY, "--quality", "math:hypot"], "say with --of ADDRESS"),
+        (["sweep", PENDULUM, *VARY, "--quality", "math:hypot"], "needs its arguments: add --of ADDRESS"),
         (["sweep", PENDULUM, *VARY, "--quality", "sim.sys.Pendulum.theta.velocty"], "did you mean"),
         (["sweep", PENDULUM, *VARY, "--quality", f"{__name__}:negative", "--of", RATE], "finite and not negative"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1"], "LOWER:UPPER:POINTS"),
-        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=a:1:2"], "in numbers"),
+        (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=a:1:2"], "with numbers"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=1:0:2"], "lower < upper"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1:1"], "at least two points"),
         ([*BOUNDARY, "--resolution", "0.5", "--coarse", "0.1"], "0 < resolution <= coarse"),
         ([*BOUNDARY, "--resolution", "0.5"], "Missing option '--coarse'"),
-        (["get", "a", "--url", "nonsense"], "the form tcpq://127.0.0.1:7700, unlike 'nonsense'"),
-        (["watch", "a", "--url", ""], "the form tcpq://127.0.0.1:7700, unlike ''"),
+        (["get", "a", "--url", "nonsense"], "such as tcpq://127.0.0.1:7700, not 'nonsense'"),
+        (["watch", "a", "--url", ""], "such as tcpq://127.0.0.1:7700, not ''"),
         (
             ["machine", SERVO, "--url", "tcpq://127.0.0.1:99999"],
-            "'tcpq://127.0.0.1:99999' has no port that there can be",
+            "'tcpq://127.0.0.1:99999' has no valid port",
         ),
-        (["machine", SERVO, *BUS, "--noise", "position"], "it takes SIGNAL=STD, a number, not 'position'"),
-        (["get", "a", *BUS, "--timeout", "nan"], "'--timeout': it is a positive time in seconds, unlike nan"),
-        (["run", SERVO, *BUS, "--seconds", "-1"], "'--seconds': it is a positive time in seconds, unlike -1"),
-        (["run", SERVO, *BUS, "--wait", "0"], "'--wait': it is a positive time in seconds, unlike 0"),
+        (["machine", SERVO, *BUS, "--noise", "position"], "expected SIGNAL=STD, a number, not 'position'"),
+        (["get", "a", *BUS, "--timeout", "nan"], "'--timeout': expected a positive time in seconds, not nan"),
+        (["run", SERVO, *BUS, "--seconds", "-1"], "'--seconds': expected a positive time in seconds, not -1"),
+        (["run", SERVO, *BUS, "--wait", "0"], "'--wait': expected a positive time in seconds, not 0"),
         (["diagram", PENDULUM, "--mode", "dream"], "'sim', 'shadow', 'real', 'twin'"),
     ],
 )
-def test_bad_input(arguments: list[str], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert expected in error_of(arguments)
+def test_bad_input_is_one_line(arguments: list[str], expected: str, tmp_path: Path) -> None:
+    assert expected in error_of(*arguments, cwd=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
     (log := tmp_path / "run.lcm").write_text("dear")
-    error = error_of(["run", SERVO, *BUS, "--record", str(log)])
+    error = error_of("run", SERVO, *BUS, "--record", log)
     assert f"{log} exists, and is not overwritten: give another name" in error
     assert log.read_text() == "dear"
 
 
 def test_where_nothing_can_be_written_is_told_before_anything_is_done() -> None:
     with open_folder() as folder, that_cannot_be_written(folder):
-        error = error_of([*SWEEP, "--csv", f"{folder}/a.csv"])
+        error = error_of(*SWEEP, "--csv", f"{folder}/a.csv")
     assert "'--csv'" in error and f"{folder}/a.csv lies in a folder that you cannot write to" in error
 
 
 def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:
     path = tmp_path / "typo.yaml"
     path.write_text(f"{PENDULUM}:\n  stiffnes: 3.0\n")
-    assert "stiffnes" in error_of(["variables", str(path)])
+    assert "stiffnes" in error_of("variables", path)
 
 
 @pytest.mark.parametrize(
@@ -131,36 +120,36 @@ def test_scenario_file_with_an_unknown_key(tmp_path: Path) -> None:
 def test_a_file_has_no_module_imported(tmp_path: Path, source: str, expected: str) -> None:
     (tmp_path / "s.yaml").write_text("never.imported:Scenario:\n  a: 1\n")
     given = source.format(file=tmp_path / "s.yaml", folder=tmp_path)
-    assert expected in error_of(["variables", given])
+    assert expected in error_of("variables", given)
 
 
 def test_scenario_file_that_names_no_class_is_named(tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
     path.write_text("a: 1\n")
-    assert error_of(["variables", str(path)]).startswith(f"Error: {path}: a scenario is named package.module:Class")
+    assert error_of("variables", path).startswith(f"Error: {path}: a scenario is named package.module:Class")
 
 
 def test_snapshot_of_another_scenario(tmp_path: Path) -> None:
     path = str(tmp_path / "s")
-    assert CliRunner().invoke(main, [*ROLLOUT, "--snapshot", path]).exit_code == 0
-    assert "of another scenario" in error_of(["rollout", PENDULUM, "--horizon", "1", "--start", path])
+    assert run(*ROLLOUT, "--snapshot", path).exit_code == 0
+    assert "of another scenario" in error_of("rollout", PENDULUM, "--horizon", "1", "--start", path)
 
 
 def test_damaged_snapshot(tmp_path: Path) -> None:
     path = tmp_path / "s"
     path.write_bytes(b"PK\x03\x04 and no more")
-    assert "damaged" in error_of([*ROLLOUT, "--start", str(path)])
+    assert "damaged" in error_of(*ROLLOUT, "--start", path)
 
 
 def test_sweep_without_a_success_has_exit_code_1() -> None:
     vary = ["--vary", "sim.sys.Acrobot.elbow.position=0:1:2", "--set", "sim.sys.Acrobot.lower_link.mass=0"]
-    error = error_of(["sweep", ACROBOT, *vary, "--quality", "dps.torque", "--horizon", "1"], code=1)
+    error = error_of("sweep", ACROBOT, *vary, "--quality", "dps.torque", "--horizon", "1", code=1)
     assert "all 2 rollouts failed; the first: RuntimeError: An internal mass matrix" in error
 
 
 def test_failures_are_listed_below_the_table_once() -> None:
     vary = ["--vary", "sim.sys.Acrobot.lower_link.mass=0:1:2", "--quality", "dps.torque", "--horizon", "0.1"]
-    result = CliRunner().invoke(main, ["sweep", ACROBOT, *vary])
+    result = run("sweep", ACROBOT, *vary)
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
     assert [line.split()[-1] for line in lines[2:4]] == ["failed", "horizon"]
@@ -169,5 +158,5 @@ def test_failures_are_listed_below_the_table_once() -> None:
 
 
 def test_traceback_on_request() -> None:
-    result = CliRunner().invoke(main, ["--traceback", "variables", "none.yaml"])
+    result = run("--traceback", "variables", "none.yaml")
     assert type(result.exception).__name__ == "ScenarioError"

@@ -1,0 +1,53 @@
+"""The program itself: its help, its version, and where it finds scenarios."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from tests.cli.program import DAMPING, ROOT, run
+from vtbdrake.cli import main
+
+
+def test_version_is_one_line() -> None:
+    program = run("--version")
+    assert (program.exit_code, program.stderr) == (0, "")
+    assert program.stdout.startswith("vtbdrake")
+
+
+@pytest.mark.parametrize("command", main.list_commands(click.Context(main)))
+def test_help_shows_an_example(command: str) -> None:
+    shown = run(command, "--help")
+    assert shown.exit_code == 0
+    assert f"Example:\n    vtbdrake {command} " in shown.stdout
+
+
+def test_scenarios_are_found_from_the_current_directory(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("from tests.testbeds import PendulumScenario as Mine\n")
+    program = f"import sys; sys.path.remove({str(tmp_path)!r}) if {str(tmp_path)!r} in sys.path else None; "
+    program += "sys.path.remove('') if '' in sys.path else None; from vtbdrake.cli import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", program, "variables", "mine:Mine", "--match", "theta.damping"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert DAMPING in result.stdout, result.stderr
+
+
+def test_a_module_of_the_current_directory_does_not_take_the_place_of_another(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text("print('has run')\nfrom tests.testbeds import PendulumScenario as Mine\n")
+    for command in (["-m", "vtbdrake.cli"], ["-P", "-c", "from vtbdrake.cli import main; main()"]):
+        result = subprocess.run(
+            [sys.executable, *command, "variables", "wave:Mine"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert (result.returncode, result.stdout) == (2, "")
+        assert "wave has no scenario 'Mine'" in result.stderr

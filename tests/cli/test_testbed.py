@@ -1,0 +1,98 @@
+"""``vtbdrake variables``, ``diagram`` and ``rollout`` show what the library computes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from tests.cli.program import ACROBOT, ANGLE, PENDULUM, run
+from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake import Snapshot
+from vtbdrake.rollout import RolloutRunner, RolloutTask
+
+
+def test_variables_are_those_of_the_testbed() -> None:
+    testbed = PendulumScenario().build()
+    expected = testbed.variables().table(testbed.default_context(), pattern="theta")
+    assert run("variables", PENDULUM, "--match", "theta").stdout == expected + "\n"
+
+
+def test_variables_as_json() -> None:
+    listed = {v["address"]: v for v in json.loads(run("variables", ACROBOT, "--json").stdout)}
+    assert list(listed) == list(AcrobotScenario().build().variables())
+    assert listed["dps.gain"] == {
+        "address": "dps.gain",
+        "kind": "a",
+        "derived": False,
+        "shape": [4],
+        "unit": "N m/rad, N m s/rad",
+        "bounds": [-1000.0, 1000.0],
+        "value": [0.0, 0.0, -3.0, -1.0],
+    }
+    assert listed["sim.sys.Acrobot.elbow.damping"]["bounds"] == [0.0, None]
+
+
+def test_rollout_from_a_file_prints_and_saves_what_the_library_computes(tmp_path: Path) -> None:
+    scenario = PendulumScenario(stiffness=2.0)
+    scenario.save(tmp_path / "stiff.yaml")
+    result = RolloutRunner(RolloutTask(scenario, 1.0, record=(ANGLE, "plant.state"))).run({ANGLE: 0.5})
+
+    command = ["--horizon", 1, "--set", f"{ANGLE}=0.5", "--record", ANGLE, "--record", "plant.state"]
+    program = run("rollout", f"{PENDULUM}@{tmp_path}/stiff.yaml", *command, "--save", tmp_path / "a.csv")
+
+    assert (program.exit_code, program.stderr) == (0, "")
+    assert "end               horizon" in program.stdout
+    angles = result.record[ANGLE]
+    row = next(line for line in program.stdout.splitlines() if line.startswith(ANGLE))
+    assert row.split() == [ANGLE, "rad", f"{angles[-1]:.6g}", f"{angles.min():.6g}", f"{angles.max():.6g}"]
+    assert (tmp_path / "a.csv").read_text().splitlines()[0] == f"t,{ANGLE},plant.state[0],plant.state[1]"
+    saved = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(saved[:, 0], result.times)
+    np.testing.assert_array_equal(saved[:, 1], angles)
+    np.testing.assert_array_equal(saved[:, 2:], result.record["plant.state"])
+
+
+def test_recording_as_numpy_archive(tmp_path: Path) -> None:
+    program = run("rollout", ACROBOT, "--horizon", 0.2, "--record", "plant.state", "--save", tmp_path / "a.npz")
+    assert program.exit_code == 0
+    saved = np.load(tmp_path / "a.npz", allow_pickle=False)
+    assert saved["plant.state"].shape == (saved["t"].size, 4) == (5, 4)
+
+
+def test_a_rollout_continues_from_the_snapshot_of_another(tmp_path: Path) -> None:
+    push = ("--set", "sim.sys.Acrobot.elbow.position=0.3")
+    assert run("rollout", ACROBOT, "--horizon", 0.5, *push, "--snapshot", tmp_path / "half").exit_code == 0
+    start = ("--start", tmp_path / "half", "--snapshot", tmp_path / "whole")
+    assert run("rollout", ACROBOT, "--horizon", 0.5, *start).exit_code == 0
+
+    half, whole = Snapshot.load(tmp_path / "half"), Snapshot.load(tmp_path / "whole")
+    runner = RolloutRunner(RolloutTask(AcrobotScenario(), 0.5, start=half))
+    runner.run({})
+    assert not whole.compare(runner.testbed.snapshot(runner.context))
+    assert (half.time, whole.time) == (0.5, 1.0)
+    assert half.compare(whole)
+
+
+def test_failed_rollout_has_exit_code_1_and_its_reason() -> None:
+    program = run("rollout", ACROBOT, "--horizon", 1, "--set", "sim.sys.Acrobot.lower_link.mass=0")
+    assert program.exit_code == 1
+    assert "end               failed" in program.stdout
+    assert program.stderr.startswith("Error: the rollout failed: RuntimeError: An internal mass matrix")
+    assert program.stderr.count("\n") == 1
+
+
+def test_diagram_shows_the_signals(tmp_path: Path) -> None:
+    program = run("diagram", ACROBOT, "--mode", "shadow")
+    assert (program.exit_code, program.stderr) == (0, "")
+    assert "joint_state" in program.stdout
+    assert run("diagram", ACROBOT, "--mode", "shadow", "-o", tmp_path / "d").stdout == ""
+    assert (tmp_path / "d").read_text() == program.stdout.removesuffix("\n")
+
+
+def test_animation_is_one_html_file(tmp_path: Path) -> None:
+    program = run("rollout", PENDULUM, "--horizon", 0.2, "--set", f"{ANGLE}=1", "--html", tmp_path / "a.html")
+    assert (program.exit_code, program.stderr) == (0, "")
+    assert "plant.state" not in program.stdout
+    text = (tmp_path / "a.html").read_text()
+    assert "</html>" in text
+    assert "http://localhost" not in text

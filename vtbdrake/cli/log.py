@@ -1,0 +1,89 @@
+"""``vtbdrake replay`` and ``export``: the log of a control loop, computed again or in formats of other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli.options import Setting, output, set_option, settings
+from vtbdrake.cli.output import RECORDINGS, save_recording
+from vtbdrake.recording.export import EXPORTS
+from vtbdrake.recording.export import export as export_log
+from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.replay import DIFFERENT
+from vtbdrake.recording.replay import replay as replay_log
+from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed.scenario import class_name
+from vtbdrake.testbed.scenario_file import scenario_class
+
+_log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
+
+
+@click.command()
+@_log
+@click.option(
+    "--scenario",
+    metavar="MODULE:CLASS",
+    help="The scenario of the log, whose fields are in the log. Its code runs, so the user has to name it.",
+)
+@click.option(
+    "--on",
+    type=click.Choice(["recorded", "dps", "testbed"]),
+    default="recorded",
+    show_default=True,
+    help="Replay with what was recorded, the DPS alone or the whole testbed.",
+)
+@set_option
+@click.option("--record", multiple=True, metavar="ADDRESS", help="Read ADDRESS after every cycle. May be repeated.")
+@click.option("--out", callback=output(*RECORDINGS), metavar="FILE", help="Write these values: .csv or .npz.")
+def replay(
+    log: Path,
+    scenario: str | None,
+    on: str,
+    values: tuple[Setting, ...],
+    record: tuple[str, ...],
+    out: Path | None,
+) -> None:
+    """Replay a LOG and compare: the exit code is 1 unless all actuator commands are the same, to the last bit.
+
+    With --set, a variable has another value throughout, and nothing is compared.
+
+    \b
+    Example:
+      vtbdrake replay run.lcm --scenario diagrams.manipulator:ManipulatorScenario
+    """
+    if bool(record) != bool(out):
+        raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
+    found = read_log(log)
+    recorded = found.header.scenario_name
+    if scenario is None and recorded:
+        raise click.UsageError(
+            f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "
+            f"--scenario {recorded}"
+        )
+    if scenario is not None and (given := class_name(scenario_class(scenario))) != recorded:
+        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {given}")
+    target = None if on == "recorded" else DpsAlone(found.scenario) if on == "dps" else found.scenario.build()
+    report = replay_log(found, target, values=settings(values), record=record)
+    if out is not None:
+        save_recording(out, report.times, report.record)
+    click.echo(report)
+    if report.outcome == DIFFERENT:
+        raise FailedError(one_line(f"the replay differs: {report.first_difference}"))
+
+
+@click.command()
+@_log
+@click.argument("out", callback=output(*EXPORTS))
+def export(log: Path, out: Path) -> None:
+    """Write a LOG as MCAP (for Foxglove), CSV or Parquet, by the suffix of OUT.
+
+    \b
+    Example:
+      vtbdrake export run.lcm run.mcap
+    """
+    found = read_log(log)
+    export_log(found, out)
+    click.echo(found)

@@ -1,0 +1,192 @@
+"""``vtbdrake variables``, ``diagram`` and ``rollout``: look at a testbed, and simulate it once."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from pydrake.systems.framework import Context
+
+from vtbdrake.cli import BadInputError, FailedError, one_line
+from vtbdrake.cli.options import (
+    Setting,
+    horizon_option,
+    output,
+    sample_period_option,
+    scenario_argument,
+    set_option,
+    settings,
+    start_option,
+)
+from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
+from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
+from vtbdrake.state import Snapshot, Variable, Variables
+from vtbdrake.state.variables import suggestion
+from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.testbed import MODES
+
+# The output port from which the motion of the simulated world is drawn.
+PLANT_STATE = "plant.state"
+
+# Larger arrays (images, clouds) get one line for all their entries.
+_MANY = 64
+
+
+@click.command()
+@scenario_argument
+@click.option("--match", default="", metavar="TEXT", help="Show only addresses that contain TEXT.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list of objects instead of a table.")
+def variables(scenario: Scenario, match: str, as_json: bool) -> None:
+    """List the variables of a testbed.
+
+    The table shows address, kind, shape, unit, bounds and the value in s0 of every element of the state. Kind x is the
+    dynamic part of the state, kind a the static part. A derived variable can be read, but not set.
+
+    \b
+    Example:
+      vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match payload
+    """
+    testbed = scenario.build()
+    listed = testbed.variables()
+    chosen = [variable for variable in listed.values() if match in variable.address]
+    if not chosen:
+        raise BadInputError(f"no address contains {match!r}{suggestion(match, listed)}")
+    context = testbed.default_context()
+    if as_json:
+        click.echo(json.dumps([_plain(variable, context) for variable in chosen], indent=2))
+    else:
+        click.echo(listed.table(context, pattern=match))
+
+
+def _plain(variable: Variable, context: Context) -> dict[str, Any]:
+    value = variable.get(context)
+    return {
+        "address": variable.address,
+        "kind": variable.kind,
+        "derived": variable.derived,
+        "shape": list(variable.shape),
+        "unit": variable.unit,
+        "bounds": [finite(bound) for bound in variable.bounds],
+        "value": finite(value if isinstance(value, float) else value.tolist()),
+    }
+
+
+@click.command()
+@scenario_argument
+@click.option(
+    "--mode", type=click.Choice(list(MODES)), default="sim", show_default=True, help="The positions of the switches."
+)
+@click.option("-o", "--output", "out", callback=output(), metavar="FILE", help="Write to FILE, not to the terminal.")
+def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
+    """Draw a testbed as SVG: DPS, switches, both worlds (Figure 4).
+
+    \b
+    Example:
+      vtbdrake diagram diagrams.space_climber:SpaceClimberScenario -o climber.svg
+    """
+    from vtbdrake.visualization import svg
+
+    text = svg(scenario.build(mode=mode))
+    if out is None:
+        click.echo(text)
+    else:
+        write_whole(out, text.encode())
+
+
+@click.command()
+@scenario_argument
+@horizon_option
+@set_option
+@click.option("--record", multiple=True, metavar="ADDRESS", help="Record a variable or output port. May be repeated.")
+@sample_period_option
+@start_option
+@click.option("--save", callback=output(*RECORDINGS), metavar="FILE", help="Write the recording: .csv or .npz.")
+@click.option("--snapshot", callback=output(), metavar="FILE", help="Write s(t_end), for --start.")
+@click.option("--html", callback=output(".html"), metavar="FILE", help="Write an animation for any web browser.")
+def rollout(
+    scenario: Scenario,
+    horizon: float,
+    values: tuple[Setting, ...],
+    record: tuple[str, ...],
+    sample_period: float,
+    start: Snapshot | None,
+    save: Path | None,
+    snapshot: Path | None,
+    html: Path | None,
+) -> None:
+    """Simulate a testbed once.
+
+    The exit code is 1 if the simulation failed; the recording until then is written anyway.
+
+    \b
+    Example:
+      vtbdrake rollout diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+          --set sim.sys.payload.mass=40 --record sim.sys.climber.base.pitch --save pitch.csv
+    """
+    if save is not None and not record:
+        raise click.UsageError("--save writes the addresses of --record, but nothing is recorded")
+    testbed = scenario.build()
+    if html is not None and testbed.plant is None:
+        raise click.UsageError("--html shows the motion of a plant, but this testbed has none")
+    parameters = settings(values)
+    for address, value in parameters.items():
+        testbed.variables()[address].check(value)
+    recorded = tuple(dict.fromkeys([*record, *([PLANT_STATE] if html is not None else [])]))
+    task = RolloutTask(scenario, horizon, sample_period=sample_period, record=recorded, start=start)
+    runner = RolloutRunner(task, testbed)
+    result = runner.run(parameters)
+
+    click.echo(_outcome(result))
+    asked = replace(result, record={address: result.record[address] for address in record})
+    if asked.times.size and asked.record:
+        click.echo("\n" + _extremes_table(asked, testbed.variables()))
+    if save is not None:
+        save_recording(save, asked.times, asked.record)
+    if html is not None:
+        from vtbdrake.optimization import Motion
+        from vtbdrake.visualization import make_meshcat, show_motion
+
+        show_motion(make_meshcat(), Motion(scenario, result.times, result.record[PLANT_STATE])).save(html)
+    if result.failed:
+        raise FailedError(f"the rollout failed: {one_line(result.message)}")
+    if snapshot is not None:
+        testbed.snapshot(runner.context).save(snapshot)
+
+
+def _outcome(result: RolloutResult) -> str:
+    simulated = float(result.times[-1]) if result.times.size else 0.0
+    reason = f" ({one_line(result.message)})" if result.message and not result.failed else ""
+    return "\n".join(
+        (
+            f"end               {result.end}{reason}",
+            f"simulated time    {number(simulated)} s",
+            f"wall time         {result.wall_time:.3f} s",
+            f"real-time factor  {simulated / result.wall_time:.3g}",
+        )
+    )
+
+
+def _extremes_table(result: RolloutResult, variables: Variables) -> str:
+    """Return a table of the final, smallest and largest value of every recorded entry."""
+    rows: list[tuple[str, ...]] = []
+    for address, values in result.record.items():
+        unit = variables[address].unit if address in variables else ""
+        if not isinstance(values, np.ndarray):
+            rows.append((address, unit, f"{len(values)} values", "", ""))
+        elif values[0].size > _MANY:
+            rows.append((address, unit, f"{values[0].size} entries", *map(number, _extremes(values))))
+        else:
+            rows += [
+                (name, unit, *map(number, (column[-1], *_extremes(column))))
+                for name, column in entries(address, values)
+            ]
+    return table(("recorded", "unit", "final", "min", "max"), rows)
+
+
+def _extremes(values: np.ndarray) -> tuple[float, float]:
+    known = values[~np.isnan(values)]
+    return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
