@@ -63,7 +63,7 @@ def noise(image_type: Any) -> Any:
     return image
 
 
-def test_images_that_drake_sends_arrive_pixel_by_pixel() -> None:
+def test_images_of_drake_arrive_exactly() -> None:
     types = {"color": ImageRgba8U, "depth": ImageDepth32F, "label": ImageLabel16I}
     images = {name: noise(image_type) for name, image_type in types.items()}
     data = sent_by_drake(ImageToLcmImageArrayT(*types), list(images.values()), lcmt_image_array)
@@ -95,7 +95,7 @@ def camera() -> Signal:
     return Signal("camera", model_value=ImageRgba8U(WIDTH, HEIGHT))
 
 
-def test_compressed_image_arrives_pixel_by_pixel() -> None:
+def test_compressed_image_arrives_exactly() -> None:
     image = noise(ImageRgba8U)
     message = message_of(image)
     compress(message)
@@ -124,14 +124,14 @@ def set_fields(**fields: Any) -> Callable[[lcmt_image], None]:
         (lambda message: compress(message, bytes(1_000)), "size"),
     ],
 )
-def test_image_that_is_not_what_the_signal_says_is_rejected(change: Callable[[lcmt_image], None], reason: str) -> None:
+def test_image_of_another_kind_is_rejected(change: Callable[[lcmt_image], None], reason: str) -> None:
     message = message_of(noise(ImageRgba8U))
     change(message)
     received = take(image_map(CHANNEL, "camera"), [camera()], message.encode())["camera"]
     assert (received.count, received.rejected) == (0, {reason: 1})
 
 
-def test_few_bytes_that_stand_for_many_are_not_unpacked() -> None:
+def test_decompression_is_limited() -> None:
     message = message_of(noise(ImageRgba8U))
     compress(message, bytes(50_000_000))
     data = message.encode()
@@ -143,7 +143,7 @@ def test_few_bytes_that_stand_for_many_are_not_unpacked() -> None:
         tracemalloc.stop()
 
 
-def test_camera_that_is_not_in_a_message_is_missing() -> None:
+def test_absent_camera_is_missing() -> None:
     message = lcmt_image_array()
     message.num_images, message.images = 1, [message_of(noise(ImageRgba8U))]
     message.images[0].header.frame_name = "color"
@@ -154,7 +154,7 @@ def test_camera_that_is_not_in_a_message_is_missing() -> None:
     assert received["other"].rejected == {"missing": 1}
 
 
-def test_image_signal_without_a_size_is_refused() -> None:
+def test_image_signal_needs_a_size() -> None:
     with pytest.raises(ValueError, match=r"signal camera on channel PICTURES needs an image of its size"):
         image_map(CHANNEL, "camera").decoder([Signal("camera", model_value=ImageRgba8U())])
 
@@ -169,7 +169,7 @@ def cloud(points: int) -> PointCloud:
 
 
 @pytest.mark.parametrize("points", [0, 1, 50])
-def test_point_cloud_that_drake_sends_arrives_point_by_point(points: int) -> None:
+def test_point_cloud_of_drake_arrives_exactly(points: int) -> None:
     sent = cloud(points)
     data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
     received = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=cloud(0))], data)["lidar"]
@@ -178,7 +178,7 @@ def test_point_cloud_that_drake_sends_arrives_point_by_point(points: int) -> Non
         np.testing.assert_array_equal(getattr(received.value, name)(), getattr(sent, name)())
 
 
-def test_points_that_see_nothing_stay_infinite() -> None:
+def test_infinite_points_are_accepted() -> None:
     sent = PointCloud(2)
     sent.mutable_xyzs()[:] = np.inf
     data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
@@ -201,7 +201,7 @@ def test_points_that_see_nothing_stay_infinite() -> None:
         (lambda message: set_fields(datatype=7)(message.fields[3]), "type"),
     ],
 )
-def test_point_cloud_that_contradicts_itself_is_rejected(change: Callable[[Any], None], reason: str) -> None:
+def test_inconsistent_point_cloud_is_rejected(change: Callable[[Any], None], reason: str) -> None:
     message = lcmt_point_cloud.decode(sent_by_drake(PointCloudToLcm("lidar"), [cloud(50)], lcmt_point_cloud))
     change(message)
     signals = [Signal("lidar", model_value=cloud(0))]
@@ -209,13 +209,13 @@ def test_point_cloud_that_contradicts_itself_is_rejected(change: Callable[[Any],
     assert (received.count, received.rejected) == (0, {reason: 1})
 
 
-def test_signal_that_is_no_point_cloud_is_refused() -> None:
+def test_point_cloud_signal_needs_a_point_cloud() -> None:
     with pytest.raises(ValueError, match="needs a PointCloud as model_value"):
         point_cloud_map(CHANNEL, "lidar").decoder([camera()])
 
 
 @pytest.mark.parametrize("kind", ["images", "cloud"])
-def test_broken_pictures_are_counted_and_do_no_harm(kind: str) -> None:
+def test_broken_pictures_are_only_counted(kind: str) -> None:
     chance = random.Random(3)
     map: LcmMap
     if kind == "images":

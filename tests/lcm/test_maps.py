@@ -73,7 +73,7 @@ def test_status_of_an_arm_becomes_its_signals() -> None:
 
 
 @pytest.mark.parametrize("names", [("position", "torque"), ("position",), ("torque",)])
-def test_command_is_what_lcm_gen_decodes_and_what_is_not_commanded_is_empty(names: tuple[str, ...]) -> None:
+def test_signals_without_a_command_are_empty(names: tuple[str, ...]) -> None:
     write = iiwa_command(ACT).encoder(signals(position=7, torque=7))
     values = {name: np.arange(7.0) + (10.0 if name == "torque" else 0.0) for name in names}
     for utime in (7, 8):
@@ -84,7 +84,7 @@ def test_command_is_what_lcm_gen_decodes_and_what_is_not_commanded_is_empty(name
         np.testing.assert_array_equal(torques, values.get("torque", []))
 
 
-def test_fields_of_a_users_type_travel_both_ways(user_types: ModuleType) -> None:
+def test_fields_of_a_user_type_travel_both_ways(user_types: ModuleType) -> None:
     fields = {"wind": ["speed", "direction"], "gust": "gust", "level": "level", "height": "where.z"}
     map = vector_map("WIND", user_types.wind_t, fields)
     of = signals(wind=2, gust=2, level=1, height=1)
@@ -105,14 +105,14 @@ def test_fields_beside_arrays_of_messages_travel_both_ways(user_types: ModuleTyp
     assert user_types.mixed_t.decode(map.encoder(signals(n=1))({"n": [0.0]}, 6)).utime == 6
 
 
-def test_arrays_that_share_a_length_are_filled_when_a_status_is_written() -> None:
+def test_other_arrays_of_the_same_length_are_zero() -> None:
     data = iiwa_status(SENSE).encoder(signals(position=7, torque=7))({"position": [1.0] * 7, "torque": [2.0] * 7}, 3)
     message = lcmt_iiwa_status.decode(data)
     assert message.joint_position_measured == (1.0,) * 7
     assert message.joint_velocity_estimated == (0.0,) * 7
 
 
-def test_message_that_cannot_leave_out_a_signal_says_so(user_types: ModuleType) -> None:
+def test_signal_of_fixed_size_cannot_be_left_out(user_types: ModuleType) -> None:
     write = vector_map("WIND", user_types.wind_t, {"speed": "speed", "gust": "gust"}).encoder(signals(speed=1, gust=2))
     with pytest.raises(LookupError, match="gust"):
         write({"speed": [1.0]}, 1)
@@ -126,28 +126,28 @@ def test_message_that_cannot_leave_out_a_signal_says_so(user_types: ModuleType) 
         ({"a": "where"}, "is a vtb_test_types.point_t"),
     ],
 )
-def test_field_that_cannot_be_a_signal_is_refused(user_types: ModuleType, fields: dict[str, str], message: str) -> None:
+def test_unsuitable_field_is_refused(user_types: ModuleType, fields: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         vector_map("WIND", user_types.wind_t, fields)
 
 
-def test_signal_of_another_size_than_its_fields_is_refused(user_types: ModuleType) -> None:
+def test_signal_of_another_size_is_refused(user_types: ModuleType) -> None:
     with pytest.raises(ValueError, match="gust has 3 entries, but gust of wind_t on channel WIND has 2"):
         vector_map("WIND", user_types.wind_t, {"gust": "gust"}).decoder(signals(gust=3))
 
 
-def test_signals_of_different_sizes_in_arrays_of_one_length_are_refused() -> None:
+def test_signals_that_share_a_length_have_one_size() -> None:
     with pytest.raises(ValueError, match="position and torque have 7 and 6 entries, but field num_joints"):
         iiwa_status(SENSE).decoder(signals(position=7, torque=6))
 
 
-def test_type_that_lcm_gen_did_not_make_is_refused() -> None:
+def test_type_not_made_by_lcm_gen_is_refused() -> None:
     with pytest.raises(ValueError, match="is no class made by lcm-gen"):
         LcmMap(channel="A", type=dict, signals=["a"])
 
 
 @pytest.mark.parametrize("channel", ["", "C" * 64])
-def test_channel_name_that_lcm_cannot_carry_is_refused(channel: str) -> None:
+def test_impossible_channel_name_is_refused(channel: str) -> None:
     with pytest.raises(ValueError, match="an LCM channel's name has 1 to 63 bytes"):
         iiwa_command(channel=channel)
 

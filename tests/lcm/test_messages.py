@@ -49,7 +49,7 @@ def test_numbers_are_decoded_as_struct_reads_them(code: str, data: st.DataObject
 
 @settings(max_examples=300)
 @given(n=st.integers(0, 3), m=st.integers(0, 3), text=st.binary(max_size=5), cut=st.integers(0, 200))
-def test_lengths_strings_and_dimensions_move_what_follows(n: int, m: int, text: bytes, cut: int) -> None:
+def test_fields_behind_variable_ones_are_found(n: int, m: int, text: bytes, cut: int) -> None:
     layout = [
         Field("n", "int16_t"),
         Field("m", "int8_t"),
@@ -100,7 +100,7 @@ def test_any_bytes_are_decoded_or_rejected(data: bytes) -> None:
         assert len(values["z"]) == 2 * len(values["d"]) == 2 * data[0]
 
 
-def test_values_of_earlier_messages_stay_as_they_are() -> None:
+def test_decoded_values_are_independent_copies() -> None:
     decoder = MessageDecoder(HEAD, fields("d", 2), {"a": ["numbers"]}, "utime")
     before = decoder.decode(message("d", [1.0, 2.0]))[1]["a"]
     decoder.decode(message("d", [3.0, 4.0]))
@@ -123,7 +123,7 @@ def test_values_of_earlier_messages_stay_as_they_are() -> None:
         ([Field("numbers", "string")], {"a": ["numbers"]}, ""),
     ],
 )
-def test_layout_that_contradicts_itself_is_refused(layout: Any, signals: Any, stamp: str) -> None:
+def test_inconsistent_layout_is_refused(layout: Any, signals: Any, stamp: str) -> None:
     with pytest.raises((ValueError, KeyError)):
         MessageDecoder(HEAD, layout, signals, stamp)
 
@@ -190,7 +190,7 @@ class Made(dict[str, np.ndarray]):
         return np.full(2, float(name))
 
 
-def test_encoder_uses_vectors_that_nobody_else_keeps() -> None:
+def test_encoder_keeps_temporary_vectors_alive() -> None:
     layout = [Field("a", "double", (2,)), Field("b", "double", (2,))]
     encoder = MessageEncoder(HEAD, layout, {"1": ["a"], "2": ["b"]}, example=HEAD + bytes(32))
     assert encoder.encode(Made(), 0) == HEAD + struct.pack(">4d", 1.0, 1.0, 2.0, 2.0)
