@@ -1,4 +1,4 @@
-"""The recorder: what it writes, and what becomes of the loop when it cannot."""
+"""The recorder: what it writes, and how the loop goes on when it cannot."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 import resource
 import signal
 import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +15,14 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.control.scripted import PERIOD
-from tests.control.test_loop import Loop
+from tests.control.scripted import PERIOD, ServoScenario
+from tests.control.slow import SlowScenario
+from tests.control.test_loop import PATIENCE, Loop
 from tests.recording.servo import Servo
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder, StateDigest
+from vtbdrake.testbed import DpsAlone
 
 
 def test_every_cycle_is_recorded_to_the_last_bit(tmp_path: Path) -> None:
@@ -44,7 +48,7 @@ def test_every_cycle_is_recorded_to_the_last_bit(tmp_path: Path) -> None:
             assert np.array_equal(log.fed[name][i], value)
 
 
-def test_what_changes_between_cycles_is_recorded(tmp_path: Path) -> None:
+def test_changes_between_cycles_are_recorded(tmp_path: Path) -> None:
     servo = Servo(begun=False)
     with Recorder(servo.runtime, tmp_path / "run.lcm"):
         servo.runtime.run(cycles=2)
@@ -61,7 +65,7 @@ def test_what_changes_between_cycles_is_recorded(tmp_path: Path) -> None:
     assert reset == ("reset", {})
 
 
-def test_faults_are_recorded_when_they_begin_and_end(tmp_path: Path) -> None:
+def test_begin_and_end_of_faults_are_recorded(tmp_path: Path) -> None:
     servo = Servo()
     with Recorder(servo.runtime, tmp_path / "run.lcm"):
         servo.runtime.run(cycles=2)
@@ -78,7 +82,7 @@ def test_faults_are_recorded_when_they_begin_and_end(tmp_path: Path) -> None:
     assert np.isnan(log.actuation["velocity"][2:5]).all() and (log.sent["velocity"][2:] == 0.0).all()
 
 
-def test_digests_are_recorded_as_often_as_asked(tmp_path: Path) -> None:
+def test_digests_are_recorded_periodically(tmp_path: Path) -> None:
     servo = Servo()
     states: dict[int, bytes] = {}
     digest = StateDigest(servo.runtime.target, servo.runtime.context)
@@ -89,7 +93,7 @@ def test_digests_are_recorded_as_often_as_asked(tmp_path: Path) -> None:
     assert {int(log.numbers[i]): data for i, data in log.digests} == {n: states[n] for n in (9, 19, 29)}
 
 
-def test_a_recording_may_begin_and_end_while_the_loop_runs(tmp_path: Path) -> None:
+def test_recording_begins_and_ends_at_any_time(tmp_path: Path) -> None:
     servo = Servo()
     servo.runtime.run(cycles=10)
     for name in ("one", "two"):
@@ -104,7 +108,7 @@ def test_a_recording_may_begin_and_end_while_the_loop_runs(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("before", [6, 7])
-def test_what_lay_at_the_ports_when_it_began_is_new_once(tmp_path: Path, before: int) -> None:
+def test_initial_port_values_are_recorded_once(tmp_path: Path, before: int) -> None:
     servo = Servo()
     servo.runtime.run(cycles=before)
     with Recorder(servo.runtime, tmp_path / "run.lcm"):
@@ -125,7 +129,7 @@ def hub() -> Iterator[Hub]:
         yield running
 
 
-def test_all_messages_are_recorded_byte_for_byte(hub: Hub, tmp_path: Path) -> None:
+def test_messages_are_recorded_byte_for_byte(hub: Hub, tmp_path: Path) -> None:
     crossed: list[tuple[str, bytes]] = []
     with Loop(hub, lock_step=True) as loop:
         loop.bridge.tap = lambda channel, data: crossed.append((channel, data))
@@ -141,7 +145,7 @@ def test_all_messages_are_recorded_byte_for_byte(hub: Hub, tmp_path: Path) -> No
     assert [message.data for message in log.messages("IIWA_COMMAND")] == [d for c, d in own if c == "IIWA_COMMAND"]
 
 
-def test_lcm_reads_the_log_with_numbers_and_times_in_order(tmp_path: Path) -> None:
+def test_lcm_reads_numbers_and_times_in_order(tmp_path: Path) -> None:
     servo = Servo()
     with Recorder(servo.runtime, tmp_path / "run.lcm"):
         servo.runtime.run(cycles=20)
@@ -155,7 +159,7 @@ def test_lcm_reads_the_log_with_numbers_and_times_in_order(tmp_path: Path) -> No
 # -- losses
 
 
-def test_the_loop_goes_on_while_the_disk_is_full_and_the_loss_is_told(
+def test_full_disk_is_reported_and_harmless(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     servo = Servo()
@@ -180,7 +184,7 @@ def test_the_loop_goes_on_while_the_disk_is_full_and_the_loss_is_told(
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
-def test_the_log_goes_on_behind_a_gap_when_the_disk_has_room_again(tmp_path: Path) -> None:
+def test_log_resumes_when_disk_has_room(tmp_path: Path) -> None:
     mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8100k", "tmpfs", tmp_path], capture_output=True)
     if mount.returncode:
         pytest.skip(f"no mounts here: {mount.stderr.decode()}")
@@ -202,7 +206,7 @@ def test_the_log_goes_on_behind_a_gap_when_the_disk_has_room_again(tmp_path: Pat
         subprocess.run(["umount", tmp_path], check=True)
 
 
-def test_the_loop_goes_on_when_the_writing_process_is_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_killed_worker_process_is_harmless(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     servo = Servo()
     recorder = Recorder(servo.runtime, tmp_path / "run.lcm")
     servo.runtime.run(cycles=100)
@@ -220,9 +224,7 @@ def test_the_loop_goes_on_when_the_writing_process_is_killed(tmp_path: Path, cap
     assert recorder.lost == 200 - arrived
 
 
-def test_a_process_that_takes_nothing_loses_cycles_and_not_time(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stopped_worker_process_loses_cycles_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     servo = Servo()
     with Recorder(servo.runtime, tmp_path / "run.lcm", backlog=1) as recorder:
         os.kill(recorder.pid, signal.SIGSTOP)
@@ -237,7 +239,7 @@ def test_a_process_that_takes_nothing_loses_cycles_and_not_time(
 # -- what is refused
 
 
-def test_a_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
+def test_log_is_overwritten_only_on_request(tmp_path: Path) -> None:
     (tmp_path / "run.lcm").write_text("dear")
     servo = Servo()
     with pytest.raises(FileExistsError, match=r"run\.lcm exists: record to another file, or with overwrite=True"):
@@ -247,7 +249,7 @@ def test_a_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     assert len(read_log(tmp_path / "run.lcm")) == 0
 
 
-def test_who_has_read_a_log_keeps_it_when_it_is_overwritten(tmp_path: Path) -> None:
+def test_overwriting_keeps_the_mapped_file(tmp_path: Path) -> None:
     servo, path = Servo(), tmp_path / "run.lcm"
     with Recorder(servo.runtime, path):
         servo.runtime.run(cycles=50)
@@ -257,7 +259,7 @@ def test_who_has_read_a_log_keeps_it_when_it_is_overwritten(tmp_path: Path) -> N
         assert bytes(log.events.content) == content
 
 
-def test_recorders_of_one_loop_may_end_in_any_order(tmp_path: Path, hub: Hub) -> None:
+def test_recorders_end_in_any_order(tmp_path: Path, hub: Hub) -> None:
     with Loop(hub, lock_step=True) as loop:
         first = Recorder(loop.runtime, tmp_path / "first.lcm")
         second = Recorder(loop.runtime, tmp_path / "second.lcm")
@@ -272,11 +274,65 @@ def test_recorders_of_one_loop_may_end_in_any_order(tmp_path: Path, hub: Hub) ->
     assert len(list(log.messages("IIWA_STATUS"))) > len(list(read_log(tmp_path / "first.lcm").messages("IIWA_STATUS")))
 
 
-def test_a_folder_that_is_not_there_is_told_at_once(tmp_path: Path) -> None:
+def test_missing_folder_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Recorder(Servo().runtime, tmp_path / "nowhere" / "run.lcm")
 
 
-def test_a_digest_more_often_than_every_cycle_is_refused(tmp_path: Path) -> None:
+def test_digest_period_below_period_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least the period, 0.001 s, not 0.0 s"):
         Recorder(Servo().runtime, tmp_path / "run.lcm", digest_period=0.0)
+
+
+def test_digest_is_equal_alone_and_in_testbed() -> None:
+    scenario = ServoScenario()
+    testbed, alone = scenario.build(), DpsAlone(scenario)
+    there, here = testbed.default_context(), alone.default_context()
+    assert StateDigest(testbed, there)() == StateDigest(alone, here)()
+    testbed.write(there, {"sim.sys.axes.discrete_state_0": [1.0, 2.0]})
+    assert StateDigest(testbed, there)() == StateDigest(alone, here)(), "the world is not the DPS's state"
+
+
+@pytest.mark.parametrize("address", ["dps.gain", "dps.seen[1]", "dps.ticks", "dps.velocity[0]"])
+def test_digest_depends_on_every_bit(address: str) -> None:
+    alone = DpsAlone(ServoScenario())
+    context = alone.default_context()
+    digest = StateDigest(alone, context)
+    before = digest()
+    value = alone.read(context, address)
+    alone.write(context, {address: np.nextafter(value, 1e3)})
+    assert digest() != before
+    alone.write(context, {address: value})
+    assert digest() == before
+
+
+def test_digest_depends_on_abstract_state() -> None:
+    first, other = (DpsAlone(SlowScenario(more={"memory": np.array([0.3, x])})) for x in (0.6, 0.7))
+    digests = [StateDigest(target, target.default_context())() for target in (first, other)]
+    assert digests[0] != digests[1]
+
+
+def test_lcm_logplayer_plays_a_log(tmp_path: Path) -> None:
+    path = tmp_path / "run.lcm"
+    with Hub(port=0) as hub, Loop(hub, lock_step=True) as loop, Recorder(loop.runtime, path):
+        loop.sense()
+        loop.runtime.switch("real")
+        loop.runtime.cycle()
+        loop.runtime.run(cycles=100)
+    recorded = [(event.channel, event.data) for event in lcm.EventLog(str(path))]
+    assert len(recorded) > 300
+    heard: list[tuple[str, bytes]] = []
+    player = Path(sys.executable).with_name("lcm-logplayer")
+    with Hub(port=0) as hub:
+        bus = lcm.LCM(hub.url)
+        subscription = bus.subscribe("(?!VTB_HUB).*", lambda channel, data: heard.append((channel, data)))
+        subscription.set_queue_capacity(0)
+        with subprocess.Popen([player, "--lcm-url", hub.url, "--speed", "5", path], stdout=subprocess.DEVNULL) as run:
+            guard = threading.Timer(PATIENCE, run.kill)
+            guard.start()
+            while len(heard) < len(recorded) and bus.handle_timeout(round(1e3 * PATIENCE)):
+                pass
+            assert run.wait(PATIENCE) == 0
+            guard.cancel()
+    assert heard == recorded
+    assert len(read_log(path)) == 101

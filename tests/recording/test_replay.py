@@ -1,12 +1,13 @@
-"""Replay: the DPS does again, to the last bit, what it did; and whatever is not the same is found."""
+"""Replay: the DPS repeats what it did to the last bit, and every difference is found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import lcm
 import numpy as np
 import pytest
 from pydrake.systems.framework import Context, System
@@ -14,9 +15,13 @@ from pydrake.systems.framework import Context, System
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.scripted import Servo as ServoSystem
 from tests.control.slow import SlowScenario, chaotic, picky
+from tests.recording.seeing import HEIGHT, WIDTH, SeeingScenario, brightness, picture
 from tests.recording.servo import Servo
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
@@ -45,7 +50,7 @@ def test_replay_is_identical(tmp_path: Path, alone: bool) -> None:
     assert len(np.unique(report.actuation["velocity"], axis=0)) >= 30
 
 
-def test_the_testbed_replays_every_switch(tmp_path: Path) -> None:
+def test_testbed_replays_every_switch(tmp_path: Path) -> None:
     """Where the DPS is fed by the simulated world, by the machine, and by the world again, from what it believes."""
     servo = Servo(alone=False, begun=False)
     with Recorder(servo.runtime, tmp_path / "run.lcm", digest_period=PERIOD):
@@ -62,7 +67,7 @@ def test_the_testbed_replays_every_switch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("before", [18, 19])
-def test_a_recording_that_began_in_the_middle_is_replayed(tmp_path: Path, before: int) -> None:
+def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
     """With what lay at the real ports by then: the position comes in every other cycle only."""
     servo = Servo()
     servo.runtime.run(cycles=before)
@@ -98,7 +103,7 @@ class PreparedScenario(ServoScenario):
 
 
 @pytest.mark.parametrize("begun", [False, True], ids=["before", "after"])
-def test_initialization_is_replayed_if_it_was_recorded(tmp_path: Path, begun: bool) -> None:
+def test_recorded_initialization_is_replayed(tmp_path: Path, begun: bool) -> None:
     servo = Servo(begun=begun, scenario=PreparedScenario(rate=0.0))
     if begun:
         servo.runtime.run(cycles=5)
@@ -110,7 +115,7 @@ def test_initialization_is_replayed_if_it_was_recorded(tmp_path: Path, begun: bo
     assert report.record["dps.ticks"][0] == (101.0 + 5 * begun)
 
 
-def test_a_dps_that_waits_to_begin_waits_in_the_replay(tmp_path: Path) -> None:
+def test_idle_dps_is_idle_in_replay(tmp_path: Path) -> None:
     servo = Servo(begun=False)
     report = replay(recorded(tmp_path, servo, lambda: servo.runtime.switch("real")))
     assert report.identical
@@ -118,9 +123,7 @@ def test_a_dps_that_waits_to_begin_waits_in_the_replay(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("begun", [True, False])
-def test_replayed_at_once_and_cycle_by_cycle_it_is_the_same_to_the_last_bit(
-    tmp_path: Path, begun: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_batch_replay_equals_replay_by_cycle(tmp_path: Path, begun: bool, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", logger="vtbdrake.recording.replay")
     servo = Servo(begun=begun)
 
@@ -137,7 +140,7 @@ def test_replayed_at_once_and_cycle_by_cycle_it_is_the_same_to_the_last_bit(
     assert np.array_equal(at_once.actuation["velocity"], by_cycle.actuation["velocity"], equal_nan=True)
 
 
-def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_exceptions_of_the_dps_are_replayed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", logger="vtbdrake.recording.replay")
     servo = Servo()
 
@@ -153,14 +156,14 @@ def test_what_the_dps_raised_it_raises_again(tmp_path: Path, caplog: pytest.LogC
     assert report.times[33] - report.times[29] == pytest.approx(PERIOD)
 
 
-def test_commands_that_are_not_finite_are_compared_too(tmp_path: Path) -> None:
+def test_nan_actuation_is_compared(tmp_path: Path) -> None:
     servo = Servo()
     log = recorded(tmp_path, servo, lambda: servo.runtime.write({"dps.trouble": 2.0}))
     assert np.isnan(log.actuation["velocity"][30:, 0]).all() and log.commanded["velocity"].all()
     assert replay(log).identical
 
 
-def test_the_dps_alone_replays_the_log_of_its_testbed(tmp_path: Path) -> None:
+def test_dps_alone_replays_log_of_testbed(tmp_path: Path) -> None:
     servo = Servo(alone=False)
     servo.runtime.run(cycles=5)
     log = recorded(tmp_path, servo, lambda: servo.runtime.switch("shadow"))
@@ -169,7 +172,7 @@ def test_the_dps_alone_replays_the_log_of_its_testbed(tmp_path: Path) -> None:
     assert not np.isnan(report.actuation["velocity"]).any(), "in the shadow it commands as well"
 
 
-def test_the_testbed_replays_the_log_of_its_dps_alone(tmp_path: Path) -> None:
+def test_testbed_replays_log_of_dps_alone(tmp_path: Path) -> None:
     servo = Servo(begun=False)
     servo.runtime.write({"u.target": [0.7, 0.1]})
     log = recorded(tmp_path, servo, lambda: servo.runtime.switch("real"))
@@ -178,7 +181,7 @@ def test_the_testbed_replays_the_log_of_its_dps_alone(tmp_path: Path) -> None:
     assert (report.record["sim.sys.axes.discrete_state_0"] == 0.0).all(), "the simulated world is idle"
 
 
-def test_the_dps_alone_is_refused_what_came_from_the_simulated_world(tmp_path: Path) -> None:
+def test_dps_alone_rejects_simulated_sensors(tmp_path: Path) -> None:
     servo = Servo(alone=False)
     log = recorded(tmp_path, servo, lambda: servo.runtime.switch(sense={"speed": "sim"}))
     with pytest.raises(LogError, match="sense.speed came from the simulated world .* replay it through the testbed"):
@@ -188,7 +191,7 @@ def test_the_dps_alone_is_refused_what_came_from_the_simulated_world(tmp_path: P
 # -- abroad
 
 
-def test_variables_and_ports_are_read_after_every_cycle(tmp_path: Path) -> None:
+def test_replay_records_variables_and_ports(tmp_path: Path) -> None:
     servo = Servo()
     report = replay(recorded(tmp_path, servo), record=["dps.ticks", "dps.velocity", "u.target"])
     assert report.record["dps.ticks"].tolist() == list(range(1, 61))
@@ -196,7 +199,7 @@ def test_variables_and_ports_are_read_after_every_cycle(tmp_path: Path) -> None:
     assert report.record["u.target"].shape == (60, 2)
 
 
-def test_other_values_hold_whatever_the_log_says_and_nothing_is_compared(tmp_path: Path) -> None:
+def test_other_values_override_the_log(tmp_path: Path) -> None:
     servo = Servo()
     log = recorded(tmp_path, servo, lambda: servo.runtime.write({"dps.gain": 9.0, "u.target": [0.1, 0.1]}))
     report = replay(log, values={"dps.gain": 2.5})
@@ -206,7 +209,7 @@ def test_other_values_hold_whatever_the_log_says_and_nothing_is_compared(tmp_pat
     assert np.array_equal(report.actuation["velocity"], 2.5 * (target - position))
 
 
-def test_an_unknown_address_is_refused(tmp_path: Path) -> None:
+def test_unknown_address_is_rejected(tmp_path: Path) -> None:
     log = recorded(tmp_path, Servo())
     with pytest.raises(AddressError, match="did you mean dps.velocity"):
         replay(log, record=["dps.velocit"])
@@ -250,7 +253,7 @@ class Altered(DpsAlone):
         self.scenario = scenario
 
 
-def test_one_bit_in_one_command_is_found(tmp_path: Path) -> None:
+def test_one_bit_of_actuation_is_found(tmp_path: Path) -> None:
     servo = Servo()
     report = replay(recorded(tmp_path, servo), Altered(servo.scenario))
     assert report.outcome == "different" and report.first_difference is not None
@@ -259,7 +262,7 @@ def test_one_bit_in_one_command_is_found(tmp_path: Path) -> None:
     assert "velocity in cycle 21 (t = 0.021 s)" in str(report)
 
 
-def test_a_state_that_no_command_shows_is_found_by_its_digest(tmp_path: Path) -> None:
+def test_hidden_state_is_found_by_digest(tmp_path: Path) -> None:
     servo = Servo()
     log = recorded(tmp_path, servo)
     # As if the DPS had counted otherwise when it was recorded.
@@ -269,7 +272,7 @@ def test_a_state_that_no_command_shows_is_found_by_its_digest(tmp_path: Path) ->
     assert (report.first_difference.what, report.first_difference.cycle) == ("state", 41)
 
 
-def test_another_scenario_is_refused_and_told(tmp_path: Path) -> None:
+def test_another_scenario_is_rejected(tmp_path: Path) -> None:
     log = recorded(tmp_path, Servo())
     with pytest.raises(LogError, match="rate: 0.0 in the log, 2.0 here"):
         replay(log, DpsAlone(ServoScenario(rate=2.0)))
@@ -277,7 +280,7 @@ def test_another_scenario_is_refused_and_told(tmp_path: Path) -> None:
         replay(log, DpsAlone(SlowScenario()))
 
 
-def test_another_version_of_the_scenario_is_refused_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_scenario_version_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = recorded(tmp_path, Servo())
 
     @dataclass
@@ -291,14 +294,14 @@ def test_another_version_of_the_scenario_is_refused_and_told(tmp_path: Path, mon
         replay(log)
 
 
-def test_a_scenario_that_is_not_to_be_had_any_more_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_scenario_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = recorded(tmp_path, Servo())
     monkeypatch.delattr("tests.control.scripted.ServoScenario")
     with pytest.raises(LogError, match="cannot be loaded in this version: .* has no scenario 'ServoScenario'"):
         replay(log)
 
 
-def test_another_version_of_a_library_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_library_version_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = recorded(tmp_path, Servo())
     monkeypatch.setitem(log.header.versions, "drake", "0.9")  # type: ignore[arg-type]
     report = replay(log)
@@ -337,3 +340,75 @@ def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[.
     report = replay(log, DpsAlone(scenario))
     assert report.identical and report.digests == 60, report
     assert len(np.unique(report.actuation["velocity"], axis=0)) > 10
+
+
+SCENARIO = SeeingScenario()
+
+
+@pytest.fixture(scope="module")
+def hub() -> Iterator[Hub]:
+    with Hub(port=0) as running:
+        yield running
+
+
+class Seeing:
+    """A loop, and a camera on its bus."""
+
+    def __init__(self, hub: Hub) -> None:
+        self.bridge: LcmBridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), hub.url)
+        self.runtime = Runtime(DpsAlone(SCENARIO), self.bridge, period=PERIOD, clock=SimulatedClock())
+        self._camera = lcm.LCM(hub.url)
+        self._random = np.random.default_rng(0)
+        self._utime = 0
+
+    def show(self, *, late: bool = False) -> np.ndarray:
+        """A new image, which has come; a late one is rejected."""
+        pixels = self._random.integers(0, 256, (HEIGHT, WIDTH))
+        self._utime += 1000
+        self._camera.publish("CAMERA", picture(self._utime - 5000 * late, pixels))
+        for _ in range(60):
+            if self.bridge.poll(1.0):
+                return pixels
+        raise TimeoutError("the image does not come")
+
+
+def test_images_are_replayed_from_raw_messages(hub: Hub, tmp_path: Path) -> None:
+    """Of several in one cycle the last good one; of those that were rejected none."""
+    loop = Seeing(hub)
+    shown = []
+    with Recorder(loop.runtime, tmp_path / "run.lcm", digest_period=PERIOD):
+        loop.bridge.open()
+        for i in range(30):
+            if i % 3 == 0:
+                loop.show()
+                shown.append(loop.show())
+                if i:
+                    loop.show(late=True)
+            if i == 0:
+                loop.runtime.switch("real")
+            loop.runtime.cycle()
+        loop.bridge.close()
+    log = read_log(tmp_path / "run.lcm")
+    assert sum(1 for _ in log.messages("CAMERA")) == 29
+    assert (log.sources["image"] != 0).tolist() == [i % 3 == 0 for i in range(30)]
+    report = replay(log)
+    assert report.identical and report.digests == 30, report
+    assert report.actuation["velocity"][:, 0].tolist() == [brightness(shown[i // 3]) for i in range(30)]
+
+
+def test_unrecorded_present_image_is_rejected(hub: Hub, tmp_path: Path) -> None:
+    loop = Seeing(hub)
+    loop.bridge.open()
+    loop.show()
+    with pytest.raises(ValueError, match="signal image is abstract, .* start to record before the bridge is opened"):
+        Recorder(loop.runtime, tmp_path / "run.lcm")
+    loop.bridge.close()
+    assert not (tmp_path / "run.lcm").exists()
+
+
+def test_bridge_without_raw_messages_is_rejected(tmp_path: Path) -> None:
+    clock = SimulatedClock()
+    bridge = ScriptedBridge(SCENARIO.interface(), clock, lambda t: {})
+    runtime = Runtime(DpsAlone(SCENARIO), bridge, clock=clock)
+    with pytest.raises(ValueError, match="by its raw messages, which ScriptedBridge does not have"):
+        Recorder(runtime, tmp_path / "run.lcm")

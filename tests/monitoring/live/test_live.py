@@ -53,7 +53,7 @@ def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[
 # -- set and get
 
 
-def test_the_service_waits_for_a_place_at_a_full_hub(capfd: pytest.CaptureFixture[str]) -> None:
+def test_service_waits_for_a_full_hub(capfd: pytest.CaptureFixture[str]) -> None:
     with Hub(port=0, max_clients=2) as bus:
         others = [TcpqConnection(bus.url, {"A": lambda *_: None}, PATIENCE) for _ in range(2)]
         with served(bus.url) as (rig, _):
@@ -66,7 +66,7 @@ def test_the_service_waits_for_a_place_at_a_full_hub(capfd: pytest.CaptureFixtur
     assert "Traceback" not in told and told.count("the live service waits for the bus") == 1
 
 
-def test_who_sets_next_on_a_protected_channel_gets_it() -> None:
+def test_clients_take_turns_on_protected_channel() -> None:
     with Hub(port=0, protect=["VTB_SET"], lease=0.1) as bus, served(bus.url) as (rig, _):
         with LiveClient(bus.url, timeout=PATIENCE) as first, LiveClient(bus.url, timeout=PATIENCE) as second:
             rig.during(first.set, {"dps.gain": 3.0})
@@ -77,7 +77,7 @@ def test_who_sets_next_on_a_protected_channel_gets_it() -> None:
         assert bus.statistics().protected["VTB_SET"].taken >= 2
 
 
-def test_who_is_not_let_to_set_is_told_by_whom(hub: Hub) -> None:
+def test_owner_of_protected_channel_is_named(hub: Hub) -> None:
     with Hub(port=0, protect=["VTB_SET"], lease=300.0) as bus:
         owner = lcm.LCM(bus.url)
         owner.publish("VTB_SET", b"")
@@ -92,7 +92,7 @@ def test_who_is_not_let_to_set_is_told_by_whom(hub: Hub) -> None:
 
 
 @pytest.mark.parametrize("noise", [b"", b"[1]", b"no", b"\xff", b"[" * 5000, b'{"id": 3}'])
-def test_what_is_no_answer_is_not_taken_for_one(hub: Hub, noise: bytes) -> None:
+def test_noise_is_not_taken_for_an_answer(hub: Hub, noise: bytes) -> None:
     bus = lcm.LCM(hub.url)
     with served(hub.url, **AMPLE) as (rig, _), LiveClient(hub.url, timeout=PATIENCE) as client:
         for channel in ("VTB_GET_ANSWER", "VTB_WATCH_ANSWER", "VTB_GET", "VTB_SET", "VTB_WATCH"):
@@ -144,7 +144,7 @@ NO_VALUES = [None, 3, [], {}, {"b": 1.0}, *({"a": value} for value in ("1", None
         ("reset", (), {"ok": True, "released": [3]}),
     ],
 )
-def test_answer_that_is_none_of_a_dps_is_a_live_error(
+def test_invalid_answer_raises_live_error(
     hub: Hub, method: str, arguments: tuple[Any, ...], answer: dict[str, Any]
 ) -> None:
     channel = f"VTB_{method.upper()}"
@@ -163,7 +163,7 @@ def test_answer_that_is_none_of_a_dps_is_a_live_error(
         {"error": 3},
     ],
 )
-def test_sample_that_is_none_of_a_dps_ends_a_watch_with_a_live_error(hub: Hub, sample: dict[str, Any]) -> None:
+def test_invalid_sample_raises_live_error(hub: Hub, sample: dict[str, Any]) -> None:
     answers = [("VTB_WATCH_ANSWER", {"ok": True}), ("VTB_WATCHED/ID", sample)]
     with impostor(hub.url, "VTB_WATCH", answers):
         with pytest.raises(LiveError):
@@ -172,7 +172,7 @@ def test_sample_that_is_none_of_a_dps_ends_a_watch_with_a_live_error(hub: Hub, s
             live.wait(1, timeout=PATIENCE)
 
 
-def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:
+def test_set_values_take_effect(hub: Hub) -> None:
     with served(hub.url) as (rig, _):
         rig.during(asked, hub.url, "set", {"dps.gain": 3.0, "u.target": [0.2, -0.1]})
         rig.runtime.cycle()
@@ -183,7 +183,7 @@ def test_what_is_set_takes_effect_and_is_noted(hub: Hub) -> None:
         assert not np.array_equal(rig.cycles[k - 1].actuation["velocity"], rig.cycles[k].actuation["velocity"])
 
 
-def test_what_is_read_is_what_is_there(shared: Rig) -> None:
+def test_get_returns_present_values(shared: Rig) -> None:
     found = shared.during(asked, shared.url, "get", ["dps.gain", "u.target", "u.target[1]", "real.act.velocity"])
     assert (found["dps.gain"], found["u.target[1]"]) == (5.0, 0.0)
     assert np.array_equal(found["u.target"], [0.0, 0.0])
@@ -203,16 +203,14 @@ def test_what_is_read_is_what_is_there(shared: Rig) -> None:
         ({"real.act.velocity": [1.0, 1.0]}, "real.act.velocity is an output port"),
     ],
 )
-def test_what_cannot_be_set_is_refused_with_the_reason(shared: Rig, values: dict[str, Any], reason: str) -> None:
+def test_impossible_set_is_rejected(shared: Rig, values: dict[str, Any], reason: str) -> None:
     with pytest.raises(LiveError) as error:
         shared.during(asked, shared.url, "set", values)
     assert reason in str(error.value)
     assert not any(change.kind == "write" for cycle in shared.cycles for change in cycle.changes)
 
 
-def test_what_fails_an_assertion_inside_drake_is_refused_with_the_reason(
-    hub: Hub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_drake_assertion_is_an_answer(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
     def write(values: dict[str, Any]) -> None:
         raise SystemExit("Failure at diagram.cc:1: condition 'it holds' failed.")
 
@@ -224,7 +222,7 @@ def test_what_fails_an_assertion_inside_drake_is_refused_with_the_reason(
         rig.during(asked, hub.url, "set", {"dps.gain": 3.0})
 
 
-def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
+def test_garbage_is_counted_and_harmless(hub: Hub) -> None:
     bus, answers = lcm.LCM(hub.url), []
     bus.subscribe("VTB_SET_ANSWER", lambda _, data: answers.append(json.loads(data)))
     with served(hub.url) as (rig, service):
@@ -241,7 +239,7 @@ def test_garbage_is_counted_and_harms_nobody(hub: Hub) -> None:
     assert rig.runtime.guards.latched == ()
 
 
-def test_a_flood_of_requests_costs_the_loop_one_a_cycle(hub: Hub) -> None:
+def test_flood_costs_one_request_per_cycle(hub: Hub) -> None:
     bus, answers = lcm.LCM(hub.url), []
     with served(hub.url) as (rig, _):
         rig.during(asked, hub.url, "get", ["dps.gain"])
@@ -257,7 +255,7 @@ def test_a_flood_of_requests_costs_the_loop_one_a_cycle(hub: Hub) -> None:
     assert all(len(cycle.changes) <= 1 for cycle in rig.cycles[before:])
 
 
-def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> None:
+def test_set_command_respects_the_rate_limit(hub: Hub) -> None:
     rate = 2.0
     with served(hub.url, rate=rate) as (rig, _):
         rig.during(asked, hub.url, "set", {"u.target": [0.2, -0.2], "dps.gain": 4.0})
@@ -267,7 +265,7 @@ def test_a_command_changed_from_outside_respects_the_rate_limit(hub: Hub) -> Non
 
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("nan")])
-def test_timeout_that_is_no_positive_time_is_refused(hub: Hub, timeout: float) -> None:
+def test_timeout_must_be_positive(hub: Hub, timeout: float) -> None:
     for begin in (LiveClient, lambda url, timeout: LiveWatch(url, ["dps.gain"], timeout=timeout)):
         with pytest.raises(ValueError, match="the timeout must be a positive number of seconds, not"):
             begin(hub.url, timeout=timeout)
@@ -275,17 +273,17 @@ def test_timeout_that_is_no_positive_time_is_refused(hub: Hub, timeout: float) -
         next(watch(hub.url, ["dps.gain"], timeout=timeout))
 
 
-def test_lease_that_is_no_number_is_refused(hub: Hub) -> None:
+def test_lease_must_be_a_number(hub: Hub) -> None:
     with pytest.raises(LiveError, match="lease must be 0.1 to 60 s, not nan"):
         next(watch(hub.url, ["dps.gain"], lease=float("nan"), timeout=0.1))
 
 
-def test_who_asks_where_nobody_serves_is_told(hub: Hub) -> None:
+def test_missing_service_is_a_timeout(hub: Hub) -> None:
     with LiveClient(hub.url, timeout=0.1) as client, pytest.raises(LiveTimeoutError, match="no answer"):
         client.get(["dps.gain"])
 
 
-def test_a_latch_is_released_from_outside_once_its_cause_is_over(hub: Hub) -> None:
+def test_latch_is_released_when_its_cause_is_over(hub: Hub) -> None:
     with served(hub.url, **AMPLE) as (rig, _):
         assert rig.during(asked, hub.url, "reset") == []
         rig.during(asked, hub.url, "set", {"dps.trouble": 1.0})
@@ -304,7 +302,7 @@ def test_a_latch_is_released_from_outside_once_its_cause_is_over(hub: Hub) -> No
 # -- watch
 
 
-def test_values_watched_are_those_of_their_cycle(shared: Rig) -> None:
+def test_watched_values_match_their_cycle(shared: Rig) -> None:
     seen = shared.during(watched, shared.url, ["dps.velocity", "real.act.velocity", "dps.ticks"], 50)
     by_time = {cycle.time: cycle.actuation for cycle in shared.cycles}
     for t, values in seen:
@@ -313,12 +311,12 @@ def test_values_watched_are_those_of_their_cycle(shared: Rig) -> None:
     assert np.diff([values["dps.ticks"] for _, values in seen]).tolist() == [1.0] * 49
 
 
-def test_one_may_watch_every_so_many_cycles(shared: Rig) -> None:
+def test_watch_has_a_period_in_cycles(shared: Rig) -> None:
     seen = shared.during(watched, shared.url, ["dps.ticks"], 5, every=7)
     assert np.diff([values["dps.ticks"] for _, values in seen]).tolist() == [7.0] * 4
 
 
-def test_beyond_the_budget_values_are_read_in_turns_and_that_is_told(hub: Hub) -> None:
+def test_values_beyond_the_budget_take_turns(hub: Hub) -> None:
     addresses = ["dps.ticks", "dps.gain", "dps.velocity", "u.target"]
     bus, seen = lcm.LCM(hub.url), []
     bus.subscribe("VTB_WATCHED/me", lambda _, data: seen.append(json.loads(data)))
@@ -332,7 +330,7 @@ def test_beyond_the_budget_values_are_read_in_turns_and_that_is_told(hub: Hub) -
     assert all(m["values"]["dps.ticks"] == round(m["since"] / PERIOD) for m in seen)
 
 
-def test_nobody_waits_for_ever_while_others_watch_more_than_there_is_time_for(hub: Hub) -> None:
+def test_watches_beyond_the_budget_take_turns(hub: Hub) -> None:
     with served(hub.url, budget=1e-9) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks", "dps.gain"], timeout=PATIENCE) as first:
             rig.until(lambda: service.watches == 1)
@@ -341,7 +339,7 @@ def test_nobody_waits_for_ever_while_others_watch_more_than_there_is_time_for(hu
         assert len(seen) == 5
 
 
-def test_what_takes_too_long_to_read_is_not_read_again(hub: Hub) -> None:
+def test_slow_value_is_not_read_again(hub: Hub) -> None:
     with served(hub.url, budget=1e-9, longest=1e-9) as (rig, service):
         with pytest.raises(LiveError, match=r"reading dps.ticks takes .* ms"):
             rig.during(watched, hub.url, ["dps.ticks"], 1)
@@ -352,12 +350,12 @@ def test_what_takes_too_long_to_read_is_not_read_again(hub: Hub) -> None:
     ("address", "reason"),
     [("dps.velocty", "did you mean dps.velocity"), ("u.target[2]", "no variable"), ("dps", "no variable")],
 )
-def test_unknown_addresses_are_not_watched(shared: Rig, address: str, reason: str) -> None:
+def test_watch_of_unknown_address_is_rejected(shared: Rig, address: str, reason: str) -> None:
     with pytest.raises(LiveError, match=reason):
         shared.during(watched, shared.url, ["dps.ticks", address], 1)
 
 
-def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> None:
+def test_watch_period_beyond_timeout_is_reported(hub: Hub) -> None:
     def reason(timeout: float) -> str:
         with pytest.raises(LiveTimeoutError) as caught:
             list(watch(hub.url, ["dps.ticks"], every=1_000_000_000, timeout=timeout))
@@ -369,7 +367,7 @@ def test_a_watch_that_is_too_patient_for_its_timeout_is_told_so(hub: Hub) -> Non
         assert rig.during(lambda: any(told in reason(timeout) for timeout in LONGER_AND_LONGER))
 
 
-def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
+def test_watch_ends_with_its_lease(hub: Hub) -> None:
     bus = lcm.LCM(hub.url)
     with served(hub.url, **AMPLE) as (rig, service):
         rig.during(asked, hub.url, "get", ["dps.gain"])
@@ -385,7 +383,7 @@ def test_who_goes_away_costs_nothing_after_his_lease(hub: Hub) -> None:
         rig.until(lambda: service.watches == 0)
 
 
-def test_commands_are_the_same_to_the_last_bit_whether_watched_or_not(hub: Hub) -> None:
+def test_watching_does_not_change_actuation(hub: Hub) -> None:
     addresses = ["real.act.velocity", "dps.seen"]
     with served(hub.url, **AMPLE) as (rig, _), LiveWatch(hub.url, addresses, timeout=PATIENCE) as live:
         rig.during(live.wait, 100, timeout=PATIENCE)
@@ -397,7 +395,7 @@ def test_commands_are_the_same_to_the_last_bit_whether_watched_or_not(hub: Hub) 
     assert np.ptp(rig.sent) > 0.1
 
 
-def test_the_newest_values_are_kept_to_be_plotted(hub: Hub) -> None:
+def test_newest_values_are_kept(hub: Hub) -> None:
     with (
         served(hub.url, **AMPLE) as (rig, _),
         LiveWatch(hub.url, ["dps.ticks", "dps.velocity"], size=20, timeout=PATIENCE) as live,
@@ -412,7 +410,7 @@ def test_the_newest_values_are_kept_to_be_plotted(hub: Hub) -> None:
     assert frame.index.name == "time" and (frame["dps.velocity[1]"].size >= 20)
 
 
-def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
+def test_watch_ends_with_the_loop(hub: Hub) -> None:
     with served(hub.url, **AMPLE) as (rig, _):
         live = LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE)
         rig.during(live.wait, 5, timeout=PATIENCE)
@@ -420,7 +418,7 @@ def test_a_watch_ends_with_the_loop(hub: Hub) -> None:
     assert live.arrays()["dps.ticks"].size >= 5
 
 
-def test_the_loop_goes_on_when_the_worker_process_is_gone(hub: Hub) -> None:
+def test_killed_worker_process_is_harmless(hub: Hub) -> None:
     with served(hub.url, **AMPLE) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
             rig.during(live.wait, 5, timeout=PATIENCE)

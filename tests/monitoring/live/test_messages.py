@@ -21,7 +21,7 @@ def encoded(**message):
     return json.dumps(message).encode()
 
 
-def test_requests_are_what_they_say():
+def test_valid_requests_are_parsed():
     assert parse_request(SET, encoded(id="a", set={"x": 1, "y": [1.5, [2]]})) == SetRequest(
         "a", {"x": 1, "y": [1.5, [2]]}
     )
@@ -55,18 +55,18 @@ def test_requests_are_what_they_say():
         (WATCH, encoded(id="a", watch=["x"], lease=1e9), "not 1000000000.0"),
     ],
 )
-def test_others_are_refused(channel, data, reason):
+def test_invalid_requests_are_rejected(channel, data, reason):
     with pytest.raises(RequestError) as error:
         parse_request(channel, data)
     assert reason in str(error.value)
 
 
-def test_an_id_is_found_where_there_is_one():
+def test_request_id_is_found():
     assert request_id(encoded(id="a", nonsense=1)) == "a"
     assert [request_id(data) for data in (b"{", b"[]", encoded(id=["a"]), b" " * 70_000)] == [""] * 4
 
 
-def test_numbers_are_nested_as_their_shape_says():
+def test_nested_follows_the_shape():
     assert nested((1.0,), ()) == 1.0
     assert nested((1.0, 2.0), (2,)) == [1.0, 2.0]
     assert nested(tuple(range(6)), (3, 2)) == [[0, 1], [2, 3], [4, 5]]

@@ -48,14 +48,14 @@ def twin(scenario: DrivenPendulum, config: ResidualConfig = CONFIG, cycles: int 
 
 
 @pytest.mark.parametrize("scenario", EXACT, ids=str)
-def test_twin_of_a_perfect_model_leaves_nothing(scenario: DrivenPendulum) -> None:
+def test_perfect_twin_has_no_residuals(scenario: DrivenPendulum) -> None:
     found = twin(scenario)
     assert found.shape == (20, 3)
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("scenario", EXACT, ids=str)
-def test_shadow_of_a_perfect_model_leaves_nothing(scenario: DrivenPendulum) -> None:
+def test_perfect_shadow_has_no_residuals(scenario: DrivenPendulum) -> None:
     together = Together(scenario, machine(scenario), shadowing=scenario)
     monitor = monitored(together.shadow, "shadow")
     together.run(205)
@@ -65,20 +65,20 @@ def test_shadow_of_a_perfect_model_leaves_nothing(scenario: DrivenPendulum) -> N
 
 
 @pytest.mark.parametrize("horizon", [1, 3, 50])
-def test_any_horizon_lines_up(horizon: int) -> None:
+def test_any_horizon_is_aligned(horizon: int) -> None:
     found = twin(DrivenPendulum(sampled=True), replace(CONFIG, horizon=horizon))
     assert len(found) == 203 // horizon
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("options", [{"act_delay": 2 * PERIOD}, {"sense_delay": 2 * PERIOD}])
-def test_declared_delay_of_the_way_lines_up(options: dict[str, float]) -> None:
+def test_declared_delay_is_aligned(options: dict[str, float]) -> None:
     found = twin(DrivenPendulum(), replace(CONFIG, delay=2), **options)
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
     assert np.abs(twin(DrivenPendulum(), **options)[:, 1]).max() > 1e-3
 
 
-def test_other_payload_leaves_what_the_equation_of_motion_says() -> None:
+def test_other_payload_matches_equation_of_motion() -> None:
     heavier = 1.05 * MASS
     scenario = DrivenPendulum()
     together = Together(scenario, machine(scenario, values={PAYLOAD: heavier}))
@@ -104,7 +104,7 @@ def test_other_payload_leaves_what_the_equation_of_motion_says() -> None:
     np.testing.assert_allclose(found, expected, atol=0.15 * np.abs(expected).max())
 
 
-def test_lost_messages_cost_their_windows_and_no_more() -> None:
+def test_lost_messages_cost_one_window() -> None:
     scenario = DrivenPendulum()
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin")
@@ -119,7 +119,7 @@ def test_lost_messages_cost_their_windows_and_no_more() -> None:
     assert monitor.skipped == 1
 
 
-def test_long_gap_has_it_begin_anew() -> None:
+def test_prediction_begins_anew_after_gap() -> None:
     scenario = DrivenPendulum(sampled=True)
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin", replace(CONFIG, settle=2))
@@ -150,7 +150,7 @@ def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
     return Comparison(predictor, layout, CONFIG, mode="twin"), rows
 
 
-def test_rows_may_come_in_any_portions_and_parts() -> None:
+def test_rows_arrive_in_any_portions() -> None:
     comparison, rows = rows_of(102)
     expected = np.array([window.residual for window in comparison.take(rows)])
     assert np.abs(expected).max() > 1e-2
@@ -167,7 +167,7 @@ def test_rows_may_come_in_any_portions_and_parts() -> None:
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
 
-def test_second_command_for_one_period_is_the_one_that_acts() -> None:
+def test_last_actuation_of_a_period_acts() -> None:
     comparison, rows = rows_of(102)
     expected = np.array([window.residual for window in comparison.take(rows)])
     again, _ = rows_of(1)
@@ -177,7 +177,7 @@ def test_second_command_for_one_period_is_the_one_that_acts() -> None:
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
 
-def test_failed_prediction_is_told_and_begins_anew() -> None:
+def test_failed_prediction_is_reported() -> None:
     scenario = DrivenPendulum()
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin")

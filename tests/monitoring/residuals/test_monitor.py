@@ -36,7 +36,7 @@ def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -
         select.select((monitor._worker,), (), (), 0.05)
 
 
-def test_other_process_finds_what_the_own_one_does() -> None:
+def test_worker_process_gives_equal_results() -> None:
     together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
     own = ResidualMonitor(together.driver, "twin", config=CONFIG, worker=False)
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as other:
@@ -50,7 +50,7 @@ def test_other_process_finds_what_the_own_one_does() -> None:
     np.testing.assert_array_equal([w.residual for w in other.history], [w.residual for w in own.history])
 
 
-def test_newest_residuals_are_known_while_the_loop_runs() -> None:
+def test_newest_residuals_are_available_while_running() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
         assert monitor.newest is None
@@ -59,7 +59,7 @@ def test_newest_residuals_are_known_while_the_loop_runs() -> None:
         assert {name: value.shape for name, value in monitor.newest.items()} == dict.fromkeys(TOLERANCE, (1,))
 
 
-def test_arrays_show_how_an_alarm_came_about() -> None:
+def test_arrays_show_the_alarm_statistic() -> None:
     together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
         assert {name: value.shape for name, value in monitor.arrays().items()} == {
@@ -75,7 +75,7 @@ def test_arrays_show_how_an_alarm_came_about() -> None:
     assert (table["time"][begin], table[alarm.signal][begin, alarm.entry]) == (alarm.began, alarm.residual)
 
 
-def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+def test_killed_worker_process_is_harmless(caplog: pytest.LogCaptureFixture) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
         assert monitor._worker is not None
@@ -90,7 +90,7 @@ def test_loop_goes_on_when_the_process_is_killed(caplog: pytest.LogCaptureFixtur
         assert "is lost" in caplog.text
 
 
-def test_process_that_is_stopped_leaves_windows_out() -> None:
+def test_stopped_worker_process_skips_windows() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
         assert monitor._worker is not None
@@ -106,7 +106,7 @@ def test_process_that_is_stopped_leaves_windows_out() -> None:
         assert not monitor.alarms
 
 
-def test_windows_that_lack_samples_are_told_of_while_the_loop_runs() -> None:
+def test_skipped_windows_are_reported_while_running() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
         together.driver.unwatch(monitor)
@@ -120,7 +120,7 @@ def test_windows_that_lack_samples_are_told_of_while_the_loop_runs() -> None:
         assert not monitor.history
 
 
-def test_dps_that_is_not_fed_by_the_machine_is_not_compared() -> None:
+def test_simulated_sensors_are_not_compared() -> None:
     together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
     assert together.shadow is not None
     config = replace(CONFIG, settle=0)
@@ -179,7 +179,7 @@ class MoodyPendulum(DrivenPendulum):
         builder.believe("sim.sys.Pendulum.theta.velocity", of=["dps.rhythm.seen[1]"])
 
 
-def test_shadow_goes_on_behind_a_dps_that_raised_and_tells_it_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_exceptions_of_the_dps_skip_windows(caplog: pytest.LogCaptureFixture) -> None:
     together = Together(SCENARIO, machine(SCENARIO), shadowing=MoodyPendulum())
     shadow = together.shadow
     assert shadow is not None
@@ -204,7 +204,7 @@ class HalfTimeless(Line):
         return count
 
 
-def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
+def test_signal_without_time_joins_newest_sample() -> None:
     def residuals(kind: type[Line]) -> np.ndarray:
         line = kind(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
         driver = loop(DpsAlone(SCENARIO), line, PERIOD)
@@ -217,28 +217,28 @@ def test_signal_without_a_time_belongs_to_the_newest_sample() -> None:
 
 
 @pytest.mark.parametrize("worker", [True, False])
-def test_world_of_other_signals_is_refused(worker: bool) -> None:
+def test_world_with_other_signals_is_rejected(worker: bool) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with pytest.raises(ValueError, match=r"ServoScenario has other signals than sense.position"):
         ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), worker=worker)
 
 
 @pytest.mark.parametrize("worker", [True, False])
-def test_testbed_without_a_belief_is_refused(worker: bool) -> None:
+def test_scenario_without_belief_is_rejected(worker: bool) -> None:
     scenario = DrivenPendulum(believes=False)
     together = Together(scenario, machine(scenario))
     with pytest.raises(ValueError, match=r"DrivenPendulum does not declare .* from which a prediction starts"):
         ResidualMonitor(together.driver, "twin", config=CONFIG, worker=worker)
 
 
-def test_unknown_variable_of_the_predicted_world_is_refused() -> None:
+def test_unknown_variable_is_rejected() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     config = replace(CONFIG, values={"sim.sys.Pendulum.arm_com.mas": 1.0})
     with pytest.raises(ValueError, match="arm_com.mass"):
         ResidualMonitor(together.driver, "twin", config=config)
 
 
-def test_shadow_of_a_machine_that_reports_nothing_is_refused() -> None:
+def test_shadow_needs_reported_actuation() -> None:
     ear = Ear(SCENARIO)
     ear.reported = {}
     shadow = loop(SCENARIO.build(mode="shadow"), ear, PERIOD)
@@ -246,19 +246,19 @@ def test_shadow_of_a_machine_that_reports_nothing_is_refused() -> None:
         ResidualMonitor(shadow, "shadow", config=CONFIG, worker=False)
 
 
-def test_other_mode_is_refused() -> None:
+def test_unknown_mode_is_rejected() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with pytest.raises(ValueError, match="must be shadow or twin, not 'real'"):
         ResidualMonitor(together.driver, "real", config=CONFIG)
 
 
-def test_other_period_than_the_loops_is_refused() -> None:
+def test_other_period_is_rejected() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with pytest.raises(ValueError, match=r"0.001 s, must be the period of the loop, 0.1 s"):
         ResidualMonitor(together.driver, "twin")
 
 
-def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
+def test_belief_age_must_be_multiple_of_period() -> None:
     scenario = DrivenPendulum(sampled=True)
     together = Together(scenario, machine(scenario))
     together.driver.period = 0.04
@@ -276,7 +276,7 @@ def test_belief_whose_age_is_no_whole_number_of_periods_is_refused() -> None:
         ({"tolerance": {"sense.position": -1.0}}, "tolerance of sense.position"),
     ],
 )
-def test_impossible_config_is_refused(fields: dict[str, object], message: str) -> None:
+def test_impossible_config_is_rejected(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ResidualConfig(**fields)  # type: ignore[arg-type]
 

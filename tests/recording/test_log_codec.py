@@ -1,4 +1,4 @@
-"""The compiled search for events and cycles against the same in a few lines of plain Python, on damaged files."""
+"""The compiled search for events and cycles in damaged files, compared with plain Python."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def files() -> Iterator[bytes]:
     yield from (chosen.randbytes(chosen.randrange(40)) for _ in range(100))
 
 
-def test_events_and_damages_are_those_of_a_plain_search() -> None:
+def test_find_events_matches_plain_search() -> None:
     damages = 0
     for content in files():
         places, wrong = find_events(content)
@@ -134,7 +134,7 @@ def test_events_and_damages_are_those_of_a_plain_search() -> None:
     assert damages > 500
 
 
-def test_cycles_are_those_whose_checksum_a_plain_search_finds_right() -> None:
+def test_whole_cycles_matches_plain_search() -> None:
     good = bad = 0
     for content in files():
         places = find_events(content)[0].get(CYCLE.encode(), np.empty((0, 4), np.int64))
@@ -148,7 +148,7 @@ def test_cycles_are_those_whose_checksum_a_plain_search_finds_right() -> None:
 
 
 @pytest.mark.parametrize("size", [-(2**31), -1, 0, 4, LAYOUT.dtype.itemsize, 2**31 - 1])
-def test_a_frame_that_reaches_beyond_the_file_is_a_wrong_checksum(size: int) -> None:
+def test_frame_beyond_file_is_wrong_checksum(size: int) -> None:
     record = LAYOUT.blank()
     record["number"], record["size"] = 5, size
     content = event(0, 0, CYCLE.encode(), record.tobytes())
@@ -159,12 +159,12 @@ def test_a_frame_that_reaches_beyond_the_file_is_a_wrong_checksum(size: int) -> 
 
 
 @pytest.mark.parametrize(("begin", "end"), [(-1, 3), (2, 1), (3, 11), (2**62, 2**62 + 1)])
-def test_a_place_that_is_not_in_the_file_is_refused(begin: int, end: int) -> None:
+def test_place_outside_file_is_rejected(begin: int, end: int) -> None:
     with pytest.raises(IndexError, match=f"bytes {begin} to {end} are outside the file, which has 10"):
         whole_cycles(bytes(10), np.array([[0, 0, begin, end]]), LAYOUT.dtype)
 
 
 @pytest.mark.parametrize("columns", [0, 1, 3, 5])
-def test_a_place_is_four_numbers(columns: int) -> None:
+def test_place_must_have_four_numbers(columns: int) -> None:
     with pytest.raises(ValueError, match=f"not {columns} numbers"):
         whole_cycles(bytes(10), np.zeros((1, columns), np.int64), LAYOUT.dtype)
