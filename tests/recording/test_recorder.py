@@ -180,7 +180,8 @@ def test_full_disk_is_reported_and_harmless(
     log = read_log(tmp_path / "run.lcm")
     assert 0 < len(log) == 600 - recorder.lost
     assert not log.damages, "what is there is whole"
-    assert not log.closed and np.array_equal(log.numbers, np.arange(1, len(log) + 1))
+    # Whether the short last event still fits is a matter of bytes.
+    assert np.array_equal(log.numbers, np.arange(1, len(log) + 1))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
