@@ -42,7 +42,7 @@ _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 _RESOLUTION = 1000.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene:
     """The scene of a Meshcat with its recording, which shows itself in a notebook.
 
@@ -79,6 +79,9 @@ class Scene:
             "font:14px/1.5 sans-serif;color:#222"
         )
         return f'<div id="caption" style="{style}">{"<br>".join(rows)}</div>\n' if rows else ""
+
+    def __repr__(self) -> str:
+        return "<Scene in 3D: run the cell to see it>"
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {self.height}px; border: 0"

@@ -1,0 +1,46 @@
+"""What must hold for every notebook: it runs, shows each figure once, and is stored with its text and plots."""
+
+import re
+from pathlib import Path
+
+import nbformat
+from nbformat import NotebookNode
+
+from tools.run_notebooks import FOLDER, run
+
+
+def stored(name: str) -> NotebookNode:
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    return notebook
+
+
+def code_cells(notebook: NotebookNode) -> list[NotebookNode]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def pictures(cell: NotebookNode) -> int:
+    return sum("image/png" in output.get("data", {}) for output in cell.outputs)
+
+
+def check_stored(name: str) -> None:
+    """Check that a reader without a kernel sees text and plots, and nothing of the machine that made them."""
+    notebook = stored(name)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert "widgets" not in notebook.metadata
+    for cell in code_cells(notebook):
+        assert cell.execution_count, f"{cell.id} has not been run: python tools/run_notebooks.py {name}"
+        text = str(cell.outputs)
+        assert "<iframe" not in text, f"{cell.id} holds a 3D recording"
+        assert not re.search(r"/(home|root|tmp|work|usr)/", text), f"{cell.id} shows a path of a machine"
+
+
+def check_runs(name: str) -> None:
+    """Run the notebook: its own assertions hold, nothing warns, and each figure is shown once, as it is stored."""
+    before = {cell.id: cell for cell in code_cells(stored(name))}
+    for cell in code_cells(run(Path(FOLDER / f"{name}.ipynb"))):
+        lines = "".join(output.text for output in cell.outputs if output.get("name") == "stderr").splitlines()
+        warnings = [line for line in lines if line and not line.startswith("INFO:")]  # such as Meshcat's address
+        assert not warnings, f"{cell.id} warns: {warnings}"
+        expected = "plot()" in cell.source or "plt.show()" in cell.source
+        assert pictures(cell) == pictures(before[cell.id]) == expected, cell.id

@@ -1,0 +1,64 @@
+"""Run the notebooks and store them with their text and plots: ``python tools/run_notebooks.py [NAME...]``.
+
+What a reader cannot use without a kernel is left out: recordings in 3D (they are large), and widgets.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "notebooks"
+WIDGET = "application/vnd.jupyter.widget-view+json"
+
+
+def run(path: Path) -> NotebookNode:
+    """Run a notebook from top to bottom in the root of the checkout, and return it with its outputs.
+
+    Raises:
+        nbclient.exceptions.CellExecutionError: a cell raised.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
+    return notebook
+
+
+def strip(notebook: NotebookNode) -> None:
+    """Remove what a stored page cannot use: 3D recordings, progress bars, log messages, times of execution."""
+    notebook.metadata.pop("widgets", None)
+    notebook.metadata.language_info = {"name": "python"}
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+        if cell.cell_type != "code":
+            continue
+        kept: list[NotebookNode] = []
+        for output in cell.outputs:
+            data = output.get("data", {})
+            if WIDGET in data or output.get("name") == "stderr":
+                continue
+            if "<iframe" in data.get("text/html", ""):
+                del data["text/html"]
+            if kept and output.get("name") == kept[-1].get("name") == "stdout":
+                kept[-1].text += output.text
+            else:
+                kept.append(output)
+        cell.outputs = kept
+
+
+def main() -> None:
+    """Run the notebooks that are named, or all, and store them."""
+    for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
+        path = FOLDER / f"{name}.ipynb"
+        notebook = run(path)
+        strip(notebook)
+        nbformat.write(notebook, path)
+        print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
