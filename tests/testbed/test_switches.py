@@ -13,7 +13,7 @@ from pydrake.systems.sensors import ImageRgba8U
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
-from vtbdrake.testbed import Command, Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import ActuatorCommand, Interface, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.01
 
@@ -189,12 +189,12 @@ def test_no_command_leaves_while_the_switch_is_on_sim():
     testbed, _ = _testbed(PoseCounter(), sense, act)
     context = testbed.default_context()
     assert np.isnan(testbed.read(context, "real.act.speed")).all()
-    assert testbed.read(context, "real.act.look") == Command(None)
+    assert testbed.read(context, "real.act.look") == ActuatorCommand(None)
     assert testbed.read(context, "real.act.active").tolist() == [0.0, 0.0]
     testbed.switch(context, act={"speed": "real"})
     assert testbed.read(context, "real.act.active").tolist() == [0.0, 1.0]
     assert testbed.read(context, "real.act.speed").tolist() == [0.0, 0.0, 0.0]
-    assert testbed.read(context, "real.act.look") == Command(None)
+    assert testbed.read(context, "real.act.look") == ActuatorCommand(None)
     testbed.switch(context, act={"look": "real"})
     np.testing.assert_array_equal(testbed.read(context, "real.act.look").value.GetAsMatrix34(), np.eye(3, 4))
 

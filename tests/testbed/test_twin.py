@@ -8,7 +8,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, PassThrough
 
 from tests.testbeds import AcrobotScenario
-from vtbdrake.testbed import Command, Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import ActuatorCommand, Interface, Signal, VirtualTestbedBuilder
 
 SEEN = RigidTransform([1.0, 2.0, 3.0])
 IDLE = RigidTransform([0.0, 0.0, 9.0])
@@ -72,7 +72,7 @@ def _matrix(pose):
 def test_the_real_ports_carry_a_command_in_real_and_twin_only(mode):
     testbed, context = _testbed(mode)
     look, speed = testbed.read(context, "real.act.look"), testbed.read(context, "real.act.speed")
-    assert isinstance(look, Command)
+    assert isinstance(look, ActuatorCommand)
     if mode in ("real", "twin"):
         assert testbed.read(context, "real.act.active").tolist() == [1.0, 1.0]
         assert _matrix(look.value) == _matrix(SEEN)
@@ -115,7 +115,7 @@ def test_an_abstract_command_that_is_not_selected_is_not_evaluated():
     testbed, context = _testbed("real", dps=Silent)
     assert _matrix(testbed.read(context, "sim.act.look.y")) == _matrix(IDLE)
     testbed.switch(context, act="sim")
-    assert testbed.read(context, "real.act.look") == Command(None)
+    assert testbed.read(context, "real.act.look") == ActuatorCommand(None)
     with pytest.raises(AssertionError, match="it was evaluated"):
         testbed.read(context, "sim.act.look.y")
 

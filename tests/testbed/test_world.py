@@ -33,7 +33,7 @@ def test_world_with_the_commands_of_the_dps_moves_as_in_the_testbed() -> None:
     simulator = world.simulator(own)
     simulator.Initialize()
     for k, command in enumerate(commands):
-        world.command(own, "torque", command)
+        world.actuate(own, "torque", command)
         simulator.AdvanceTo((k + 1) * STEP)
         np.testing.assert_array_equal(world.read(own, "plant.state"), expected[k])
 
@@ -45,7 +45,7 @@ def test_fed_commands_act_as_those_that_are_given_one_by_one() -> None:
     feed = world.feed(contexts[1])
     for k in range(20):
         torque = np.array([np.sin(k)])
-        world.command(contexts[0], "torque", torque)
+        world.actuate(contexts[0], "torque", torque)
         feed("torque", torque)
         for simulator in simulators:
             simulator.AdvanceTo((k + 1) * STEP)
@@ -104,7 +104,7 @@ def test_abstract_commands_can_be_fed() -> None:
 def test_abstract_signals_pass() -> None:
     world = WorldAlone(PoseScenario())
     context = world.default_context()
-    world.command(context, "commanded", RigidTransform([1.0, 2.0, 3.0]))
+    world.actuate(context, "commanded", RigidTransform([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(world.read(context, "sense.seen").translation(), [-1.0, -2.0, -3.0])
 
 
@@ -130,4 +130,4 @@ def test_world_that_lacks_a_sensor_is_refused() -> None:
 def test_a_command_that_does_not_fit_is_refused(name, value, message):
     world = WorldAlone(AcrobotScenario())
     with pytest.raises(SignalError, match=message):
-        world.command(world.default_context(), name, value)
+        world.actuate(world.default_context(), name, value)

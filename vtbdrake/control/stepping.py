@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram
 from vtbdrake.control.bridge import Bridge, ReceivedSignal
 from vtbdrake.control.guards import Verdict
 from vtbdrake.state.systems import leaves
-from vtbdrake.testbed import Command, DpsAlone, VirtualTestbed
+from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.signal import Feed
 from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
@@ -123,7 +123,7 @@ class RealPorts:
             value = evaluate(self._context)
             if signal.is_vector:
                 value = np.array(value)
-            elif isinstance(value, Command):
+            elif isinstance(value, ActuatorCommand):
                 value = value.value
             actuation[name] = value
         return actuation

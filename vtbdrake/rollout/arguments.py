@@ -1,4 +1,4 @@
-"""Arguments of the wrong kind, told where they are given."""
+"""Checks of arguments, with errors where the arguments are given."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
     found = tuple(values)
     for value in found:
         if not isinstance(value, kind):
-            raise ValueError(f"give {name} as {form}; {value!r} has no place there")
+            raise ValueError(f"give {name} as {form}; {value!r} does not fit")
     return found

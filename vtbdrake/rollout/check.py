@@ -1,4 +1,4 @@
-"""Finds what executors cannot cope with: memory outside the Context, and values that do not travel to workers."""
+"""Finds problems of executors: memory outside the Context, and values that cannot be sent to workers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
 from vtbdrake.testbed import VirtualTestbed
 
-# The reference is simulated for about so many seconds of processor time; the other rollouts go as far.
+# Seconds of processor time for the reference; the other rollouts are as long in simulated time.
 _BUDGET = 0.1
 
-# What is compared at a sample time: by the path of a system its numbers, under "" those of f and the other measures.
+# Compared at a sample time: the numbers of each system, by path; under "" those of f and the other measures.
 Sample = Mapping[str, tuple[Any, ...]]
 
 
@@ -172,7 +172,7 @@ def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
 def _fingerprint(value: Any) -> Any:
     try:
         return pickle.dumps(value)
-    except Exception:  # A port, or a function: it is what it is.
+    except Exception:  # A port or a function, for example.
         return id(value)
 
 

@@ -19,9 +19,9 @@ from vtbdrake.state.systems import leaves, read_group, write_group
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
-# Of a parameter's own size, when what it does to the groups of a context is measured. Nearly all are linear in it.
+# Relative step of a parameter in the differences of the context's groups, which are mostly linear in it.
 _STEP = 1e-6
-# Of the state, along the direction in which a parameter moves it, when what that does to f is measured.
+# Step of the state, along its derivative by a parameter, in the differences of f.
 _NUDGE = 1e-6
 
 
@@ -138,7 +138,7 @@ class DerivativeRunner:
         systems = {path: system for path, _, system in self._pairs}
         for (path, group, index), value in self._groups(context).items():
             gradient = np.stack([direction[path, group, index] for direction in directions], axis=1)
-            # NaN marks what has no value, such as the command that is none: it has no derivative either.
+            # NaN stands for no value, such as no command: it has no derivative.
             gradient[np.isnan(gradient)] = 0.0
             if gradient.any():
                 leaf = systems[path].GetMyMutableContextFromRoot(seeded)
@@ -177,14 +177,14 @@ class DerivativeRunner:
 
     def _f(self, context: Context, t: float, *, checked: bool = True) -> float:
         arguments = [read(context) for read in self._readers]
-        # Nudged below its least, f may be negative.
+        # A step may make f negative.
         return self._quality(arguments, time=t) if checked else float(self._quality.f(*arguments))
 
     def _read(self, times: np.ndarray, samples: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
         t, value = READINGS[self._quality.reading](times, samples, not self._quality.minimize)
         if self._quality.reading == "integral":
             return value, np.trapezoid(slopes, times, axis=0)
-        # At the best time its own derivative is zero, or it is an end: only that of f counts (envelope theorem).
+        # Envelope theorem: at the best time f is stationary in time, or the time is an end.
         return value, slopes[int(np.flatnonzero(times == t)[0])]
 
 

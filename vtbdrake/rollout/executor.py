@@ -110,11 +110,11 @@ class ThreadExecutor(Executor):
         self._runners = Runners(Testbeds(testbed, kept=kept))
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
-        # The threads know nothing of the executor: one that is forgotten without being closed must not live on in them.
+        # The threads hold no reference to the executor, so that one that was not closed can be freed.
         weakref.finalize(self, _stop, self._jobs, self._threads)
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        if len(points) == 1:  # It would gain nothing from a change of threads.
+        if len(points) == 1:  # Without the cost of another thread.
             yield 0, self._runners.run(task, points[0])
             return
         while len(self._threads) < min(self._count, len(points)):
@@ -161,7 +161,7 @@ def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
             job.done.put((job.index, runners.run(job.task, job.point, cancel=job.cancel)))
         except BaseException as error:  # Raised again where the results are read.
             job.done.put(error)
-        # While it waits for the next one, it keeps nothing of the last.
+        # Keep nothing of the last job while waiting for the next one.
         del job
 
 

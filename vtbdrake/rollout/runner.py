@@ -57,13 +57,13 @@ class RolloutRunner:
         self._s0 = self.testbed.default_context()
         if task.start is not None:
             self.testbed.restore(self._s0, task.start)
-            # In a rollout there is no reality: a copy of the running robot throws its switches.
+            # A copy of the running robot is simulated.
             self.testbed.switch(self._s0, "sim")
         self._instants = task.instants(self._s0.get_time(), self.testbed.event_timings())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
         self._copier = self.testbed.copier_from(self.testbed)
-        # Which hidden variables differ from s0: at first, those of a snapshot may.
+        # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
 
     def run(self, parameters: Mapping[str, Any], *, cancel: threading.Event | None = None) -> RolloutResult:
@@ -145,7 +145,7 @@ class RolloutRunner:
         return self.testbed.snapshot(self._context)
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
-        # A new integrator: the step memory of a used one would be part of the trajectory. Its config sets the time.
+        # A new integrator: the step size of a used one would change the trajectory.
         ApplySimulatorConfig(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         self._copier.copy(self._s0, self._context, hidden=self._changed)
@@ -154,7 +154,7 @@ class RolloutRunner:
         with _FailuresAsOutcomes():
             self._variables.write(self._context, parameters)
             before = self._variables.read(self._context, list(parameters))
-            # Initialization events make s0 of the defaults; to a restored s0 they have happened before.
+            # Initialization events are part of a default s0; in a restored s0 they have happened already.
             self._simulator.Initialize(InitializeParams(suppress_initialization_events=restored))
         for address, value in before.items():
             after = self._variables[address].get(self._context)
@@ -173,7 +173,7 @@ class RolloutRunner:
         return status
 
     def _refuse_nonfinite(self, t: float) -> None:
-        # A DPS may mark what it does not know by NaN; the simulated world may not.
+        # NaN is allowed in a DPS, for unknown values, but not in the simulated world.
         x = self._context.get_continuous_state_vector().CopyToVector()
         plant = self.testbed.plant
         if plant is not None and plant.time_step() > 0.0:
@@ -248,7 +248,7 @@ class _Samples:
         t_star, h, value, state = np.nan, np.nan, np.nan, None
         measures: tuple[float, ...] = ()
         if exceeded.any():
-            # t* = min G1 stands, whatever happens to a rollout that runs on.
+            # t* = min G1, also in a rollout that runs on and fails later.
             end = THRESHOLD
         if times.size and end != FAILED:
             if f is not None:
@@ -277,7 +277,7 @@ class _Samples:
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
         runner = self._runner
-        # A rollout that failed after t* has moved on.
+        # A rollout that failed after t* has gone on since: simulate it again up to t*.
         at_end = t_star == self._times[-1] and runner.context.get_time() == self._clock
         return runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
 
@@ -286,7 +286,7 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
     try:
         return measure(values, time=t)
     except QualityError as error:
-        # f may know what NaN means (nothing was detected); where it does not, the simulation is to blame.
+        # f may accept NaN (nothing was detected). If it does not, NaN is a failure of the simulation.
         if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
             raise
         raise SimulationError(f"a quality variable is not finite: {error}") from error
@@ -305,9 +305,9 @@ def _stack(values: list[Any]) -> Any:
 
 
 FIELD = "scenario."
-# How many testbeds are kept, beside one that is given.
+# Number of testbeds that are kept besides a given one.
 KEPT = 4
-# How many runners a thread keeps, on these testbeds; an executor may see any number of tasks.
+# Number of runners that a thread keeps; an executor may run any number of tasks.
 _RUNNERS = 16
 
 
@@ -397,7 +397,7 @@ class Runners:
         """
         mine: OrderedDict[Hashable, tuple[RolloutTask, RolloutRunner]]
         mine = self._threads.__dict__.setdefault("runners", OrderedDict())
-        # A task is its own key: to compare what it holds would take longer than to run it.
+        # By identity: comparing tasks can take longer than running them.
         key = (id(task), _key(fields))
         if key not in mine:
             mine[key] = (task, self._make(task, fields))

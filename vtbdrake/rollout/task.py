@@ -1,4 +1,4 @@
-"""What a rollout is asked, and what it returns."""
+"""The task of rollouts, and their results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ THRESHOLD = "threshold"
 HORIZON = "horizon"
 TERMINATED = "terminated"
 FAILED = "failed"
-# How the message of a rollout begins that failed since its quality function did.
+# Begin of the message of a rollout whose quality function failed.
 QUALITY_FAILED = "QualityError: "
 
 
@@ -105,7 +105,7 @@ def _same(a: Any, b: Any) -> bool:
         return isinstance(b, RigidTransform) and a.IsExactlyEqualTo(b)
     if isinstance(a, float | int | np.ndarray):
         return bool(np.array_equal(a, b, equal_nan=True))
-    # Drake's images and other objects compare by identity; their bytes do not.
+    # Drake's images and other objects compare by identity: compare their bytes.
     return pickle.dumps(a) == pickle.dumps(b)
 
 
@@ -158,7 +158,7 @@ class RolloutTask:
             object.__setattr__(self, name, as_number(what, getattr(self, name)))
         object.__setattr__(self, "record", as_addresses("what to record", self.record))
         object.__setattr__(self, "measures", tuple(self.measures))
-        # Its own: a scenario that is changed afterwards is another one.
+        # A copy: the caller may change the scenario afterwards.
         object.__setattr__(self, "scenario", copy.deepcopy(self.scenario))
         if not (isfinite(self.horizon) and self.horizon > 0.0):
             raise ValueError(f"the horizon t_m must be positive and finite, not {self.horizon} s")
@@ -221,7 +221,7 @@ class RolloutTask:
         """
         times = t0 + self.sample_times()
         snapped = times.copy()
-        # So many roundings of numbers of this size may lie between two ways to compute an instant.
+        # Two ways to compute an instant may differ by some roundings.
         close = 8.0 * np.spacing(np.maximum(np.abs(times), 1.0))
         distance = np.full(times.shape, np.inf)
         for period, offset in timings:
@@ -229,6 +229,5 @@ class RolloutTask:
             away = np.abs(events - times)
             nearer = (away <= close) & (away < distance)
             snapped[nearer], distance[nearer] = events[nearer], away[nearer]
-        # It begins at t0 itself.
         snapped[0] = t0
         return snapped

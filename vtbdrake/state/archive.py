@@ -16,13 +16,13 @@ import numpy as np
 
 _HEADER = "header.json"
 _ARRAY = ".npy"
-# What any file may unpack to, in bytes.
+# Every file may unpack to this many bytes.
 LARGEST = 1 << 30
 T = TypeVar("T")
 
 
 class ArchiveError(ValueError):
-    """A file that is damaged, or is not what it should be."""
+    """A file that is damaged, or of another kind."""
 
 
 def write_archive(
@@ -60,8 +60,8 @@ def _write(
         size = sum(entry.file_size for entry in archive.infolist())
     if size > _most(file.tell()):
         raise ValueError(
-            f"{size} bytes that can be packed into {file.tell()} would not be read again, for fear of a compression "
-            "bomb: save less at once"
+            f"{size} bytes that can be packed into {file.tell()} would be rejected as a compression bomb: save "
+            "less at once"
         )
 
 
@@ -80,7 +80,7 @@ def read_archive(
     """Return what ``make(header, arrays)`` makes of what `write_archive` wrote, or of the bytes of it.
 
     Args:
-        make: may assume that the file is as it should be: what it raises says that it is not.
+        make: an exception that it raises is reported as damage of the file.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -170,8 +170,7 @@ class SnapshotError(ValueError):
 class AbstractState:
     """Reads and writes the abstract state of one leaf system.
 
-    The system's attribute ``codecs`` says how a state becomes arrays; where it says nothing, `codec_of` the value that
-    the state has does.
+    The codecs are those of the system's attribute ``codecs``, or else `codec_of` the present value of the state.
 
     Args:
         path: of the system, for messages.
@@ -186,7 +185,7 @@ class AbstractState:
         self._path = path
         self._system = system
         self._codecs: dict[int, Codec] = {}
-        # What a snapshot needs of these is in their variables.
+        # Snapshots hold their variables instead.
         if is_plant(system) or is_scene_graph(system) or is_camera(system):
             return
         if context.num_abstract_parameters():
@@ -201,7 +200,7 @@ class AbstractState:
     def _codec_of(self, context: Context, index: int) -> Codec:
         try:
             return codec_of(context.get_abstract_state(index).get_value(), varying=True)
-        # pydrake has a RuntimeError for a type of C++ that Python does not know.
+        # pydrake raises a RuntimeError for a C++ type without bindings.
         except (ValueError, RuntimeError) as error:
             reason = str(error) if isinstance(error, ValueError) else "Python does not know its type"
             raise SnapshotError(
@@ -250,7 +249,7 @@ class AbstractState:
         parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
         try:
             return self._codecs[index].decode(parts)
-        except Exception as error:  # The codec may be anybody's, and so may the arrays.
+        except Exception as error:  # Codec and arrays may come from anywhere.
             raise SnapshotError(
                 f"abstract state {index} of {self._path} cannot be made of the arrays {', '.join(parts) or 'none'}: "
                 f"{type(error).__name__}: {error}"

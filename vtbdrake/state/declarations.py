@@ -85,8 +85,8 @@ class Codec:
     decode: Callable[[Mapping[str, np.ndarray]], Any]
 
 
-# The ``__slots__`` of every class that derives from LeafSystem. A dict of its own, beside that of Drake's class, is
-# visited twice by the collector (drake 1.51), which then takes it for used from elsewhere. Attributes go into Drake's.
+# The ``__slots__`` of every class that derives from LeafSystem. With an instance dict beside that of Drake's class, the
+# collector visits it twice (drake 1.51) and considers it referenced from outside. Attributes go into Drake's dict.
 NO_DICT: tuple[str, ...] = ()
 
 

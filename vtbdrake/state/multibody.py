@@ -49,7 +49,7 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Va
                 yield _pose_entry(plant, body, address, entry)
     for index in range(plant.num_frames()):
         frame = plant.get_frame(FrameIndex(index))
-        # A name that begins with underscores is the parser's, not the model's.
+        # Names that begin with underscores come from the parser, not from the model.
         named = frame.name() and not frame.name().startswith("__")
         if isinstance(frame, FixedOffsetFrame) and named and not frame.is_ephemeral():
             yield _frame_pose(plant, frame, element_address(plant, frame, prefix))
@@ -160,7 +160,7 @@ def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
         else:
             joint.Unlock(context)
 
-    # Locking stops the joint, and a locked joint takes no velocity: last.
+    # Written last: locking stops the joint, and a locked joint takes no velocity.
     return Variable(name, A, (), "1", read, write, bounds=(0.0, 1.0), carried_by=name, order=1)
 
 
@@ -181,7 +181,7 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
         return inertia_in_body(root).get_com()
 
     def write_com(root: Context, value: np.ndarray) -> None:
-        # SpatialInertia keeps the inertia about the body's origin: shift it, or it would not stay physical.
+        # SpatialInertia keeps the inertia about the body's origin: without a shift, it would become unphysical.
         M_BBo_B = inertia_in_body(root)
         G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(M_BBo_B.get_com())
         set_inertia(root, SpatialInertia(M_BBo_B.get_mass(), value, G_BBcm_B.ShiftFromCenterOfMass(value)))

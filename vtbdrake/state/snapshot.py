@@ -32,8 +32,8 @@ class Snapshot:
         groups: every numeric group and, through its codec, every abstract state of every leaf system, under
             ``path/group/index`` and ``path/abstract/index/name``.
 
-    Two snapshots are equal if all of that is, where NaN equals NaN. Arrays are read only. What Drake hides from
-    Python (the last step's contact results of a discrete plant) is not part of it.
+    Two snapshots are equal if all of that is, where NaN equals NaN. Arrays are read only. The contact
+    results of a discrete plant's last step are not part of it: Python cannot read them.
     """
 
     time: float
@@ -56,7 +56,7 @@ class Snapshot:
             return NotImplemented
         return self.scenario == other.scenario and not self.compare(other)
 
-    # It is made of arrays, which have no hash.
+    # Arrays have no hash.
     __hash__ = None  # type: ignore[assignment]
 
     def __getitem__(self, address: str) -> np.ndarray:
@@ -75,7 +75,7 @@ class Snapshot:
         """Return the largest absolute difference to another snapshot, by address or group.
 
         ``inf`` stands where only one of them has the entry, it has another shape, or it is not of real numbers. Equal
-        entries (NaN equals NaN) are left out, so that ``not a.compare(b)`` says that they are identical.
+        entries (NaN equals NaN) are left out, so that ``not a.compare(b)`` means that they are identical.
         """
         differences = {} if self.time == other.time else {"time": abs(self.time - other.time)}
         for mine, theirs in ((self.values, other.values), (self.groups, other.groups)):
@@ -157,7 +157,7 @@ def apply(
     """Set time, state and parameters of ``context`` from ``snapshot``.
 
     Args:
-        only: says of the path of a system whether it is set, and looked for in the snapshot; left out, all are.
+        only: selects the systems that are set, by path; left out, all are.
 
     Raises:
         SnapshotError: the Diagram is built in another way than the one that the snapshot was taken from; the
@@ -195,14 +195,14 @@ def apply(
     for path, system in systems:
         leaf_context = system.GetMyMutableContextFromRoot(context)
         if not (is_scene_graph(system) or is_camera(system)):
-            # What a snapshot cannot hold, the memory of a discrete plant's last step, is to be that of a new context.
+            # Reset the memory of a discrete plant's last step, which a snapshot cannot hold.
             system.SetDefaultContext(leaf_context)
         for group, index in numeric_groups(leaf_context):
             write_group(leaf_context, group, index, snapshot.groups[f"{path}/{group}/{index}"])
         if path in writers:
             writers[path](leaf_context)
     for variable in hidden:
-        # Writing makes SceneGraph and cameras compute anew: only what differs.
+        # Write only what differs: writing makes SceneGraph and cameras compute anew.
         if not np.array_equal(variable.get(context), snapshot.values[variable.address]):
             variable.set(context, snapshot.values[variable.address])
 
@@ -232,7 +232,7 @@ class StateCopier:
     Args:
         source, target: the Diagrams; they may be the same one.
         source_variables, target_variables: theirs.
-        only: says of the path of a system of the target whether it is copied; left out, all are.
+        only: selects the systems of the target that are copied, by path; left out, all are.
 
     Raises:
         ValueError: the two are not built alike.

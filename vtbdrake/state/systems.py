@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vtbdrake.state.multibody import Prefix
 
 POSE_UNIT = "m, rad"
-# What Drake appends to the class of a system that was given no name: its address in memory.
+# Drake names a system without a name by its class and its address in memory.
 _UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
 
@@ -96,7 +96,7 @@ def _elements(system: System) -> Iterator[Element]:
         yield Element(f"discrete_state_{i}", DISCRETE, i, (context.get_discrete_state(i).size(),))
     for i in range(context.num_numeric_parameter_groups()):
         size = context.get_numeric_parameter(i).size()
-        # The value of a constant source is what it puts out.
+        # The parameter of a constant source is its output value.
         name = "value" if isinstance(system, ConstantVectorSource) else f"parameter_{i}"
         yield Element(name, PARAMETER, i, (size,))
 
@@ -212,7 +212,7 @@ def collect(
     Args:
         plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to
             that instance. By default the path of the plant.
-        skip: says of the path of a leaf system whether its variables are left out.
+        skip: selects the leaf systems whose variables are left out, by path.
         extra: further variables of the diagram.
     """
     plant_prefix = plant_prefix or (lambda path, instance: path)
@@ -222,7 +222,7 @@ def collect(
     by_demand: dict[str, Callable[[], Variable]] = {}
     for path, system in systems:
         if is_plant(system):
-            # They need the modules that such a system has brought with it.
+            # Imported here: heavy, and already imported where there is a plant.
             from vtbdrake.state.multibody import friction_variables, multibody_variables, pose_entries_by_demand
 
             prefix = _prefix_of(plant_prefix, path)

@@ -107,7 +107,7 @@ class Variable:
         """Check ``value`` and write it into ``context``.
 
         Raises:
-            VariableError: as `check`, or the value is refused by what it is written to.
+            VariableError: as `check`, or Drake rejects the value.
         """
         array = self.check(value)
         assert self.write is not None

@@ -8,14 +8,14 @@ from vtbdrake.testbed.scenario import Scenario, ScenarioError
 from vtbdrake.testbed.scenario_file import load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.slow_part import SlowPart, slow_parts
-from vtbdrake.testbed.switch import Command
+from vtbdrake.testbed.switch import ActuatorCommand
 from vtbdrake.testbed.testbed import VirtualTestbed
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.hardware_sim import HardwareSimScenario
 
 __all__ = [
-    "Command",
+    "ActuatorCommand",
     "DpsAlone",
     "HardwareSimScenario",
     "Interface",

@@ -77,7 +77,7 @@ class AddressedDiagram:
         """Return a new context: s0 from defaults."""
         context = self.diagram.CreateDefaultContext()
         if self.simulator_config.use_error_control:
-            # Drake looks here for how exactly an event that depends on the state (a foot that lands) is to be found.
+            # Drake uses it to find the time of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
         return context
 

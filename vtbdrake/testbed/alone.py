@@ -109,7 +109,7 @@ def _without_plant(config: SimulatorConfig) -> SimulatorConfig:
 
 
 class WorldAlone(AddressedDiagram):
-    """The simulated world of a scenario without its DPS: what is left of the testbed when `DpsAlone` is taken away.
+    """The simulated world of a scenario without its DPS: the complement of `DpsAlone`.
 
     Its variables have the addresses that they have in the testbed.
 
@@ -158,10 +158,10 @@ class WorldAlone(AddressedDiagram):
         """Return a new context: s0 from defaults, every actuator with its idle command."""
         context = super().default_context()
         for signal in self.interface.act:
-            self.command(context, signal.name, signal.idle)
+            self.actuate(context, signal.name, signal.idle)
         return context
 
-    def command(self, context: Context, name: str, value: Any) -> None:
+    def actuate(self, context: Context, name: str, value: Any) -> None:
         """Give the simulated actuator ``name`` a command, which lasts until the next one.
 
         Args:

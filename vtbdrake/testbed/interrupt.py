@@ -38,7 +38,7 @@ class Interruptible:
             self._handler(number, frame)
         except BaseException as error:
             self._raised = error
-            # At once, as this may be raised where the block ends, before `__exit__` comes to it.
+            # At once: this may be raised at the end of the block, before `__exit__` restores the handler.
             signal.signal(signal.SIGINT, self._handler)
             raise
 

@@ -72,7 +72,7 @@ class Scenario(ABC):
             return NotImplemented
         return dict(_flat(self)) == dict(_flat(other))
 
-    # It can change.
+    # Scenarios are mutable.
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:

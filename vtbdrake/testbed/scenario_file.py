@@ -150,7 +150,7 @@ def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
 
 
 def _resolve_types(schema: type) -> None:
-    # Drake's reader wants the types of fields; `from __future__ import annotations` leaves their names.
+    # Drake's reader needs types; `from __future__ import annotations` leaves their names.
     hints = get_type_hints(schema)
     for item in fields(schema):
         item.type = hints[item.name]
@@ -210,7 +210,7 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
         below = f"{name}.{key.value}".lstrip(".")
         if expected is None:  # A dict, say.
             _refuse_unknown(value, inside, below)
-        elif key.value == "<<":  # Keys that are taken over from elsewhere in the file.
+        elif key.value == "<<":  # Keys merged from elsewhere in the file.
             for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
                 _refuse_unknown(merged, expected, name)
         elif key.value in known:

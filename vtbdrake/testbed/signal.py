@@ -31,8 +31,8 @@ class Signal:
         rate: the largest change per second of an entry.
         acceleration: the largest change per second of that change.
         max_age: in seconds; an older sample is stale.
-        idle: actuator signals: what the simulated actuator gets while the real one is driven.
-        default: commands: the value until another one is given; zeros if left out.
+        idle: of actuator signals: the command of the simulated actuator while the real one is driven.
+        default: of commands: the value until another one is given; zeros if left out.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Signal:
             try:
                 self.check_value(self.idle)
             except SignalError as error:
-                raise SignalError(f"the idle command does not fit: {error}") from None
+                raise SignalError(f"the idle value does not fit: {error}") from None
 
     @property
     def is_vector(self) -> bool:
@@ -137,7 +137,7 @@ class Signal:
                 raise SignalError(f"signal {self.name} has {self.size} entries, not the shape {array.shape}")
             if np.isnan(array).any():
                 raise SignalError(
-                    f"signal {self.name}: entry {int(np.argmax(np.isnan(array)))} is NaN; what is not known is not fed"
+                    f"signal {self.name}: entry {int(np.argmax(np.isnan(array)))} is NaN: do not feed unknown values"
                 )
             return
         model = self.abstract_value().get_value()
@@ -198,7 +198,7 @@ class Interface:
     """All signals of a DPS: sensor signals in, actuator signals out, commands u in.
 
     Raises:
-        SignalError: two signals have one name, an actuator signal has no idle command, or a command is abstract.
+        SignalError: two signals have one name, an actuator signal has no idle value, or a command is abstract.
     """
 
     sense: Sequence[Signal]
@@ -216,8 +216,8 @@ class Interface:
         for signal in self.act:
             if signal.idle is None:
                 raise SignalError(
-                    f"actuator signal {signal.name} has no idle command: give idle=, what its simulated actuator gets "
-                    "while the real one is driven"
+                    f"actuator signal {signal.name} has no idle value: give idle=, the command of its simulated "
+                    "actuator while the real one is driven"
                 )
         for signal in self.commands:
             if not signal.is_vector:
@@ -238,8 +238,8 @@ class Interface:
 class Feed:
     """Input ports of one context, by signal, which carry what they were given last.
 
-    A value that was fixed once is changed in place afterwards, which costs a microsecond or two. A vector's numbers are
-    written through a view of them that is kept; `GetMutableData` must say each time, before, that they change.
+    After the first time, a value is changed in place, which takes one or two microseconds. `GetMutableData` must be
+    called before each change, to invalidate caches; the view of a vector's numbers can be kept.
     """
 
     def __init__(self, ports: Mapping[str, tuple[Signal, InputPort]], context: Context) -> None:

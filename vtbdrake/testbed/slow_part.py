@@ -49,7 +49,7 @@ class SlowFunction:
         """Return the arrays of the outputs and the memory, for those of the inputs and the memory.
 
         Raises:
-            SlowPartError: the function did not return what it should; what it raises itself passes.
+            SlowPartError: the function did not return what it declares. Its own exceptions pass.
         """
         codecs = {**self.inputs, **self.memory}
         result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
@@ -192,8 +192,8 @@ PROGRESS_CODEC = Codec(_encode, _decode)
 
 
 MOST_UNDER_WAY = 16
-# Drake now and then leaves out a periodic event that has an offset, when a simulation is advanced to just that time:
-# its (t - offset) / period is rounded up. What is a little early is not left out; and what is due is there in time.
+# Drake sometimes skips a periodic event with an offset when a simulation is advanced to exactly its time, because
+# (t - offset) / period is rounded up. Events that are a little early are not skipped, and results are there in time.
 _EARLY = 1e-8  # s
 _SHORTEST = 1e-6  # s
 _SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
@@ -222,7 +222,7 @@ class SlowPart(LeafSystem):
     stay as they are. What has neither come nor been declared missing is computed here: so a copy of a running context
     goes on by itself.
 
-    All that it knows lies in its context, as arrays: the samples and results under way, latency / period of them, and
+    All its memory lies in its context, as arrays: the samples and results under way, latency / period of them, and
     the memory.
 
     Args:
@@ -235,7 +235,7 @@ class SlowPart(LeafSystem):
         memory: what the function remembers from one call to the next, at first: it is the argument ``memory``, and
             the function returns ``(outputs, memory)``. A call begins with the memory of the last one whose result has
             come, be it too late to be shown.
-        codecs: by port name or ``memory``, how values become arrays, where `codec_of` knows no way.
+        codecs: by port name or ``memory``, how values become arrays, where `codec_of` has no codec.
         patience: after how many latencies without an answer a runtime ends the other process, and starts another.
 
     Attributes:
@@ -320,7 +320,7 @@ class SlowPart(LeafSystem):
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
         progress: Progress = value.get_value()
         tick = round((context.get_time() - self.offset) / self.period)
-        # The events of an instant are repeated after an exception in one of them.
+        # After an exception in one of them, the events of an instant are repeated.
         if progress.find(tick) is None:
             sample = {name: port.Eval(context) for name, port in self._inputs.items()}
             work = Work(tick, WAITING, encode(sample, self.function.inputs))

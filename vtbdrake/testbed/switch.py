@@ -47,7 +47,7 @@ def SwitchBoard_(T: type) -> type:
 
         name: SwitchBoard
         output_ports:
-        - <switch> (InputPortIndex, as the selector port of a PortSwitch wants it)
+        - <switch> (InputPortIndex, for the selector port of a PortSwitch)
         - <constant>
         - active (1 for every actuator signal whose switch lets it command, else 0)
     """
@@ -229,7 +229,7 @@ class Switches:
         return output
 
     def _gate(self, switch: str, signal: Signal, command: OutputPort) -> OutputPort:
-        gate = self._builder.AddNamedSystem(f"{switch}.real", CommandGate(signal, _port(ACT_POSITIONS, SIM)))
+        gate = self._builder.AddNamedSystem(f"{switch}.real", ActuatorGate(signal, _port(ACT_POSITIONS, SIM)))
         self._builder.Connect(self._board.GetOutputPort(switch), gate.GetInputPort("port_selector"))
         self._builder.Connect(command, gate.GetInputPort("command"))
         return gate.get_output_port()
@@ -250,7 +250,7 @@ class Switches:
 
 
 @dataclass(frozen=True)
-class Command:
+class ActuatorCommand:
     """A value of the port ``real.act.<signal>`` of an abstract signal: a command, or none (``value`` is None)."""
 
     value: Any = None
@@ -290,13 +290,14 @@ class AbstractSwitch(LeafSystem):
         output.SetFrom(self.EvalAbstractInput(context, int(selected)))
 
 
-class CommandGate(LeafSystem):
-    """A gate before the real port of an abstract actuator signal: its output is a `Command`, empty while the switch is
-    at port ``closed``.
+class ActuatorGate(LeafSystem):
+    """A gate before the real port of an abstract actuator signal, with an `ActuatorCommand` as output.
+
+    The command is empty while the switch is at port ``closed``.
 
     .. pydrake_system::
 
-        name: CommandGate
+        name: ActuatorGate
         input_ports:
         - port_selector
         - command
@@ -313,11 +314,11 @@ class CommandGate(LeafSystem):
         self._command = self.DeclareAbstractInputPort("command", signal.abstract_value())
         self.DeclareAbstractOutputPort(
             "value",
-            lambda: Value(Command()),
-            weakly(self, CommandGate._calc),
+            lambda: Value(ActuatorCommand()),
+            weakly(self, ActuatorGate._calc),
             prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         closed = self._selector.Eval(context) == self._closed
-        output.set_value(Command() if closed else Command(self._command.Eval(context)))
+        output.set_value(ActuatorCommand() if closed else ActuatorCommand(self._command.Eval(context)))

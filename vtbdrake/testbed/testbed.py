@@ -72,7 +72,7 @@ class Belief:
         return self.by(*estimates) if self.by is not None else estimates[0]
 
 
-# Mode -> where (T_sense, T_act) stand.
+# Mode -> positions of (T_sense, T_act).
 MODES = {"sim": (SIM, SIM), "shadow": (REAL, SIM), "real": (REAL, REAL), "twin": (REAL, TWIN)}
 
 
@@ -92,7 +92,7 @@ class VirtualTestbed(AddressedDiagram):
     Attributes:
         diagram: input ports ``real.sense.<signal>``; output ports ``real.act.<signal>`` and ``real.act.active`` (1
             for every actuator signal that commands, else 0). While an actuator signal's switch is on sim, its real
-            port carries no command: NaN, or an empty `Command` for an abstract signal. No system in it touches
+            port carries no command: NaN, or an empty `ActuatorCommand` for an abstract signal. No system in it touches
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
         dps: the data processing system, a direct subsystem of the diagram.
         plant, scene_graph: of the simulated world, if it has them.
@@ -240,7 +240,7 @@ class VirtualTestbed(AddressedDiagram):
     def start_from_belief(self, context: Context) -> None:
         """Set the simulated world to what the DPS in ``context`` believes: s_sim(t0) from s_dps(t).
 
-        An estimate beyond the bounds of what it is about (a joint a little past its stop) is taken to the bound.
+        An estimate beyond the bounds of its target (a joint a little past its stop) is clipped.
 
         Raises:
             ValueError: the testbed declares no belief, or a variable refuses what is believed of it.

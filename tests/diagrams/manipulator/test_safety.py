@@ -149,7 +149,7 @@ class GuardedArm:
         verdict = self.guards.check(now, self.receptions, {"joint_torque": gravity(self.pose)}, **options)
         self.guards.note_unsent(())
         if "joint_torque" in verdict.actuation:
-            WORLD.command(self.context, "joint_torque", verdict.actuation["joint_torque"])
+            WORLD.actuate(self.context, "joint_torque", verdict.actuation["joint_torque"])
         self.cycles += 1
         self.simulator.AdvanceTo(self.cycles * T)
         return verdict

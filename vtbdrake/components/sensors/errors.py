@@ -49,7 +49,7 @@ class ErrorModel:
     bias: float = 0.0
     # Standard deviation of the random walk after one second, in the signal's unit per root second.
     drift: float = 0.0
-    # Distance of two values that the sensor can tell apart; 0 is infinitely fine.
+    # Resolution of the sensor; 0 is infinitely fine.
     quantization: float = 0.0
     # Age of a sample when it is shown, in whole periods.
     latency: int = 0

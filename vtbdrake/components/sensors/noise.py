@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-# A generator costs more than what it draws: many ticks have one in common.
+# A generator costs more than its samples: many ticks share one.
 _BATCH = 512
 _KEPT = 128
 
