@@ -107,7 +107,7 @@ class Deployment:
             )
         check_continuity(interface, self.continuity)
         for name in (signal.name for signal in interface.act):
-            if guards.needs_start(name) and name not in self.continuity:
+            if guards.limiters[name].needs_start and name not in self.continuity:
                 raise ValueError(
                     f"the actuator signal {name} has a limited rate or acceleration, but no measurement to start from: "
                     f"give continuity={{{name!r}: (sensor signal, largest difference)}}"

@@ -162,7 +162,7 @@ def test_a_second_publisher_is_waited_for_before_the_switch_and_an_alarm_after_i
         program.send_signal(signal.SIGINT)
         output, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 0, errors
-    assert "ALARM: somebody else published commands to the machine, too" in output
+    assert "ALARM: other publishers commanded the machine, too" in output
 
 
 def may_have_priority() -> bool:

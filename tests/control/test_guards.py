@@ -65,7 +65,7 @@ def test_without_a_fault_the_limited_commands_go_out() -> None:
     verdict = loop.cycle({"torque": [0.05, 4.0], "position": [1e-6]})
     assert verdict.ok and not verdict.faults
     assert {name: c.tolist() for name, c in verdict.actuation.items()} == {"torque": [0.05, 0.1], "position": [1e-6]}
-    assert loop.guards.limiters["torque"].counts["rate"].count == 1
+    assert loop.guards.limiters["torque"].counts["rate"].changed == 1
 
 
 FAULTS: list[tuple[dict[str, Any], dict[str, Any], tuple[str | None, str]]] = [
@@ -174,7 +174,7 @@ def test_command_of_a_faulty_cycle_leaves_no_trace_in_the_limits() -> None:
 def test_reset_is_refused_while_the_cause_persists() -> None:
     loop = Loop(TORQUE)
     loop.cycle({"torque": [nan, 0.0]})
-    assert loop.reset() == ("the command torque is not finite: [nan, 0.0]",)
+    assert loop.reset() == ("the actuator command torque is not finite: [nan, 0.0]",)
     assert not loop.cycle({"torque": [0.05, 0.0]}).ok
     assert loop.reset() == ()
     verdict = loop.cycle({"torque": [0.05, 0.0]})
@@ -200,7 +200,7 @@ def test_reset_names_all_causes() -> None:
     assert loop.reset() == (
         "20 deadlines were missed in a row, 10 are allowed",
         "the machine is not ready: it is off",
-        "the command torque has the shape (1,) instead of (2,)",
+        "the actuator command torque has the shape (1,) instead of (2,)",
         "sensor signal velocity has never arrived",
     )
 
@@ -241,7 +241,7 @@ def test_latch_outlasts_a_switch_to_sim() -> None:
 
 def test_limited_signal_that_was_not_started_is_not_sent() -> None:
     loop = Loop(TORQUE, start=False)
-    assert loop.guards.needs_start("torque")
+    assert loop.guards.limiters["torque"].needs_start
     verdict = loop.cycle({"torque": [0.0, 0.0]})
     assert kinds(verdict) == [("torque", "not started")] and verdict.actuation == {}
     loop.guards.start("torque", [0.0, 0.0])
@@ -343,7 +343,7 @@ def test_commands_that_cannot_be_sent_for_long_are_a_fault_until_one_is() -> Non
         loop.guards.note_unsent(("torque",))
     verdict = loop.cycle({"torque": [1.0, 1.0]})
     assert kinds(verdict) == [("torque", "not sent")]
-    assert loop.reset() == ("the last 11 commands torque could not be sent",)
+    assert loop.reset() == ("the last 11 actuator commands torque could not be sent",)
     loop.guards.note_unsent(())
     loop.cycle({"torque": [1.0, 1.0]})
     assert loop.reset() == ()

@@ -1,16 +1,17 @@
-"""Commands leave a guard within all limits, and are left alone where they keep to them."""
+"""Limits of values: bounds and jumps agree with numpy; the rate limiter keeps all limits and changes nothing else."""
 
 from __future__ import annotations
 
 import math
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vtbdrake.control.limits import CommandFault, CommandLimiter, PassThrough
+from vtbdrake.control.limits import ActuationError, Bounds, JumpBounds, PassThrough, RateLimiter
 from vtbdrake.testbed import Signal
 
 T = 1e-3
@@ -21,8 +22,8 @@ def signal(size: int = 1, **limits: object) -> Signal:
     return Signal("joint_position", size=size, unit="rad", idle=0.0, **limits)
 
 
-def guard(start: float | None = 0.0, **limits: object) -> CommandLimiter:
-    made = CommandLimiter(signal(**limits), period=T)
+def limiter(start: float | None = 0.0, **limits: object) -> RateLimiter:
+    made = RateLimiter(signal(**limits), period=T)
     if start is not None:
         made.start_from([start])
     return made
@@ -66,7 +67,7 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
     start: float,
     commands: list[tuple[float, int]],
 ) -> None:
-    one = guard(None, rate=rate, acceleration=acceleration, lower=lower, upper=upper)
+    one = limiter(None, rate=rate, acceleration=acceleration, lower=lower, upper=upper)
     one.start_from([start])
     before = min(max(start, lower), upper)
     step_before = 0.0
@@ -90,7 +91,7 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
 )
 def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int) -> None:
     a, rate = acceleration * T**2, 5.0
-    one = guard(rate=rate, acceleration=acceleration, upper=upper)
+    one = limiter(rate=rate, acceleration=acceleration, upper=upper)
     position, step = 0.0, 0.0
     for _ in range(waits):
         sent = one.limit([1e6]).item()
@@ -105,7 +106,7 @@ def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
     acceleration: float, upper: float, excess: float
 ) -> None:
     a, rate = acceleration * T**2, 5.0
-    one = guard(rate=rate, acceleration=acceleration, upper=upper)
+    one = limiter(rate=rate, acceleration=acceleration, upper=upper)
     position, step = 0.0, 0.0
     for _ in range(100):
         most = min(rate * T, step + a, longest_step(upper - position, a))
@@ -115,7 +116,7 @@ def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
 
 
 def test_command_at_the_last_place_to_stop_passes_without_rounding() -> None:
-    one = guard(-1.0, acceleration=1.0 / T**2, upper=0.0)
+    one = limiter(-1.0, acceleration=1.0 / T**2, upper=0.0)
     assert one.limit([-1e-300]).item() == -1e-300
 
 
@@ -123,7 +124,7 @@ def test_command_at_the_last_place_to_stop_passes_without_rounding() -> None:
 def test_sequence_that_can_go_on_for_ever_passes_unchanged(shares: list[float]) -> None:
     rate, acceleration, bound = 0.5, 20.0, 0.002
     a = acceleration * T**2
-    one = guard(rate=rate, acceleration=acceleration, lower=-bound, upper=bound)
+    one = limiter(rate=rate, acceleration=acceleration, lower=-bound, upper=bound)
     s, x = 0.0, 0.0
     for share in shares:
         most = min(rate * T, x + a, longest_step(bound - s, a))
@@ -131,12 +132,12 @@ def test_sequence_that_can_go_on_for_ever_passes_unchanged(shares: list[float]) 
         command = s + 0.5 * (most + least) + 0.5 * share * (most - least)
         assert one.limit([command]).item() == command
         s, x = command, command - s
-    assert [count.count for count in one.counts.values()] == [0, 0, 0]
+    assert [count.changed for count in one.counts.values()] == [0, 0, 0]
 
 
 def test_motion_from_end_to_end_of_the_range_passes_unchanged() -> None:
     bound, frequency = 0.3, 4.0
-    one = guard(
+    one = limiter(
         -bound, rate=1.01 * bound * frequency, acceleration=1.01 * bound * frequency**2, lower=-bound, upper=bound
     )
     for k in range(2000):
@@ -145,7 +146,7 @@ def test_motion_from_end_to_end_of_the_range_passes_unchanged() -> None:
 
 
 def test_step_command_takes_the_time_of_full_acceleration_and_full_braking() -> None:
-    one = guard(rate=inf, acceleration=10.0, upper=0.4)
+    one = limiter(rate=inf, acceleration=10.0, upper=0.4)
     sent = [one.limit([1.0]).item() for _ in range(1000)]
     first_at_end = next(k for k, s in enumerate(sent, 1) if s >= 0.4 - 1e-9)
     assert first_at_end * T == pytest.approx(2.0 * math.sqrt(0.4 / 10.0), abs=2 * T)
@@ -153,7 +154,7 @@ def test_step_command_takes_the_time_of_full_acceleration_and_full_braking() -> 
 
 
 def test_speed_at_a_distance_from_the_end_is_that_of_constant_braking() -> None:
-    one = guard(rate=inf, acceleration=10.0, upper=0.4)
+    one = limiter(rate=inf, acceleration=10.0, upper=0.4)
     before = 0.0
     while (sent := one.limit([1.0]).item()) < 0.3:
         before = sent
@@ -161,7 +162,7 @@ def test_speed_at_a_distance_from_the_end_is_that_of_constant_braking() -> None:
 
 
 def test_hold_after_motion_brakes_at_the_limit_of_acceleration() -> None:
-    one = guard(rate=1.0, acceleration=10.0)
+    one = limiter(rate=1.0, acceleration=10.0)
     for _ in range(50):
         one.limit([10.0])
     steps = []
@@ -173,38 +174,38 @@ def test_hold_after_motion_brakes_at_the_limit_of_acceleration() -> None:
 
 
 def test_entries_have_limits_of_their_own() -> None:
-    one = CommandLimiter(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
+    one = RateLimiter(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
     one.start_from([0.0, 0.5, 0.0])
     assert one.limit([1.0, -1.0, 2.0]).tolist() == [1e-3, 0.5 - 2e-3, 0.5]
 
 
 def test_counts_tell_how_often_and_by_how_much_each_limit_acted() -> None:
-    one = guard(rate=1.0, upper=0.0015)
+    one = limiter(rate=1.0, upper=0.0015)
     one.limit([0.0005])
     one.limit([0.1])
     one.limit([0.2])
-    assert {name: count.count for name, count in one.counts.items()} == {"range": 1, "rate": 1, "acceleration": 0}
+    assert {name: count.changed for name, count in one.counts.items()} == {"range": 1, "rate": 1, "acceleration": 0}
     assert one.counts["rate"].largest == pytest.approx(0.1 - 0.0015)
     assert one.counts["range"].largest == pytest.approx(0.2 - 0.0015)
 
 
 def test_limit_of_acceleration_counts() -> None:
-    one = guard(acceleration=10.0)
+    one = limiter(acceleration=10.0)
     one.limit([1.0])
-    assert one.counts["acceleration"].count == 1
+    assert one.counts["acceleration"].changed == 1
     assert one.counts["acceleration"].largest == pytest.approx(1.0 - 1e-5)
 
 
 def test_rounding_of_a_command_at_its_limit_does_not_count() -> None:
-    one = guard(rate=0.7)
+    one = limiter(rate=0.7)
     for k in range(1, 1000):
         command = 0.7 * k * T
         assert one.limit([command]).item() == pytest.approx(command, rel=1e-14)
-    assert one.counts["rate"].count == 0
+    assert one.counts["rate"].changed == 0
 
 
 def test_start_is_left_at_rest_whatever_the_motion_before() -> None:
-    one = guard(acceleration=10.0)
+    one = limiter(acceleration=10.0)
     for _ in range(100):
         one.limit([1.0])
     one.start_from([0.3])
@@ -213,36 +214,36 @@ def test_start_is_left_at_rest_whatever_the_motion_before() -> None:
 
 @pytest.mark.parametrize(("limits"), [{"rate": 1.0}, {"acceleration": 1.0}])
 def test_limited_rate_without_a_start_is_a_fault(limits: dict[str, float]) -> None:
-    one = guard(None, **limits)
+    one = limiter(None, **limits)
     assert one.needs_start and not one.has_start
-    with pytest.raises(CommandFault, match="no start") as caught:
+    with pytest.raises(ActuationError, match="nothing to depart from") as caught:
         one.limit([0.0])
     assert caught.value.kind == "not started"
 
 
 def test_range_alone_needs_no_start() -> None:
-    one = guard(None, lower=-1.0, upper=1.0)
+    one = limiter(None, lower=-1.0, upper=1.0)
     assert [one.limit([c]).item() for c in (3.0, -0.5, -2.0)] == [1.0, -0.5, -1.0]
 
 
 def test_released_guard_forgets_what_was_sent() -> None:
-    one = guard(rate=1.0)
+    one = limiter(rate=1.0)
     one.release()
     assert one.last_sent is None and not one.has_start
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 def test_entry_that_is_not_finite_is_a_fault_and_changes_nothing(bad: float) -> None:
-    one = CommandLimiter(signal(2, rate=1.0), period=T)
+    one = RateLimiter(signal(2, rate=1.0), period=T)
     one.start_from([0.0, 0.0])
-    with pytest.raises(CommandFault, match="not finite") as caught:
+    with pytest.raises(ActuationError, match="not finite") as caught:
         one.limit([1.0, bad])
     assert caught.value.kind == "not finite"
     assert one.last_sent.tolist() == [0.0, 0.0]
 
 
 def test_large_finite_entries_are_finite() -> None:
-    one = CommandLimiter(signal(2, lower=-1.0, upper=1.0), period=T)
+    one = RateLimiter(signal(2, lower=-1.0, upper=1.0), period=T)
     assert one.limit([1.7e308, 1.7e308]).tolist() == [1.0, 1.0]
 
 
@@ -250,8 +251,8 @@ def test_large_finite_entries_are_finite() -> None:
     "bad", [[0.0], [0.0, 0.0, 0.0], 0.0, [[0.0, 0.0]], None, "ab", [0.0, "x"], [[0.0], [1.0, 2.0]]]
 )
 def test_command_of_another_size_is_a_fault(bad: object) -> None:
-    one = CommandLimiter(signal(2), period=T)
-    with pytest.raises(CommandFault) as caught:
+    one = RateLimiter(signal(2), period=T)
+    with pytest.raises(ActuationError) as caught:
         one.limit(bad)
     assert caught.value.kind == "size"
 
@@ -259,19 +260,102 @@ def test_command_of_another_size_is_a_fault(bad: object) -> None:
 @pytest.mark.parametrize("period", [0.0, -1.0, nan, inf])
 def test_period_must_be_positive(period: float) -> None:
     with pytest.raises(ValueError, match="positive period"):
-        CommandLimiter(signal(), period=period)
+        RateLimiter(signal(), period=period)
 
 
 def test_limits_that_leave_no_step_are_refused() -> None:
     with pytest.raises(ValueError, match="leave no step"):
-        CommandLimiter(signal(acceleration=1e-300), period=T)
+        RateLimiter(signal(acceleration=1e-300), period=T)
 
 
 def test_abstract_signal_has_no_limits_but_remembers() -> None:
     picture = Signal("lamp", model_value="off", idle="off")
     with pytest.raises(ValueError, match="abstract"):
-        CommandLimiter(picture, period=T)
-    one = PassThrough(picture)
+        RateLimiter(picture, period=T)
+    one = PassThrough()
     assert one.limit("on") == "on" and one.last_sent == "on"
-    with pytest.raises(CommandFault):
+    with pytest.raises(ActuationError):
         one.limit(None)
+
+
+# -- bounds of values
+
+VECTOR = st.lists(st.floats(-2.0, 2.0) | st.sampled_from([nan, inf, -inf]), min_size=3, max_size=3)
+BOUND = st.lists(st.floats(-2.0, 2.0) | st.sampled_from([inf, -inf]), min_size=3, max_size=3)
+
+
+@given(BOUND, VECTOR, BOUND)
+def test_bounds_agree_with_numpy(lower: list[float], entries: list[float], upper: list[float]) -> None:
+    lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
+    bounds = Bounds(Signal("a", size=3, lower=lower, upper=upper))
+    finite = np.isfinite(entries).all()
+    expected = (
+        "" if finite and ((lower <= entries) & (entries <= upper)).all() else "limits" if finite else "not finite"
+    )
+    assert bounds.check(np.array(entries)) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ([0.5, 0.5], ""),
+        ((0.5, 9.0), "limits"),
+        (np.ones(2, dtype=np.float32), ""),
+        (np.ones(2, dtype=">f8"), ""),
+        (np.ones(4)[::2], ""),
+        (np.ones((2, 1)), "size"),
+        (np.array(1.0), "size"),
+        (np.ones(3), "size"),
+        ([1.0, "x"], "type"),
+        ([[1.0], [1.0, 2.0]], "type"),
+        (None, "size"),
+    ],
+)
+def test_values_that_are_not_plain_arrays_are_converted_first(value: Any, problem: str) -> None:
+    assert Bounds(Signal("a", size=2, lower=-1.0, upper=1.0)).check(value) == problem
+
+
+def test_read_only_array_is_a_value() -> None:
+    value = np.ones(2)
+    value.flags.writeable = False
+    assert Bounds(Signal("a", size=2)).check(value) == ""
+    assert RateLimiter(signal(2), period=T).limit(value).tolist() == [1.0, 1.0]
+
+
+def test_abstract_value_has_its_type() -> None:
+    bounds = Bounds(Signal("picture", model_value="", idle=""))
+    assert [bounds.check(value) for value in ("cat", 1.0)] == ["", "type"]
+
+
+def test_bounds_of_equal_signals_are_equal() -> None:
+    wide, narrow = Signal("a", size=2, upper=2.0), Signal("a", size=2, upper=1.0)
+    assert Bounds(wide) == Bounds(Signal("b", size=2, upper=[2.0, 2.0])) != Bounds(narrow)
+    assert Bounds(Signal("a", model_value="", idle="")) != Bounds(wide)
+
+
+@given(VECTOR, VECTOR, st.floats(0.0, 1.0))
+def test_jump_bounds_agree_with_numpy(before: list[float], value: list[float], seconds: float) -> None:
+    rate, tolerance = np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.0, 1.0])
+    with np.errstate(invalid="ignore"):
+        expected = (abs(np.subtract(value, before)) <= rate * seconds + tolerance).all()
+    assert JumpBounds(rate, tolerance).contains(np.array(before), np.array(value), seconds) == expected
+
+
+def test_jump_bounds_of_different_sizes_are_rejected() -> None:
+    with pytest.raises(ValueError, match="different sizes: 3 and 1"):
+        JumpBounds([1.0] * 3, [0.0])
+
+
+# -- commands that did not leave
+
+
+@given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.booleans()), max_size=40))
+def test_command_taken_back_leaves_no_trace(commands: list[tuple[float, bool]]) -> None:
+    one, other = (limiter(rate=50.0, acceleration=1e4, upper=0.5) for _ in range(2))
+    for command, leaves in commands:
+        sent = one.limit([command])
+        if leaves:
+            assert other.limit([command]) == sent
+        else:
+            one.take_back()
+        assert one.last_sent == other.last_sent

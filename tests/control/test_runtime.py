@@ -408,7 +408,9 @@ def test_a_second_publisher_of_commands_is_an_alarm_and_blocks_the_switch_to_rea
     assert runtime.guards.latched == () and len(bridge.sent) == 10
     assert runtime.prepare("real").reasons == ()
     assert runtime.statistics.foreign == 1
-    assert "ALARM: somebody else published commands to the machine, too: 1 were heard" in str(runtime.statistics)
+    assert "ALARM: other publishers commanded the machine, too: 1 of their commands were heard" in str(
+        runtime.statistics
+    )
     [record] = [record for record in caplog.records if "ALARM" in record.message]
     assert "somebody else commands (heard so far: 1)" in record.message
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.limits import ValueRange
-from vtbdrake.control.sensor_monitor import SensorMonitor
+from vtbdrake.control.kernels import check_all
+from vtbdrake.control.limits import Bounds
+from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
 from vtbdrake.testbed import Signal
 
 
@@ -21,26 +23,26 @@ def received(value: object, arrived: float = 0.0, count: int = 1) -> ReceivedSig
     return ReceivedSignal(value=value, arrived=arrived, count=count)
 
 
-def kind(watchdog: SensorMonitor, now: float, reception: ReceivedSignal) -> str | None:
-    fault = watchdog.check(now, reception)
+def kind(monitor: SensorMonitor, now: float, signal: ReceivedSignal) -> str | None:
+    fault = monitor.check(now, signal)
     return fault and fault.kind
 
 
 @pytest.mark.parametrize("max_age", [0.05, inf])
 def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
-    watchdog = SensorMonitor(Signal("encoders", size=2, max_age=max_age))
-    fault = watchdog.check(7.0, ReceivedSignal())
+    monitor = SensorMonitor(Signal("encoders", size=2, max_age=max_age))
+    fault = monitor.check(7.0, ReceivedSignal())
     assert (fault.kind, fault.signal, fault.time) == ("stale", "encoders", 7.0)
     assert "never arrived" in str(fault)
 
 
 def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
-    watchdog, reception = SensorMonitor(signal()), received(np.zeros(2), arrived=1.0)
-    assert kind(watchdog, 1.0499, reception) is None
-    fault = watchdog.check(1.0625, reception)
+    monitor, sample = SensorMonitor(signal()), received(np.zeros(2), arrived=1.0)
+    assert kind(monitor, 1.0499, sample) is None
+    fault = monitor.check(1.0625, sample)
     assert fault.kind == "stale" and fault.reason == "sensor signal encoders is stale: 62.5 ms old, 50 allowed"
-    reception.arrived, reception.count = 1.0625, 2
-    assert kind(watchdog, 1.0625, reception) is None
+    sample.arrived, sample.count = 1.0625, 2
+    assert kind(monitor, 1.0625, sample) is None
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
@@ -56,10 +58,10 @@ def test_entry_that_is_not_finite_is_implausible_without_limits_too(bad: float, 
 def test_entry_beyond_its_limit_is_implausible(size: int) -> None:
     upper = np.ones(size)
     upper[-1] = 2.0
-    watchdog = SensorMonitor(signal(size, lower=-1.0, upper=upper))
-    assert kind(watchdog, 0.0, received(upper)) is None
-    assert kind(watchdog, 0.0, received(1.001 * upper, count=2)) == "implausible"
-    assert kind(watchdog, 0.0, received(np.full(size, -1.001), count=3)) == "implausible"
+    monitor = SensorMonitor(signal(size, lower=-1.0, upper=upper))
+    assert kind(monitor, 0.0, received(upper)) is None
+    assert kind(monitor, 0.0, received(1.001 * upper, count=2)) == "implausible"
+    assert kind(monitor, 0.0, received(np.full(size, -1.001), count=3)) == "implausible"
 
 
 @pytest.mark.parametrize("value", [np.zeros(1), np.zeros(3), np.zeros((1, 2))])
@@ -68,14 +70,14 @@ def test_sample_of_another_size_is_implausible(value: np.ndarray) -> None:
 
 
 def test_implausible_sample_is_a_fault_until_the_next_one() -> None:
-    watchdog, reception = SensorMonitor(signal(upper=1.0)), received(np.array([0.0, 2.0]))
-    assert [kind(watchdog, now, reception) for now in (0.0, 0.01)] == ["implausible"] * 2
-    reception.value, reception.count = np.zeros(2), 2
-    assert kind(watchdog, 0.02, reception) is None
+    monitor, sample = SensorMonitor(signal(upper=1.0)), received(np.array([0.0, 2.0]))
+    assert [kind(monitor, now, sample) for now in (0.0, 0.01)] == ["implausible"] * 2
+    sample.value, sample.count = np.zeros(2), 2
+    assert kind(monitor, 0.02, sample) is None
 
 
 def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
-    watchdog = SensorMonitor(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
+    monitor = SensorMonitor(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
     at = [
         received(np.array([0.0, 0.0]), 0.00, 1),
         received(np.array([0.09, 0.0105]), 0.01, 2),
@@ -84,82 +86,82 @@ def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
         received(np.array([-0.32, 0.0315]), 0.04, 5),
         received(np.array([-0.32, 0.0315]), 0.08, 6),
     ]
-    assert [kind(watchdog, r.arrived, r) for r in at] == [None, None, "jump", None, "jump", None]
-    assert (watchdog.value.tolist(), watchdog.arrived) == ([-0.32, 0.0315], 0.08)
+    assert [kind(monitor, r.arrived, r) for r in at] == [None, None, "jump", None, "jump", None]
+    assert (monitor.value.tolist(), monitor.arrived) == ([-0.32, 0.0315], 0.08)
 
 
 def test_false_level_is_not_accepted_by_being_repeated() -> None:
-    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
-    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
+    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 500):
-        assert kind(watchdog, 0.001 * k, received(np.full(2, 0.1), 0.001 * k, k)) == "jump"
-    assert watchdog.value.tolist() == [0.0, 0.0]
-    assert kind(watchdog, 0.5, received(np.full(2, 0.02), 0.5, 500)) is None
+        assert kind(monitor, 0.001 * k, received(np.full(2, 0.1), 0.001 * k, k)) == "jump"
+    assert monitor.value.tolist() == [0.0, 0.0]
+    assert kind(monitor, 0.5, received(np.full(2, 0.02), 0.5, 500)) is None
 
 
 def test_samples_among_false_ones_are_accepted() -> None:
-    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
+    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     samples = [received(np.full(2, 0.001 * k + (k % 3 == 1)), 0.001 * k, k + 1) for k in range(300)]
-    found = [kind(watchdog, r.arrived, r) for r in samples]
+    found = [kind(monitor, r.arrived, r) for r in samples]
     # The very first is taken for true.
     assert found[1:] == ["jump" if k % 3 == 1 else None for k in range(1, 300)]
 
 
 @pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
 def test_level_jumped_to_can_be_accepted_once_it_is_steady(swing: float, accepted: bool) -> None:
-    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
-    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
+    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 100):
-        watchdog.check(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
-    watchdog.accept_steady()
-    assert watchdog.value.tolist() == [0.0, 0.0], "not yet"
+        monitor.check(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
+    monitor.accept_steady()
+    assert monitor.value.tolist() == [0.0, 0.0], "not yet"
     for k in range(100, 104):
         last = received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k)
-        watchdog.check(0.001 * k, last)
-    watchdog.accept_steady()
-    assert (kind(watchdog, 0.103, last) is None) == accepted
+        monitor.check(0.001 * k, last)
+    monitor.accept_steady()
+    assert (kind(monitor, 0.103, last) is None) == accepted
 
 
 def test_longer_silence_allows_a_larger_change() -> None:
-    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
-    assert kind(watchdog, 0.0, received(np.zeros(2), 0.0, 1)) is None
-    assert kind(watchdog, 0.5, received(np.full(2, 0.49), 0.5, 2)) is None
+    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
+    assert kind(monitor, 0.0, received(np.zeros(2), 0.0, 1)) is None
+    assert kind(monitor, 0.5, received(np.full(2, 0.49), 0.5, 2)) is None
 
 
 def test_jump_is_a_fault_until_the_next_sample() -> None:
-    watchdog = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
-    watchdog.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
+    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
     jumped = received(np.ones(2), 0.01, 2)
-    assert [kind(watchdog, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
+    assert [kind(monitor, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
 
 
 def test_sample_that_is_not_new_is_no_jump() -> None:
-    watchdog, reception = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
+    monitor, sample = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
     for now in (0.0, 0.001, 0.002):
-        assert kind(watchdog, now, reception) is None
+        assert kind(monitor, now, sample) is None
 
 
 def test_abstract_signal_is_watched_for_its_age_only() -> None:
-    watchdog = SensorMonitor(Signal("picture", model_value="", max_age=0.1))
-    assert kind(watchdog, 0.0, received("cat")) is None
-    assert kind(watchdog, 0.2, received("cat")) == "stale"
+    monitor = SensorMonitor(Signal("picture", model_value="", max_age=0.1))
+    assert kind(monitor, 0.0, received("cat")) is None
+    assert kind(monitor, 0.2, received("cat")) == "stale"
 
 
 def test_value_that_the_bridge_checked_by_other_limits_is_checked_again() -> None:
     wide, narrow = signal(upper=2.0), signal(upper=1.0)
-    sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, range=ValueRange(wide))
+    sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, bounds=Bounds(wide))
     assert kind(SensorMonitor(narrow), 0.0, sample) == "implausible"
     assert kind(SensorMonitor(wide), 0.0, sample) is None
 
 
 def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str | None]:
-    """The watchdog's findings for samples of (sent, arrived)."""
-    watchdog = SensorMonitor(signal(), max_delay=max_delay)
-    receptions = [
+    """The faults for samples of (sent, arrived)."""
+    monitor = SensorMonitor(signal(), max_delay=max_delay)
+    given = [
         ReceivedSignal(value=np.zeros(2), sent=sent, arrived=arrived, count=k + 1)
         for k, (sent, arrived) in enumerate(samples)
     ]
-    return [kind(watchdog, reception.arrived, reception) for reception in receptions]
+    return [kind(monitor, sample.arrived, sample) for sample in given]
 
 
 def test_sample_that_took_longer_than_the_quickest_one_is_stale_until_one_is_quick_again() -> None:
@@ -195,3 +197,24 @@ def test_jumps_need_a_finite_rate_and_a_vector() -> None:
         SensorMonitor(Signal("picture", model_value=""), jump_tolerance=0.1)
     with pytest.raises(ValueError, match="not negative"):
         SensorMonitor(signal(rate=1.0), jump_tolerance=[0.1, -0.1])
+
+
+def test_value_is_examined_once_and_its_age_in_every_cycle() -> None:
+    class Counting(SensorMonitor):
+        examined = 0
+
+        def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
+            self.examined += 1
+            return super().examine(now, received)
+
+    monitor, sample = Counting(signal(upper=1.0)), received(np.full(2, 2.0))
+    assert [kind(monitor, now, sample) for now in (0.0, 0.02, 0.06)] == ["implausible", "implausible", "stale"]
+    assert monitor.examined == 1
+
+
+def test_only_a_received_signal_is_checked() -> None:
+    nothing: Any = None
+    with pytest.raises(TypeError, match="takes the ReceivedSignal of the signal, not None"):
+        SensorMonitor(signal()).check(0.0, nothing)
+    with pytest.raises(TypeError, match="StalenessMonitor"):
+        check_all(0.0, {"a": nothing}, {"a": ReceivedSignal()})

@@ -1,4 +1,4 @@
-"""What tells whether a sensor signal can be relied on."""
+"""Detection of sensor signals that cannot be relied on: stale, late, implausible, or jumping."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.kernels import JumpBounds, StalenessMonitor
-from vtbdrake.control.limits import ValueRange
+from vtbdrake.control.kernels import StalenessMonitor
+from vtbdrake.control.limits import Bounds, JumpBounds
 from vtbdrake.testbed import Signal
 
-# By how many seconds in one the clocks of two computers may drift apart: NTP's largest correction.
-_DRIFT = 500e-6
+_DRIFT = 500e-6  # Largest drift between the clocks of two computers, in s per s: NTP's largest correction.
 
 SETTLING = 0.1
 """Seconds for which samples have to agree before the level that a signal has jumped to can be accepted."""
@@ -22,15 +21,15 @@ SETTLING = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Why the machine must not be commanded as the DPS would like.
+    """A detected reason why the machine must not get the DPS's commands.
 
     Attributes:
-        time: when it was found, on the loop's clock, in seconds.
-        signal: the one it is about; None if it is about all.
+        time: time of detection on the loop's clock, in seconds.
+        signal: name of the faulty signal; None if the fault concerns all.
         kind: of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``,
             ``not finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``not ready``
             or ``told``.
-        reason: one sentence.
+        reason: description in one sentence.
     """
 
     time: float
@@ -43,50 +42,55 @@ class Fault:
 
 
 class LatencyMonitor:
-    """How much longer than the quickest one a message took, by its sender's clock; the clocks' zeros need not agree.
+    """Measures how much longer a message took than the quickest one, by its sender's clock.
+
+    The zeros of the two clocks need not agree, and the clocks may drift apart slowly.
 
     Args:
-        most: how much longer it may take, in seconds.
+        limit: largest excess latency, in seconds.
     """
 
-    def __init__(self, most: float) -> None:
-        self.most = most
-        self._least = inf  # of the times from sending to arrival: the clocks' difference is in it
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
+        self._least = inf  # Least time from sending to arrival; it contains the difference of the clocks.
         self._sent = self._arrived = -inf
 
-    def of(self, reception: ReceivedSignal) -> float:
-        """Of the newest message, in seconds; NaN if it does not tell when it was sent."""
-        took = reception.arrived - reception.sent
+    def excess(self, received: ReceivedSignal) -> float:
+        """Return the excess latency of the newest message in seconds; NaN if it has no time stamp."""
+        took = received.arrived - received.sent
         if isnan(took):
             return nan
-        if reception.sent < self._sent:  # The sender's clock was set back.
+        if received.sent < self._sent:  # The sender's clock was set back.
             self._least = inf
-        drifted = self._least + _DRIFT * max(reception.arrived - self._arrived, 0.0)
+        drifted = self._least + _DRIFT * max(received.arrived - self._arrived, 0.0)
         self._least = min(took, drifted)
-        self._sent, self._arrived = reception.sent, reception.arrived
+        self._sent, self._arrived = received.sent, received.arrived
         return took - self._least
 
 
 class SensorMonitor(StalenessMonitor):
-    """Watches one sensor signal: it has to be fresh, and what it says plausible.
+    """Checks that one sensor signal is fresh and plausible; `check` returns the fault, if there is one.
 
-    A signal that never arrived is stale, whatever its maximum age. A vector is plausible if it has the right size and
-    all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
-    What the bridge has checked by the same limits is not checked again.
+    A signal that has never arrived is stale, whatever its maximum age. A vector is plausible if it has the right size
+    and all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
+    Values that the bridge has checked against the same bounds are not checked again.
 
-    A sample that is further from the last accepted one than the signal can have changed is a *jump*. The signal stays
-    implausible until a sample is within reach of the last accepted one again. While samples are refused, that reach
-    grows for `max_age` at most (or for the gap before the first of them, if that was longer): a wrong value does not
-    become right by being repeated. `accept_steady` is the way on for a sensor that really is elsewhere.
+    A sample that differs from the last accepted one by more than the signal can have changed is a *jump*. The signal
+    stays implausible until a sample is close enough to the last accepted one again. While samples are rejected, the
+    allowed change grows for `max_age` at most (or for the gap before the first of them, if that was longer), so that a
+    wrong value is not accepted because it is repeated. `accept_steady` accepts the new level of a sensor that really is
+    elsewhere.
 
     Args:
-        signal: its limits count.
+        signal: the sensor signal with its limits.
         jump_tolerance: a scalar or one per entry, in the signal's unit. If given, entries may change from one accepted
-            sample to the next by rate * dt + jump_tolerance, with dt between their arrivals: noise and jitter of the
-            arrival are to be tolerated.
-        max_delay: in seconds. If given, a sample that took so much longer than the quickest one, by its sender's clock,
-            is stale: it may have waited anywhere before it was read. Only for a sender whose clock runs as ours does;
-            that of a simulation may stand still.
+            sample to the next by rate * dt + jump_tolerance, with dt between their arrivals: the tolerance covers
+            noise and the jitter of the arrival.
+        max_delay: in seconds. If given, a sample with a larger excess latency (see `LatencyMonitor`) is stale. Only for
+            a sender whose clock runs as ours does; that of a simulation may stand still.
+
+    Raises:
+        ValueError: ``max_delay`` is not positive, or the signal does not allow ``jump_tolerance``.
     """
 
     def __init__(
@@ -94,103 +98,98 @@ class SensorMonitor(StalenessMonitor):
     ) -> None:
         if max_delay is not None and not max_delay > 0.0:
             raise ValueError(f"the sensor signal {signal.name} has a positive max_delay, not {max_delay} s")
-        self.signal = signal
         super().__init__(signal.max_age)
-        # The newest sample that was refused as a jump, and since when such samples have agreed with each other.
-        self._refused: np.ndarray | None = None
-        self._refused_at = self._steady_since = -inf
+        self.signal = signal
+        # The newest sample rejected as a jump, and since when such samples have agreed with each other.
+        self._rejected: np.ndarray | None = None
+        self._rejected_at = self._steady_since = -inf
         self._longest_gap = inf
-        self._delay = None if max_delay is None else LatencyMonitor(max_delay)
-        self._range = None if signal.size is None else ValueRange(signal)
-        self._reach: JumpBounds | None = None
-        self._compares = jump_tolerance is not None or self._delay is not None
-        if jump_tolerance is not None:
-            if signal.size is None:
-                raise ValueError(f"the sensor signal {signal.name} is abstract: there is no jump to tolerate")
-            rate, tolerance = signal.vector(signal.rate), signal.vector(jump_tolerance)
-            if not np.isfinite(rate).all():
-                raise ValueError(f"the sensor signal {signal.name} may jump: to tell a jump, it needs a finite rate")
-            if not (tolerance >= 0.0).all():
-                raise ValueError(f"the jump_tolerance of {signal.name} is not negative, unlike {tolerance.tolist()}")
-            self._reach = JumpBounds(rate.tolist(), tolerance.tolist())
+        self._latency = None if max_delay is None else LatencyMonitor(max_delay)
+        self._bounds = None if signal.size is None else Bounds(signal)
+        self._jump_bounds = None if jump_tolerance is None else _jump_bounds(signal, jump_tolerance)
+        self._examines_all = jump_tolerance is not None or max_delay is not None
 
-    def stale(self, now: float, reception: ReceivedSignal) -> Fault:
+    def stale(self, now: float, received: ReceivedSignal) -> Fault:
+        """Return the fault of a signal that is too old or has never arrived."""
         name = self.signal.name
-        if not reception.count:
+        if not received.count:
             return Fault(now, name, "stale", f"sensor signal {name} has never arrived")
-        age = f"{1e3 * reception.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
+        age = f"{1e3 * received.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
         return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
 
-    def examine(self, now: float, reception: ReceivedSignal) -> Fault | None:
+    def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
+        """Return what is wrong with a new sample, or None."""
         fault = None
-        # Mostly they are not only equal but the same, from the second time on.
-        if self._range is not reception.range:
-            if self._range == reception.range:
-                self._range = reception.range
+        if self._bounds is not received.bounds:
+            if self._bounds == received.bounds:
+                self._bounds = received.bounds  # From now on the comparison above is enough.
             else:
-                fault = self._implausible(now, reception)
-        if not self._compares:
-            self.trusted = self._range
-        if fault is None and self._delay is not None:
-            fault = self._delayed(now, reception, self._delay)
-        if fault is None and self._reach is not None:
-            fault = self._jump(now, reception, self._reach)
-        return fault
+                fault = self._implausible(now, received)
+        if not self._examines_all:
+            self.trusted = self._bounds
+        return fault or self._late(now, received) or self._jump(now, received)
 
     @property
     def steady(self) -> bool:
         """Whether the signal has jumped, and its samples have agreed with each other for `SETTLING` since then."""
-        return self._refused is not None and self._refused_at - self._steady_since >= SETTLING
+        return self._rejected is not None and self._rejected_at - self._steady_since >= SETTLING
 
     def accept_steady(self) -> None:
         """Accept the level that the signal has jumped to, if it is steady there.
 
-        To be called when somebody takes the responsibility (a reset by hand), or nothing depends on the signal.
+        Call it when somebody takes the responsibility (a reset by hand), or when nothing depends on the signal.
         """
         if self.steady:
-            self.accept(self._refused, self._refused_at)
-            self._refused = None
+            self.accept(self._rejected, self._rejected_at)
+            self._rejected = None
 
-    def _implausible(self, now: float, reception: ReceivedSignal) -> Fault | None:
-        if self._range is None:
-            return None
-        name, value = self.signal.name, reception.value
-        problem = self._range.check(value)
+    def _implausible(self, now: float, received: ReceivedSignal) -> Fault | None:
+        problem = "" if self._bounds is None else self._bounds.check(received.value)
         if not problem:
             return None
+        name, value = self.signal.name, received.value
         if problem in ("size", "type"):
             reason = f"sensor signal {name} has the shape {np.shape(value)} instead of ({self.signal.size},)"
         else:
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
         return Fault(now, name, "implausible", reason)
 
-    def _jump(self, now: float, reception: ReceivedSignal, reach: JumpBounds) -> Fault | None:
-        value = np.asarray(reception.value, dtype=float)
-        if self.value is None:
+    def _late(self, now: float, received: ReceivedSignal) -> Fault | None:
+        if self._latency is None or not (excess := self._latency.excess(received)) > self._latency.limit:
             return None
-        accepted = np.asarray(self.value, dtype=float)
-        since = max(reception.arrived - self.arrived, 0.0)
-        within = since if self._refused is None else min(since, self._longest_gap)
-        if reach.contains(accepted, value, within):
-            self._refused = None
-            return None
-        if self._refused is None:
-            self._longest_gap = max(since, self.max_age) if isfinite(self.max_age) else since
-        if self._refused is None or not reach.contains(self._refused, value, reception.arrived - self._refused_at):
-            self._steady_since = reception.arrived
-        self._refused, self._refused_at = value, reception.arrived
         reason = (
-            f"sensor signal {self.signal.name} jumps within {1e3 * since:.1f} ms from {accepted.tolist()} to "
+            f"sensor signal {self.signal.name} is stale: it took {1e3 * excess:.1f} ms longer than the quickest "
+            f"sample, {1e3 * self._latency.limit:g} allowed"
+        )
+        return Fault(now, self.signal.name, "stale", reason)
+
+    def _jump(self, now: float, received: ReceivedSignal) -> Fault | None:
+        bounds = self._jump_bounds
+        if bounds is None or self.value is None:
+            return None
+        value, accepted = np.asarray(received.value, dtype=float), np.asarray(self.value, dtype=float)
+        gap = max(received.arrived - self.arrived, 0.0)
+        if bounds.contains(accepted, value, gap if self._rejected is None else min(gap, self._longest_gap)):
+            self._rejected = None
+            return None
+        if self._rejected is None:
+            self._longest_gap = max(gap, self.max_age) if isfinite(self.max_age) else gap
+        if self._rejected is None or not bounds.contains(self._rejected, value, received.arrived - self._rejected_at):
+            self._steady_since = received.arrived
+        self._rejected, self._rejected_at = value, received.arrived
+        reason = (
+            f"sensor signal {self.signal.name} jumps within {1e3 * gap:.1f} ms from {accepted.tolist()} to "
             f"{value.tolist()}"
         )
         return Fault(now, self.signal.name, "jump", reason)
 
-    def _delayed(self, now: float, reception: ReceivedSignal, delay: LatencyMonitor) -> Fault | None:
-        more = delay.of(reception)
-        if not more > delay.most:
-            return None
-        reason = (
-            f"sensor signal {self.signal.name} is stale: it took {1e3 * more:.1f} ms longer than the quickest sample, "
-            f"{1e3 * delay.most:g} allowed"
-        )
-        return Fault(now, self.signal.name, "stale", reason)
+
+def _jump_bounds(signal: Signal, jump_tolerance: ArrayLike) -> JumpBounds:
+    if signal.size is None:
+        raise ValueError(f"the sensor signal {signal.name} is abstract: there is no jump to tolerate")
+    rate, tolerance = signal.vector(signal.rate), signal.vector(jump_tolerance)
+    if not np.isfinite(rate).all():
+        raise ValueError(f"the sensor signal {signal.name} may jump: to tell a jump, it needs a finite rate")
+    if not (tolerance >= 0.0).all():
+        raise ValueError(f"the jump_tolerance of {signal.name} is not negative, unlike {tolerance.tolist()}")
+    return JumpBounds(rate, tolerance)

@@ -1,4 +1,4 @@
-"""How punctual a loop is: histograms of durations, counts of misses and of what exceeds thresholds."""
+"""Statistics of a loop's timing: histograms of durations, missed deadlines, and durations above thresholds."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from itertools import accumulate
 from math import ceil, exp, inf, log, nan
 from typing import Any
 
-from vtbdrake.control.kernels import Bins
 
-
-class Histogram(Bins):
+class Histogram:
     """Durations in bins of equal ratio, in constant memory.
 
     A percentile is the upper end of the bin in which it lies: never below the true one (of the kind "inverted_cdf"),
@@ -21,8 +19,14 @@ class Histogram(Bins):
 
     Args:
         resolution: ratio of the ends of a bin, less one.
-        lowest: in seconds; what is shorter, or negative, shares one bin.
-        highest: in seconds; what is longer shares one bin.
+        lowest: in seconds; shorter and negative durations share one bin.
+        highest: in seconds; longer durations share one bin.
+
+    Attributes:
+        count: number of durations.
+        total: sum of the durations, in seconds.
+        least: shortest duration in seconds; NaN if there is none.
+        largest: longest duration in seconds; NaN if there is none.
     """
 
     def __init__(self, *, resolution: float = 0.01, lowest: float = 1e-6, highest: float = 10.0) -> None:
@@ -31,44 +35,73 @@ class Histogram(Bins):
         if not 0.0 < lowest < highest < inf:
             raise ValueError(f"a histogram needs 0 < lowest < highest, not {lowest} and {highest}")
         self.resolution, self.lowest, self.highest = resolution, lowest, highest
+        self.count, self.total = 0, 0.0
+        self.least = self.largest = nan
+        # Bin 0 ends at lowest, bin k > 0 at lowest exp(k / scale); the last one starts at highest and has no end.
         self._scale = 1.0 / log(1.0 + resolution)
-        super().__init__(lowest, highest, self._scale, ceil(self._scale * log(highest / lowest)) + 2)
+        self._shift = 1.0 - self._scale * log(lowest)
+        self._bins = [0] * (ceil(self._scale * log(highest / lowest)) + 2)
+
+    def record(self, seconds: float) -> None:
+        """Add one duration.
+
+        Raises:
+            ValueError: it is NaN.
+        """
+        if seconds <= self.lowest:
+            self._bins[0] += 1
+        elif seconds < self.highest:
+            self._bins[int(log(seconds) * self._scale + self._shift)] += 1
+        elif seconds >= self.highest:
+            self._bins[-1] += 1
+        else:
+            raise ValueError("a duration is a number of seconds, not NaN")
+        self.count += 1
+        self.total += seconds
+        if not seconds >= self.least:
+            self.least = seconds
+        if not seconds <= self.largest:
+            self.largest = seconds
 
     @property
     def mean(self) -> float:
-        """In seconds; NaN if there is none."""
+        """Mean duration in seconds; NaN if there is none."""
         return self.total / self.count if self.count else nan
 
     def percentile(self, percent: float) -> float:
-        """In seconds; NaN if there is none. The duration that ``percent`` of all do not exceed."""
+        """Return the duration in seconds that ``percent`` of all do not exceed; NaN if there is none."""
         if not 0.0 <= percent <= 100.0:
             raise ValueError(f"a percentile lies in 0 to 100, not at {percent}")
         if self.count == 0:
             return nan
         if percent == 100.0:
             return self.largest
-        # The rounding guards 99.9 % of 1000, which is 999.0000000000001.
+        # The rounding corrects products such as 99.9 % of 1000, which is 999.0000000000001.
         rank = max(1, ceil(round(percent / 100.0 * self.count, 6)))
-        bins = self.counts()
-        index = next(index for index, passed in enumerate(accumulate(bins)) if passed >= rank)
-        end = inf if index == len(bins) - 1 else self.lowest * exp(index / self._scale)
+        index = next(index for index, passed in enumerate(accumulate(self._bins)) if passed >= rank)
+        end = inf if index == len(self._bins) - 1 else self.lowest * exp(index / self._scale)
         return min(end, self.largest)
 
     def merge(self, other: Histogram) -> None:
-        """Adds all durations of ``other``.
+        """Add all durations of ``other``.
 
         Raises:
-            ValueError: its bins are others.
+            ValueError: its bins are different.
         """
         if self._shape() != other._shape():
             raise ValueError(
                 "histograms merge if their resolution, lowest and highest agree, but these are "
                 f"{self._shape()} and {other._shape()}"
             )
-        self.add(other.counts(), other.total, other.least, other.largest)
+        if other.count:
+            self._bins = [a + b for a, b in zip(self._bins, other._bins, strict=True)]
+            self.least = min(self.least if self.count else inf, other.least)
+            self.largest = max(self.largest if self.count else -inf, other.largest)
+            self.count += other.count
+            self.total += other.total
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, fit for JSON."""
+        """Return the histogram as plain data, fit for JSON."""
         return {
             "resolution": self.resolution,
             "lowest": self.lowest,
@@ -76,24 +109,24 @@ class Histogram(Bins):
             "total": self.total,
             "least": self.least if self.count else None,
             "largest": self.largest if self.count else None,
-            "bins": {str(index): number for index, number in enumerate(self.counts()) if number},
+            "bins": {str(index): number for index, number in enumerate(self._bins) if number},
         }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Histogram:
-        """What `to_dict` gave.
+        """Return the histogram that `to_dict` described.
 
         Raises:
-            ValueError: it has a bin that such a histogram has not.
+            ValueError: the data contain a bin that such a histogram does not have.
         """
         histogram = cls(resolution=data["resolution"], lowest=data["lowest"], highest=data["highest"])
-        bins = histogram.counts()
         for index, number in data["bins"].items():
-            if not (0 <= int(index) < len(bins) and number > 0):
-                raise ValueError(f"a histogram of {len(bins)} bins has no bin {index} with {number} entries")
-            bins[int(index)] = number
-        if any(bins):
-            histogram.add(bins, data["total"], data["least"], data["largest"])
+            if not (0 <= int(index) < len(histogram._bins) and number > 0):
+                raise ValueError(f"a histogram of {len(histogram._bins)} bins has no bin {index} with {number} entries")
+            histogram._bins[int(index)] = number
+        histogram.count = sum(histogram._bins)
+        if histogram.count:
+            histogram.total, histogram.least, histogram.largest = data["total"], data["least"], data["largest"]
         return histogram
 
     def _shape(self) -> tuple[float, float, float]:
@@ -101,7 +134,7 @@ class Histogram(Bins):
 
 
 class Level(IntEnum):
-    """How bad it is."""
+    """Severity of what was measured."""
 
     OK = 0
     WARNING = 1
@@ -110,11 +143,13 @@ class Level(IntEnum):
 
 @dataclass
 class Threshold:
-    """From which duration on, in seconds, one worries; and how often that was so.
+    """Thresholds of a duration, with counts of the durations above them.
 
     Attributes:
-        warning, error: what is longer counts.
-        warnings, errors: how many were; an error is not a warning, too.
+        warning: longer durations count as warnings, in seconds.
+        error: longer durations count as errors, in seconds.
+        warnings: number of durations above ``warning``, up to ``error``.
+        errors: number of durations above ``error``.
     """
 
     warning: float
@@ -128,7 +163,7 @@ class Threshold:
 
     @property
     def level(self) -> Level:
-        """The worst so far."""
+        """The worst level so far."""
         return Level.ERROR if self.errors else Level.WARNING if self.warnings else Level.OK
 
 
@@ -136,16 +171,20 @@ QUANTITIES = ("lateness", "step", "cycle")
 
 
 class LoopStatistics:
-    """What a loop of a fixed period did, in constant memory.
+    """Statistics of a loop with a fixed period, in constant memory.
+
+    Args:
+        period: period of the loop, in seconds.
+        thresholds: by quantity; by default, warnings start above half a period and errors above a whole one.
 
     Attributes:
         histograms: of ``lateness`` (from the deadline to the wake-up), ``step`` (of the DPS) and ``cycle`` (all work of
             a cycle, from the wake-up on).
-        thresholds: the same; warning at half a period, error at a whole one, if not given.
-        misses: deadlines that passed while the loop was at work on an earlier cycle.
-        run: how many of them in a row, up to now.
-        longest_run: the longest such run.
-        foreign: commands of somebody else that were heard while the loop commanded.
+        thresholds: for the same quantities.
+        misses: number of deadlines that passed while the loop worked on an earlier cycle.
+        run: number of misses in a row, up to now.
+        longest_run: number of misses in the longest such row.
+        foreign: number of commands of other publishers that were heard while the loop commanded.
     """
 
     def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
@@ -167,7 +206,7 @@ class LoopStatistics:
         self._recorders = tuple((self.histograms[name].record, self.thresholds[name]) for name in QUANTITIES)
 
     def record(self, *, lateness: float, step: float, cycle: float) -> None:
-        """One cycle: its durations in seconds."""
+        """Record the durations of one cycle, in seconds."""
         for (record, threshold), seconds in zip(self._recorders, (lateness, step, cycle), strict=True):
             record(seconds)
             if seconds > threshold.warning:
@@ -180,9 +219,9 @@ class LoopStatistics:
         self._missed = False
 
     def miss(self, number: int) -> None:
-        """After a cycle: how many deadlines passed before it ended. One without any ends the run."""
+        """Record after a cycle how many deadlines passed before it ended; 0 ends the row of misses."""
         if number < 0:
-            raise ValueError(f"one misses no deadline or some, not {number}")
+            raise ValueError(f"the number of missed deadlines is not negative, unlike {number}")
         self._missed = number > 0
         self.misses += number
         self.run = self.run + number if number else 0
@@ -190,18 +229,19 @@ class LoopStatistics:
 
     @property
     def cycles(self) -> int:
+        """Number of recorded cycles."""
         return self.histograms["cycle"].count
 
     @property
     def level(self) -> Level:
-        """The worst of all thresholds so far."""
+        """The worst level of all thresholds so far."""
         return max(threshold.level for threshold in self.thresholds.values())
 
     def merge(self, other: LoopStatistics) -> None:
-        """Adds another run of the same period and thresholds. Its misses and ours are not in a row.
+        """Add the statistics of another run. Its misses and ours do not form one row.
 
         Raises:
-            ValueError: its period or a threshold is another.
+            ValueError: its period or a threshold is different.
         """
         if self._shape() != other._shape():
             raise ValueError(
@@ -218,7 +258,7 @@ class LoopStatistics:
         self.foreign += other.foreign
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, fit for JSON."""
+        """Return the statistics as plain data, fit for JSON."""
         return {
             "period": self.period,
             "histograms": {name: histogram.to_dict() for name, histogram in self.histograms.items()},
@@ -231,7 +271,7 @@ class LoopStatistics:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LoopStatistics:
-        """What `to_dict` gave."""
+        """Return the statistics that `to_dict` described."""
         thresholds = {name: Threshold(**threshold) for name, threshold in data["thresholds"].items()}
         statistics = cls(data["period"], thresholds=thresholds)
         for name in QUANTITIES:
@@ -241,7 +281,7 @@ class LoopStatistics:
         return statistics
 
     def __str__(self) -> str:
-        """A table, in microseconds."""
+        """Return a table, in microseconds."""
         form = "{:9}" + "{:>9}" * 7
         lines = [form.format("us", "mean", "p50", "p99", "p99.9", "max", "warnings", "errors")]
         for name, histogram in self.histograms.items():
@@ -252,7 +292,9 @@ class LoopStatistics:
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
         lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}")
         if self.foreign:
-            lines.append(f"ALARM: somebody else published commands to the machine, too: {self.foreign} were heard")
+            lines.append(
+                f"ALARM: other publishers commanded the machine, too: {self.foreign} of their commands were heard"
+            )
         return "\n".join(lines)
 
     def _shape(self) -> tuple[Any, ...]:

@@ -134,7 +134,7 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
     found = []
     for name in names:
         if name not in runtime.continuity:
-            if runtime.guards.needs_start(name):
+            if runtime.guards.limiters[name].needs_start:
                 found.append(
                     f"the command {name} has a limit of its rate or acceleration, and nothing measured that it could "
                     f"depart from: give continuity={{{name!r}: (sensor signal, largest difference)}}"

@@ -10,7 +10,7 @@ from math import inf, isfinite
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
-from vtbdrake.control.limits import ValueRange
+from vtbdrake.control.limits import Bounds
 from vtbdrake.lcm.connections import Handler, LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
@@ -240,9 +240,9 @@ class ChannelReader:
         self.channel = map.channel
         self.clock_jumps = 0
         self._decode = map.decoder(signals)
-        self._signals = [(signal.name, received[signal.name], ValueRange(signal)) for signal in signals]
-        for _, received_signal, range in self._signals:
-            received_signal.range = range
+        self._signals = [(signal.name, received[signal.name], Bounds(signal)) for signal in signals]
+        for _, received_signal, bounds in self._signals:
+            received_signal.bounds = bounds
         self._reorder_window = reorder_window
         self._last = -inf  # time of the sender in the last accepted message
         self._ahead = inf  # by how much it was ahead of ours
@@ -264,8 +264,8 @@ class ChannelReader:
                 received.reject(reason)
             return
         accepted = False
-        for name, received, range in self._signals:
-            if reason := range.check(values[name]) if name in values else "missing":
+        for name, received, bounds in self._signals:
+            if reason := bounds.check(values[name]) if name in values else "missing":
                 received.reject(reason)
             else:
                 received.accept(values[name], now, sent)
@@ -325,7 +325,7 @@ class ChannelWriter:
         """
         self.channel = map.channel
         self._encode = map.encoder(signals)
-        self._ranges = {signal.name: ValueRange(signal) for signal in signals}
+        self._bounds = {signal.name: Bounds(signal) for signal in signals}
         self._sent = sent
 
     def message(self, actuation: Mapping[str, Any], utime: int) -> tuple[list[str], bytes] | None:
@@ -334,10 +334,10 @@ class ChannelWriter:
         None if there are no such commands, or if one of them must not be sent: then all are withheld.
         """
         values, faults = {}, {}
-        for name, range in self._ranges.items():
+        for name, bounds in self._bounds.items():
             if name in actuation:
                 values[name] = actuation[name]
-                if reason := range.check(values[name]):
+                if reason := bounds.check(values[name]):
                     faults[name] = reason
         if not values:
             return None

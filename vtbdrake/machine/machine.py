@@ -179,7 +179,7 @@ class Machine:
 
     def _accept(self, name: str, reception: ReceivedSignal) -> None:
         delay = self._delays.get(name)
-        if delay is not None and delay.of(reception) > delay.most:
+        if delay is not None and delay.excess(reception) > delay.limit:
             reception.reject("late")
         else:
             self._accepted[name], self._commands[name] = self.cycle, reception.value

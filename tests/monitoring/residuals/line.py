@@ -110,7 +110,7 @@ def loop(
     if isinstance(target, DpsAlone):
         runtime.start_dps()
     for signal in target.interface.act:
-        if guards.needs_start(signal.name):
+        if guards.limiters[signal.name].needs_start:
             guards.start(signal.name, runtime.actuator_command(signal.name))
     return runtime
 

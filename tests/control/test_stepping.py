@@ -1,13 +1,27 @@
-"""Parameters at hand."""
+"""What a loop steps: the times of its steps, and the parameters that are kept alive meanwhile."""
 
 from __future__ import annotations
 
 import sys
 
 import numpy as np
+import pytest
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 
-from vtbdrake.control.stepping import numeric_parameters
+from vtbdrake.control.stepping import numeric_parameters, time_after, times_after
+
+
+@pytest.mark.parametrize("start", [0.0, 0.3, 0.1 + 0.2, 0.3 + 1e-12, 0.30037, 7.0, 12345.678, -0.5])
+@pytest.mark.parametrize("period", [0.001, 0.002, 1.0 / 3.0, 0.25])
+@pytest.mark.parametrize("first", [0, 1, 59_000])
+def test_times_after_equals_time_after_bit_for_bit(start: float, period: float, first: int) -> None:
+    steps = first + np.arange(1000)
+    expected = [time_after(int(k), start=start, period=period) for k in steps]
+    assert times_after(steps, start=start, period=period).tolist() == expected
+
+
+def test_times_after_no_steps_are_empty() -> None:
+    assert times_after(np.arange(0), start=0.0, period=0.001).shape == (0,)
 
 
 class _Two(LeafSystem):
@@ -30,14 +44,14 @@ def _values(vectors: list[BasicVector]) -> list[list[float]]:
     return [vector.value().tolist() for vector in vectors]
 
 
-def test_all_parameters_below_a_diagram_are_at_hand() -> None:
+def test_numeric_parameters_are_all_below_a_diagram() -> None:
     whole, part, _ = _nested()
     context = whole.CreateDefaultContext()
     assert _values(numeric_parameters(whole, context)) == [[10.0], [11.0, 12.0], [1.0], [2.0, 3.0]]
     assert _values(numeric_parameters(part, context)) == [[1.0], [2.0, 3.0]]
 
 
-def test_a_system_is_given_the_object_that_is_held() -> None:
+def test_system_gets_the_wrapper_that_is_kept() -> None:
     whole, part, system = _nested()
     context = whole.CreateDefaultContext()
     held = numeric_parameters(part, context)
@@ -45,7 +59,7 @@ def test_a_system_is_given_the_object_that_is_held() -> None:
     assert system.GetMyContextFromRoot(context.Clone()).get_numeric_parameter(1) is not held[1]
 
 
-def test_what_is_written_is_seen() -> None:
+def test_kept_wrapper_shows_new_values() -> None:
     whole, _, system = _nested()
     context, other = whole.CreateDefaultContext(), whole.CreateDefaultContext()
     held = numeric_parameters(whole, context)
@@ -56,7 +70,7 @@ def test_what_is_written_is_seen() -> None:
     np.testing.assert_array_equal(own.get_numeric_parameter(1).value(), [2.0, 3.0])
 
 
-def test_to_ask_again_and_again_keeps_nothing() -> None:
+def test_reading_parameters_leaks_no_references() -> None:
     whole, _, system = _nested()
     context = whole.CreateDefaultContext()
     held = numeric_parameters(whole, context)
