@@ -280,7 +280,7 @@ def test_machine_that_tells_nothing_new_is_stopped_until_reset(
         loop.runtime.run(cycles=5)
         loop.assert_within_limits()
         assert loop.ear.torques[-1] == 0.0
-        loop.machine.normal()
+        loop.machine.end_faults()
         loop.recover()
         loop.assert_within_limits()
 

@@ -185,12 +185,12 @@ def test_values_that_are_set_while_it_runs_hold_from_the_next_cycle_on() -> None
 
 
 def test_delayed_state_is_that_of_earlier_cycles() -> None:
-    late, prompt = run(machine(sense_delay=0.003), 20), run(machine(), 20)
+    late, prompt = run(machine(sense_latency=0.003), 20), run(machine(), 20)
     assert late == prompt[:-3]
 
 
 def test_delayed_command_acts_later() -> None:
-    late, prompt = machine(act_delay=0.003), machine()
+    late, prompt = machine(act_latency=0.003), machine()
     late.receive(COMMAND, torque(5.0, 1))
     run(prompt, 3)
     prompt.receive(COMMAND, torque(5.0, 1))
@@ -219,8 +219,8 @@ def test_machine_brakes_before_the_first_command_and_after_its_timeout() -> None
 
 @pytest.mark.parametrize("timeout", [0.005, 10.0])
 def test_a_command_that_has_waited_neither_acts_nor_releases_the_brake(timeout: float) -> None:
-    robot, spared = (machine(timeout=timeout, max_delay=0.001) for _ in range(2))
-    robot.refuse_late(True)
+    robot, spared = (machine(timeout=timeout, max_latency=0.001) for _ in range(2))
+    robot.reject_late(True)
     begin, clock = time.monotonic(), 5_000_000  # us, of the sender: its zero is another one
     for each in (robot, spared):
         each.receive(COMMAND, torque(1.0, clock))
@@ -278,7 +278,7 @@ def test_machine_without_its_brake_goes_on() -> None:
     robot.receive(COMMAND, torque(2.0, 1))
     assert run(robot, 50) == run(reference, 50, command=2.0)
     assert not robot.braking
-    robot.normal()
+    robot.end_faults()
     run(robot, 1)
     assert robot.braking
 
@@ -351,15 +351,18 @@ def test_period_of_an_unknown_channel_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"period": 0.0}, "period of a machine is a positive time"),
-        ({"perturb": 1.0}, "relative change from 0 to below 1"),
+        ({"period": 0.0}, "period of a machine must be a positive time in seconds, not 0.0"),
+        ({"perturb": 1.0}, "perturb of a machine must be a relative change from 0 to below 1, not 1.0"),
         ({"noise": {"position": -1.0}}, "noise of position"),
         ({"noise": {"torque": 1.0}}, "vector sensor signals \\(position, velocity\\), not to 'torque'"),
-        ({"brake": "soft"}, "brake is one of hold, idle, lock"),
-        ({"act_delay": -1.0}, "act_delay of a machine"),
-        ({"max_delay": 0.0}, "max_delay of a machine is positive, or inf where none is late, not 0.0"),
+        ({"brake": "soft"}, "brake of a machine must be one of hold, idle, lock, not 'soft'"),
+        ({"act_latency": -1.0}, "act_latency of a machine"),
+        (
+            {"max_latency": 0.0},
+            "max_latency of a machine must be a positive time in seconds, or inf to accept any, not 0.0",
+        ),
         ({"values": {"sim.sys.Acrobot.elbow.pos": 1.0}}, "did you mean sim.sys.Acrobot.elbow.position"),
-        ({"seed": -1}, "a seed is a whole number"),
+        ({"seed": -1}, "seed of a machine must be a whole number from 0 on, not -1"),
     ],
 )
 def test_config_that_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:

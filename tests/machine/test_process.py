@@ -40,7 +40,7 @@ from vtbdrake.machine import (
     NoBrake,
     Reorder,
 )
-from vtbdrake.machine.damage import DAMAGE
+from vtbdrake.machine.injected_faults import CORRUPTIONS
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -108,7 +108,7 @@ def running() -> Iterator[Stepper]:
 @pytest.fixture
 def stepper(running: Stepper) -> Iterator[Stepper]:
     yield running
-    running.process.normal()
+    running.process.end_faults()
 
 
 # -- cycles
@@ -155,7 +155,7 @@ def test_machine_ends_after_its_cycles(hub: Hub) -> None:
 def test_drop(stepper: Stepper) -> None:
     stepper.process.begin(Drop())
     assert stepper.step(5) == []
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1, 2)
     assert stepper.step(2) == expected
 
@@ -164,7 +164,7 @@ def test_delay(stepper: Stepper) -> None:
     stepper.process.begin(Delay(seconds=0.003))
     expected = stepper.healthy(1, 2)
     assert stepper.step(5) == expected
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(-2, 1, -1, 2, 0, 3, 4)
     assert stepper.step(4) == expected
 
@@ -173,7 +173,7 @@ def test_freeze(stepper: Stepper) -> None:
     stepper.process.begin(Freeze())
     expected = stepper.healthy(1) * 4
     assert stepper.step(4) == expected
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1)
     assert stepper.step() == expected
 
@@ -182,7 +182,7 @@ def test_duplicate(stepper: Stepper) -> None:
     stepper.process.begin(Duplicate(copies=2))
     expected = stepper.healthy(1, 1, 1, 2, 2, 2)
     assert stepper.step(2) == expected
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1)
     assert stepper.step() == expected
 
@@ -191,7 +191,7 @@ def test_reorder(stepper: Stepper) -> None:
     stepper.process.begin(Reorder())
     expected = stepper.healthy(2, 1, 4, 3)
     assert stepper.step(4) == expected
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1)
     assert stepper.step() == expected
 
@@ -202,19 +202,19 @@ def test_clock_jump(stepper: Stepper) -> None:
     [data] = stepper.step()
     assert utime(data) == utime(expected) - 3600 * 10**6
     np.testing.assert_array_equal(state(data), state(expected))
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1)
     assert stepper.step() == expected
 
 
-@pytest.mark.parametrize("kind", DAMAGE)
+@pytest.mark.parametrize("kind", CORRUPTIONS)
 def test_corruption(kind: str, stepper: Stepper) -> None:
     stepper.process.begin(Corrupt(kind=kind))
     whole = stepper.healthy(1, 2, 3)
     heard = stepper.step(3)
     assert len(heard) == 3
     assert not set(heard) & set(whole)
-    stepper.process.normal()
+    stepper.process.end_faults()
     expected = stepper.healthy(1)
     assert stepper.step() == expected
 
@@ -224,7 +224,7 @@ def test_fault_of_commands(stepper: Stepper) -> None:
     before = stepper.process.begin(fault)
     assert before.faults == [fault.to_dict()]
     stepper.step(5)
-    after = stepper.process.normal()
+    after = stepper.process.end_faults()
     assert (after.accepted, after.rejected) == (before.accepted, {"torque": {"fingerprint": 5}})
     assert after.faults == []
 
@@ -284,7 +284,7 @@ def test_machine_that_does_not_brake(hub: Hub) -> None:
         process.begin(NoBrake())
         process.until(lambda status: not status.braking)
         assert process.status().silent == [COMMAND]
-        process.normal()
+        process.end_faults()
         process.until(lambda status: status.braking)
 
 
@@ -431,7 +431,7 @@ def test_machine_without_a_hub_does_not_start() -> None:
 
 
 def test_error_of_the_scenario_is_told(hub: Hub) -> None:
-    with pytest.raises(MachineError, match="AcrobotScenario does not say what its machine speaks"):
+    with pytest.raises(MachineError, match="AcrobotScenario has no protocol for its machine"):
         MachineProcess(AcrobotScenario(), hub.url).start()
 
 

@@ -19,9 +19,9 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.output import number
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.machine import Machine, MachineConfig
-from vtbdrake.machine.config import BRAKES
-from vtbdrake.machine.serve import epoch, serve
+from vtbdrake.machine import Machine, MachineConfig, MachineLoop
+from vtbdrake.machine.loop import epoch, serve
+from vtbdrake.machine.machine import BRAKES
 from vtbdrake.testbed import Scenario
 
 _DEFAULT = MachineConfig()
@@ -69,14 +69,18 @@ def _parse_noise(text: str) -> tuple[str, float]:
     "--seed", type=int, default=_DEFAULT.seed, show_default=True, metavar="N", help="The seed of all random numbers."
 )
 @click.option(
-    "--sense-delay",
+    "--sense-latency",
     type=float,
     default=0.0,
     metavar="MS",
     help="The latency of sensor messages, in milliseconds; whole cycles.",
 )
 @click.option(
-    "--act-delay", type=float, default=0.0, metavar="MS", help="The latency of commands, in milliseconds; whole cycles."
+    "--act-latency",
+    type=float,
+    default=0.0,
+    metavar="MS",
+    help="The latency of commands, in milliseconds; whole cycles.",
 )
 @click.option(
     "--timeout",
@@ -87,9 +91,9 @@ def _parse_noise(text: str) -> tuple[str, float]:
     help="Brake after S seconds without a command.",
 )
 @click.option(
-    "--max-delay",
+    "--max-latency",
     type=float,
-    default=_DEFAULT.max_delay,
+    default=_DEFAULT.max_latency,
     show_default=True,
     metavar="S",
     help="Reject commands that took S seconds longer than the quickest one, by their sender's clock; inf rejects none. "
@@ -119,10 +123,10 @@ def machine(
     perturb: float,
     noise: tuple[tuple[str, float], ...],
     seed: int,
-    sense_delay: float,
-    act_delay: float,
+    sense_latency: float,
+    act_latency: float,
     timeout: float,
-    max_delay: float,
+    max_latency: float,
     brake: str | None,
     priority: int,
 ) -> None:
@@ -143,19 +147,19 @@ def machine(
         perturb=perturb,
         noise=dict(noise),
         seed=seed,
-        sense_delay=1e-3 * sense_delay,
-        act_delay=1e-3 * act_delay,
+        sense_latency=1e-3 * sense_latency,
+        act_latency=1e-3 * act_latency,
         timeout=timeout,
-        max_delay=max_delay,
+        max_latency=max_latency,
         brake=brake or "",
     )
     simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
     for address, value in simulated.perturbed.items():
         click.echo(f"{address} = {value}")
     try:
-        loop = serve(
-            simulated,
-            url,
+        loop = MachineLoop(simulated, url)
+        serve(
+            loop,
             lock_step=lock_step,
             cycles=inf if cycles is None else cycles,
             priority=priority,

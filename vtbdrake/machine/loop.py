@@ -1,59 +1,72 @@
-"""Runs a machine on an LCM bus: against a clock, or in lock-step with its controller."""
+"""The loop of a machine on an LCM bus: against a clock, or in lock-step with its controller."""
 
 from __future__ import annotations
 
 import json
 import logging
 import os
+import signal
 import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from math import inf
 from typing import Any
 
 from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.json_object import json_object
+from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.lcm.connections import LcmLink
-from vtbdrake.machine.faults import InjectedFaultError, fault_from_dict
+from vtbdrake.machine.injected_faults import InjectedFaultError, fault_from_dict
 from vtbdrake.machine.machine import Machine
 
 _log = logging.getLogger(__name__)
 
 DIED = 70
-"""Exit code of a machine that was told to die."""
+"""The exit code of a machine after the request ``die``."""
 
-_BURST = 200  # messages to take in at a time
+_BURST = 200  # messages to take at a time
 _SLICE = 0.005  # s to wait for commands before looking at requests
-_REPEAT = 0.2  # s after which a state is told again, in lock-step on a bus where nobody has commanded yet
+_REPEAT = 0.2  # s after which a state is sent again, in lock-step on a bus where nobody has commanded yet
 _CATCH_UP = 0.05  # s
 
 
 class MachineLoop:
     """A machine and its connection to the bus.
 
-    Requests come on the config's ``control_channel``, or by ``control``, as JSON: a fault, as `to_dict` gives it
-    (``{"fault": "drop", "fraction": 0.5}``), variables of its world to set (``{"set": {"sim.sys.payload.mass": 1}}``),
-    or ``{"request": NAME}``:
+    Requests arrive on the config's ``control_channel``, or by ``control``, as JSON: an injected fault
+    (``{"fault": "drop", "fraction": 0.5}``, see `InjectedFault.to_dict`), variables of its world to set
+    (``{"set": {"sim.sys.payload.mass": 1}}``), or ``{"request": NAME}``:
 
-    * ``status``: nothing else;
-    * ``normal``: ends all faults;
-    * ``statistics``: the answer has the statistics, too;
+    * ``status``: do nothing but answer;
+    * ``normal``: end all faults;
+    * ``statistics``: answer with the statistics too;
     * ``reset statistics``;
-    * ``die``: the process ends at once, without a farewell.
+    * ``die``: end the process at once, without closing its connections.
 
     By ``control`` every request is one line and gets one line: the status, or ``{"error": ...}``. On the bus, the
-    status goes to ``status_channel``: every ``status_period``, after each request, and when the brake falls in or is
-    released.
+    status is published on ``status_channel`` every ``status_period``, after each request, and when the brake engages or
+    is released.
+
+    Args:
+        machine: the machine.
+        url: the URL of the bus.
+        clock: the clock of the cycles; by default the wall clock.
+        control: a connected stream; the loop stops when its other end closes.
+        connect_timeout: the time to wait for the bus, in seconds.
 
     Attributes:
-        statistics: of its cycles; ``step`` is the simulation.
-        state_to_command: from telling a state to the next command's arrival (at the computer: the machine may be at
-            work), in seconds; of states that are not answered before the next one, the oldest counts. A command does
-            not say which state it answers: where all answers come more than a period late, they are taken for those to
-            the next state.
-        lost: seconds of the clock that the simulation could not keep up with.
+        statistics: the statistics of its cycles; ``step`` is the simulation.
+        state_to_command: the times in seconds from sending a state to the arrival of the next command at the computer
+            (the machine may be simulating then). If a state is not answered before the next one, the older one counts.
+            A command does not say which state it answers: if all answers take more than a period, they are taken for
+            answers to the next state.
+        lost: the time in seconds by which the simulation did not keep up with the clock.
+
+    Raises:
+        BridgeError: there is no bus at ``url``.
     """
 
     def __init__(
@@ -65,19 +78,7 @@ class MachineLoop:
         control: socket.socket | None = None,
         connect_timeout: float = 2.0,
     ) -> None:
-        """
-        Args:
-            url: of the bus.
-            clock: the wall's by default.
-            control: a connected stream; the loop stops when its other end closes.
-
-        Raises:
-            BridgeError: there is no bus at ``url``.
-        """
         self.machine = machine
-        self.statistics = LoopStatistics(machine.config.period)
-        self.state_to_command = Histogram()
-        self.lost = 0.0
         self._clock = clock or WallClock()
         self._control = control
         self._lines = b""
@@ -89,39 +90,47 @@ class MachineLoop:
         self._arrived: set[str] = set()
         self._alone = True
         self._reconnections = 0
-        self._told = inf
+        self._sent_at = inf
         self._next_status = 0
+        self._reset_statistics()
         handlers = {channel: self._receive for channel in machine.channels}
-        handlers[machine.config.control_channel] = self._hear
+        handlers[machine.config.control_channel] = self._answer_by_bus
         self._link = LcmLink(url, handlers, connect_timeout=connect_timeout, stamped=True)
         self._link.open()
 
+    def _reset_statistics(self) -> None:
+        self.statistics = LoopStatistics(self.machine.config.period)
+        self.state_to_command = Histogram()
+        self.lost = 0.0
+
     def stop(self) -> None:
-        """Ends `run` after the present cycle; also from a signal handler."""
+        """End `run` after the present cycle; safe in a signal handler."""
         self._stop.set()
 
     def close(self) -> None:
-        """Gives the connection back."""
+        """Close the connection to the bus."""
         self._link.close()
 
     def run(self, *, lock_step: bool = False, cycles: float = inf, ready: Callable[[], None] = lambda: None) -> None:
-        """Tells the state at the beginning of each cycle. With the clock, the commands that have come by then act in
-        it, as those of a robot on a fieldbus do: the answer to a state acts a period later. In lock-step, the answer
-        acts in the cycle whose state it answers, as a testbed's DPS does in simulation.
+        """Do cycles, and send the state at the beginning of each.
+
+        With the clock, the commands that have arrived by then act in the cycle, as those of a robot on a fieldbus do:
+        the answer to a state acts a period later. In lock-step, the answer acts in the cycle whose state it answers, as
+        the DPS of a testbed does in simulation.
 
         Args:
-            lock_step: a cycle begins when one message has arrived on every command channel, instead of with the clock.
-            cycles: after how many it ends.
-            ready: called when the first state is told.
+            lock_step: begin a cycle when one message has arrived on every command channel, instead of with the clock.
+            cycles: the number of cycles.
+            ready: called when the first state is sent.
 
         Raises:
             RuntimeError: the simulation failed.
         """
         end = self.machine.cycle + cycles
-        self.machine.refuse_late(not lock_step)
+        self.machine.reject_late(not lock_step)
         self._messages = self.machine.messages()
         begin = self._clock.now() - self.machine.time
-        self._tell()
+        self._send_state()
         ready()
         while not self._stop.is_set() and self.machine.cycle < end:
             if lock_step:
@@ -130,16 +139,16 @@ class MachineLoop:
                     self._cycle_in_lock_step()
             else:
                 begin = self._cycle_by_clock(begin, end)
-            self._serve()
+            self._answer_by_control()
 
     def _cycle_in_lock_step(self) -> None:
         begin = self._clock.now()
         step = self._advance(1)
-        self._tell()
+        self._send_state()
         self.statistics.record(lateness=0.0, step=step, cycle=self._clock.now() - begin)
 
     def _cycle_by_clock(self, begin: float, end: float) -> float:
-        """Where the clock's zero was, and where it is after this cycle."""
+        """Do the cycles that are due; return the time of cycle 0 on the clock, which moves when time is lost."""
         work = self._clock.now()
         begin, steps = self._behind(begin, work)
         step = self._advance(int(min(steps, end - self.machine.cycle)))
@@ -147,13 +156,13 @@ class MachineLoop:
         deadline = begin + self.machine.time
         woke = self._await(deadline)
         if not self._stop.is_set():
-            self._tell()
+            self._send_state()
             self.statistics.record(lateness=woke - deadline, step=step, cycle=worked + self._clock.now() - woke)
             self.statistics.miss(steps - 1)
         return begin
 
     def _advance(self, cycles: int) -> float:
-        """Does cycles, prepares what is to be told then, and gives the seconds that the simulation took."""
+        """Do cycles, prepare the messages that follow, and return the seconds that the simulation took."""
         begin = self._clock.now()
         for _ in range(cycles):
             self.machine.advance()
@@ -164,7 +173,7 @@ class MachineLoop:
     # -- when a cycle begins
 
     def _await(self, deadline: float) -> float:
-        """Takes in what arrives until the deadline."""
+        """Take messages until the deadline; return the time then."""
         if isinstance(self._clock, WallClock):
             while (left := deadline - self._clock.now()) > 0.0 and not self._stop.is_set():
                 self._link.take(left, _BURST)
@@ -173,7 +182,7 @@ class MachineLoop:
         return woke
 
     def _behind(self, begin: float, now: float) -> tuple[float, int]:
-        """Where the clock's zero is, and how many cycles are due: a body does not stop while nobody looks at it."""
+        """Return the time of cycle 0 on the clock, and the number of cycles to do; the world catches up."""
         period = self.machine.config.period
         due = int((now - begin) / period + 1e-6) + 1 - self.machine.cycle
         steps = max(1, min(due, int(_CATCH_UP / period)))
@@ -182,14 +191,14 @@ class MachineLoop:
         return begin + lost, steps
 
     def _await_commands(self) -> None:
-        """One message on every command channel."""
+        """Wait for one message on every command channel."""
         channels = set(self.machine.channels)
         repeat = time.monotonic() + _REPEAT
         while not self._arrived >= channels and not self._stop.is_set():
-            # One at a time: what is ahead of its cycle waits on the line.
+            # One at a time: messages that are ahead of their cycle stay in the connection.
             self._link.take(_SLICE, 1)
-            self._serve()
-            # Who comes to a new bus after the state was told would wait for it, and the machine for him.
+            self._answer_by_control()
+            # A controller that joins the bus after the state was sent would wait for it, and the machine for a command.
             self._alone |= self._link.reconnections > self._reconnections
             if self._alone and time.monotonic() >= repeat:
                 repeat = time.monotonic() + _REPEAT
@@ -200,39 +209,39 @@ class MachineLoop:
 
     def _receive(self, channel: str, data: bytes) -> None:
         arrived = self._link.arrived or time.monotonic()
-        if self._told <= arrived:
-            self.state_to_command.record(arrived - self._told)
-            self._told = inf
+        if self._sent_at <= arrived:
+            self.state_to_command.record(arrived - self._sent_at)
+            self._sent_at = inf
         self._arrived.add(channel)
         self.machine.receive(channel, data)
 
-    # -- what it tells
+    # -- what it sends
 
-    def _tell(self) -> None:
-        # Before they leave: where the controller preempts this process, its answer is there before `_publish` returns.
-        # A state without an answer counts until one comes.
-        self._told = min(self._told, time.monotonic())
+    def _send_state(self) -> None:
+        # Before they leave: a controller that preempts this process answers before `_publish` returns. A state without
+        # an answer counts until one arrives.
+        self._sent_at = min(self._sent_at, time.monotonic())
         self._publish()
         braking = self.machine.braking
         if self.machine.cycle >= self._next_status or braking != self._braking:
             self._braking = braking
-            self._tell_status()
+            self._send_status()
 
     def _publish(self) -> None:
         self._link.publish(*self._messages)
 
-    def _tell_status(self) -> None:
+    def _send_status(self) -> None:
         config = self.machine.config
         self._next_status = self.machine.cycle + max(1, round(config.status_period / config.period))
         self._link.publish((config.status_channel, json.dumps(self.machine.status().to_dict()).encode()))
 
     # -- requests
 
-    def _hear(self, channel: str, data: bytes) -> None:
+    def _answer_by_bus(self, channel: str, data: bytes) -> None:
         self._answer(data)
-        self._tell_status()
+        self._send_status()
 
-    def _serve(self) -> None:
+    def _answer_by_control(self) -> None:
         if self._control is None:
             return
         try:
@@ -242,23 +251,23 @@ class MachineLoop:
         except OSError:
             received = b""
         if not received:
-            _log.info("the one who started the machine is gone")
+            _log.info("the parent process has closed the connection: the machine ends")
             self._stop.set()
             return
         *lines, self._lines = (self._lines + received).split(b"\n")
         for line in lines:
             try:
-                # Who asks waits for the answer, so that there is room for it.
+                # The parent waits for the answer, so there is room for it.
                 self._control.sendall(json.dumps(self._answer(line)).encode() + b"\n")
             except OSError as error:
-                _log.warning("an answer could not be given: %s", error)
+                _log.warning("a request could not be answered: %s", error)
                 self._stop.set()
 
     def _answer(self, text: bytes) -> dict[str, Any]:
         try:
             more = self._do(json_object(text, InjectedFaultError))
         except ValueError as error:
-            _log.warning("request refused: %s", error)
+            _log.warning("request rejected: %s", error)
             return {"error": str(error)}
         return {**self.machine.status().to_dict(), **more}
 
@@ -267,17 +276,17 @@ class MachineLoop:
             self.machine.begin(fault_from_dict(request))
             return {}
         if "set" in request:
-            self.machine.write(_values(request["set"]))
+            if not isinstance(request["set"], dict):
+                raise InjectedFaultError(f"set needs an object of values by address, not {request['set']!r}")
+            self.machine.write(request["set"])
             return {}
         name = request.get("request")
         if name == "die":
             os._exit(DIED)
         if name == "normal":
-            self.machine.normal()
+            self.machine.end_faults()
         elif name == "reset statistics":
-            self.statistics = LoopStatistics(self.machine.config.period)
-            self.state_to_command = Histogram()
-            self.lost = 0.0
+            self._reset_statistics()
         elif name == "statistics":
             return {
                 "statistics": self.statistics.to_dict(),
@@ -286,13 +295,46 @@ class MachineLoop:
             }
         elif name != "status":
             raise InjectedFaultError(
-                "a request is a fault, values to set, or one of status, normal, statistics, reset statistics, die; it "
-                f"cannot be {request!r}"
+                "a request must be a fault, values to set, or one of status, normal, statistics, reset statistics and "
+                f"die, not {request!r}"
             )
         return {}
 
 
-def _values(given: Any) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise InjectedFaultError(f"what is set is given by address, unlike {given!r}")
-    return given
+def serve(
+    loop: MachineLoop,
+    *,
+    lock_step: bool = False,
+    cycles: float = inf,
+    priority: int = 0,
+    ready: Callable[[], None] = lambda: None,
+) -> None:
+    """Run a loop in the main thread of a process that does nothing else, until SIGTERM (or SIGINT, if not ignored).
+
+    Args:
+        loop: the loop, which is closed at the end.
+        lock_step: see `MachineLoop.run`, as for ``cycles`` and ``ready``.
+        cycles: the number of cycles.
+        priority: the priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
+        ready: called when the first state is sent.
+
+    Raises:
+        RuntimeError: the simulation failed.
+    """
+    signal.signal(signal.SIGTERM, lambda *_: loop.stop())
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, lambda *_: loop.stop())
+    # Without a longest step: a simulation that cannot keep up computes without a pause.
+    real_time = RealTime(priority=priority, longest_step=None) if priority else nullcontext()
+    try:
+        with real_time:
+            if isinstance(real_time, RealTime):
+                _log.info("%s", real_time)
+            loop.run(lock_step=lock_step, cycles=cycles, ready=ready)
+    finally:
+        loop.close()
+
+
+def epoch(*, lock_step: bool) -> int:
+    """Return the time of cycle 0 in microseconds: the time of day, or 0 in lock-step, for equal messages each time."""
+    return 0 if lock_step else time.time_ns() // 1000

@@ -1,43 +1,96 @@
-"""The physical robot, played: a simulated world that speaks the machine's protocol, cycle by cycle, without a clock."""
+"""The machine: a simulated world that plays the physical robot, cycle by cycle, without a clock or a bus."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from math import inf
 from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import Context
 
-from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.control.bridge import ReceivedSignal, reported_signals
 from vtbdrake.control.sensor_monitor import LatencyMonitor
 from vtbdrake.lcm.bridge import ChannelReader
-from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.machine.brake import HoldingBrake
-from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.faults import ACT, SENSE, InjectedFault, InjectedFaultError, NoBrake, Packet, whole_cycles
-from vtbdrake.machine.line import Line
-from vtbdrake.machine.perturbation import perturbed_values
-from vtbdrake.machine.sensors import Sensors
+from vtbdrake.lcm.protocol import Protocol, protocol_of
+from vtbdrake.machine.injected_faults import (
+    ACT,
+    SENSE,
+    DelayLine,
+    InjectedFault,
+    InjectedFaultError,
+    NoBrake,
+    Packet,
+    whole_cycles,
+)
+from vtbdrake.state.variables import A
 from vtbdrake.testbed import Scenario, WorldAlone
+
+HOLD, IDLE, LOCK = "hold", "idle", "lock"
+BRAKES = (HOLD, IDLE, LOCK)
+
+PERTURBED = ("mass", "damping", "friction", "rotor_inertia")
+"""The variables that are perturbed, by the last part of their addresses. An inertia changes with its mass."""
 
 _REORDER_WINDOW = 0.1  # s, see `LcmBridge`
 _MICROSECONDS = 1e6
 
 
+@dataclass(frozen=True, kw_only=True)
+class MachineConfig:
+    """How a machine differs from the simulated world, and how it behaves.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+
+    period: float = 1e-3  # s, of a cycle
+    values: Mapping[str, Any] = field(default_factory=dict)  # variables of the world to set, by address
+    perturb: float = 0.0  # largest relative change, see `perturbed_values`; `values` are set afterwards
+    noise: Mapping[str, float] = field(default_factory=dict)  # vector sensor signal -> standard deviation, in its unit
+    seed: int = 0  # of perturbation, noise and faults
+    sense_latency: float = 0.0  # s, of messages to the controller, rounded up to whole cycles
+    act_latency: float = 0.0  # s, of messages from the controller, rounded up to whole cycles
+    timeout: float = 0.1  # s without an actuator command after which the machine brakes
+    max_latency: float = 0.1  # s, of an actuator command beyond that of the quickest one, by the clock of its sender
+    brake: str = ""  # hold, idle or lock (see `HoldingBrake`); empty: lock if the plant is discrete, else idle
+    control_channel: str = "VTB_MACHINE"  # the LCM channel of requests
+    status_channel: str = "VTB_MACHINE_STATUS"  # the LCM channel of the status
+    status_period: float = 0.1  # s
+
+    def __post_init__(self) -> None:
+        positive, finite = "must be a positive time in seconds", "must be a time of at least 0 s"
+        for name in ("period", "timeout", "status_period"):
+            self._check(0.0 < getattr(self, name) < inf, name, positive)
+        self._check(self.max_latency > 0.0, "max_latency", f"{positive}, or inf to accept any")
+        for name in ("sense_latency", "act_latency"):
+            self._check(0.0 <= getattr(self, name) < inf, name, finite)
+        self._check(0.0 <= self.perturb < 1.0, "perturb", "must be a relative change from 0 to below 1")
+        self._check(self.seed >= 0, "seed", "must be a whole number from 0 on")
+        self._check(self.brake in ("", *BRAKES), "brake", f"must be one of {', '.join(BRAKES)}")
+        for name, deviation in self.noise.items():
+            if not 0.0 <= deviation < inf:
+                raise ValueError(f"the noise of {name} must be a standard deviation from 0 on, not {deviation!r}")
+
+    def _check(self, valid: bool, name: str, expected: str) -> None:
+        if not valid:
+            raise ValueError(f"{name} of a machine {expected}, not {getattr(self, name)!r}")
+
+
 @dataclass
 class MachineStatus:
-    """How a machine is.
+    """The status of a machine.
 
     Attributes:
-        cycle: how many it has done.
-        time: of its world, in seconds.
-        braking: whether it braked in its last cycle.
-        silent: command channels on which, by then, none had been accepted for longer than its timeout.
-        accepted: by actuator signal, how many commands it took.
-        rejected: by actuator signal, how many it did not, by the reason; see `ReceivedSignal`, and
-            `Machine.refuse_late` for those that are ``late``.
-        faults: those that have begun, as `InjectedFault.to_dict` gives them.
+        cycle: the number of cycles it has done.
+        time: the time of its world, in seconds.
+        braking: True if it braked in its last cycle.
+        silent: the command channels on which no command was accepted for longer than its timeout.
+        accepted: the number of accepted commands, by actuator signal.
+        rejected: the number of rejected commands, by actuator signal and reason; see `ReceivedSignal`, and
+            `Machine.reject_late` for the reason ``late``.
+        faults: the injected faults that have begun, as `InjectedFault.to_dict` gives them.
     """
 
     cycle: int
@@ -49,30 +102,30 @@ class MachineStatus:
     faults: list[dict[str, Any]]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, fit for JSON."""
+        """Return the status as plain data for JSON."""
         return asdict(self)
 
 
 class Machine:
-    """A scenario's world as a machine, with perturbed parameters, noise, delays, a brake and faults.
+    """The world of a scenario as a machine, with perturbed parameters, noise, latencies, a brake and injected faults.
 
     Cycle k takes it from k periods to k + 1, under the newest of the commands that were received before. If the answer
     to the state of k periods is among them, a controller commands it as a testbed's DPS commands the simulated world.
     Nothing in it depends on a clock: equal commands in equal cycles, and equal requests, give equal messages. Only
-    where it is told to `refuse_late`, commands have to come in time.
+    after `reject_late`, commands must come in time.
 
     Args:
-        scenario: whose world it is, and whose deployment has the protocol that it speaks (see `Protocol`).
-        config: see there.
-        epoch: what its messages tell as the time of cycle 0, in microseconds.
+        scenario: the scenario of the world. Its deployment has the protocol of the machine (see `Protocol`).
+        config: the differences from the simulated world.
+        epoch: the time of cycle 0 in its messages, in microseconds.
 
     Attributes:
-        protocol: what it speaks.
-        cycle: how many it has done.
-        perturbed: values of variables that are not the scenario's own, by address.
+        protocol: its LCM protocol.
+        cycle: the number of cycles it has done.
+        perturbed: the values of variables that differ from the scenario's, by address.
 
     Raises:
-        ProtocolError: the scenario does not say what its machine speaks, or not of all signals.
+        ProtocolError: the scenario has no protocol, or one that does not fit its signals.
         ValueError: the config does not fit the scenario.
     """
 
@@ -89,52 +142,51 @@ class Machine:
         self.perturbed.update(config.values)
         world.write(self._context, self.perturbed)
         self._simulator = world.simulator(self._context)
-        self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
 
         self._lines = {
-            side: Line(side, delay=whole_cycles(delay, config.period), period=config.period, random=random)
-            for side, delay, random in ((SENSE, config.sense_delay, sense), (ACT, config.act_delay, act))
+            side: DelayLine(delay=whole_cycles(latency, config.period), period=config.period, random=random)
+            for side, latency, random in ((SENSE, config.sense_latency, sense), (ACT, config.act_latency, act))
         }
         self._brake = HoldingBrake(world, config.brake)
-        self._given = dict(self._brake.idle())
         self._feed = world.feed(self._context)
-        self._sensors = Sensors(world, self.protocol, config, noise, given=self._given)
+        self._actuation = dict(self._brake.idle)  # What acts, by actuator signal.
+        self._sensors = _Sensors(world, self.protocol, config, noise, actuation=self._actuation)
         signals = {signal.name: signal for signal in world.interface.act}
-        self._receptions = {name: ReceivedSignal() for name in signals}
-        self._inlets = {
-            map.channel: ChannelReader(map, [signals[name] for name in map.signals], self._receptions, _REORDER_WINDOW)
+        self._received = {name: ReceivedSignal() for name in signals}
+        self._readers = {
+            map.channel: ChannelReader(map, [signals[name] for name in map.signals], self._received, _REORDER_WINDOW)
             for map in self.protocol.act
         }
         self._types = {map.channel: map.type for map in self.protocol.act}
-        self._accepted: dict[str, float] = dict.fromkeys(self._receptions, -inf)
-        self._counts = dict.fromkeys(self._receptions, 0)
-        self._commands: dict[str, Any] = dict.fromkeys(self._receptions)
-        self._delays: dict[str, LatencyMonitor] = {}
+        self._counts = dict.fromkeys(signals, 0)
+        self._accepted = dict.fromkeys(signals, -inf)  # The cycle of the last accepted command.
+        self._commands: dict[str, Any] = dict.fromkeys(signals)
+        self._latencies: dict[str, LatencyMonitor] = {}
         self._patience = whole_cycles(config.timeout, config.period)
         self._silent: list[str] = []
 
     @property
     def time(self) -> float:
-        """Of its world, in seconds."""
+        """The time of its world, in seconds."""
         return self.cycle * self.config.period
 
     @property
     def channels(self) -> list[str]:
-        """On which it is commanded."""
-        return list(self._inlets)
+        """The LCM channels of actuator commands."""
+        return list(self._readers)
 
     @property
     def braking(self) -> bool:
-        """Whether it braked in its last cycle."""
+        """True if it braked in its last cycle."""
         return self._brake.engaged
 
     def read(self, address: str) -> Any:
-        """The value of a variable or output port of its world."""
+        """Return the value of a variable or output port of its world."""
         return self.world.read(self._context, address)
 
     def write(self, values: Mapping[str, Any]) -> None:
-        """Sets variables of its world between two cycles, by address: a tool that was changed, say.
+        """Set variables of its world between two cycles, by address, as if a tool was changed.
 
         Raises:
             ValueError: an address is unknown, or a value impossible; nothing has changed.
@@ -142,104 +194,236 @@ class Machine:
         self.world.write(self._context, values)
         self.perturbed.update(values)
 
-    def refuse_late(self, refuse: bool) -> None:
-        """Whether commands are refused that took longer than the quickest one by more than the config's ``max_delay``.
+    def reject_late(self, reject: bool) -> None:
+        """Reject, or accept, commands whose latency exceeds that of the quickest one by more than ``max_latency``.
 
-        They have waited somewhere: in a hub that stood still, say. Only for senders whose clock runs as this computer's
-        does, so not in lock-step; a sender that does not tell the time is not late.
+        Such commands have waited somewhere, in a hub that was stopped for example. This needs a sender whose clock
+        runs as fast as this computer's, so not in lock-step. A sender that does not tell the time is never late.
         """
-        wanted = refuse and self.config.max_delay < inf
-        self._delays = {name: LatencyMonitor(self.config.max_delay) for name in self._receptions} if wanted else {}
+        wanted = reject and self.config.max_latency < inf
+        self._latencies = {n: LatencyMonitor(self.config.max_latency) for n in self._received} if wanted else {}
 
     # -- cycles
 
     def receive(self, channel: str, data: bytes) -> None:
-        """Takes a message of the controller, which may go through delays and faults before it is looked at."""
+        """Take a message of the controller, which passes the latency and the injected faults before it is decoded."""
         self._lines[ACT].send(Packet(channel, self._types[channel], data, self.cycle))
 
     def advance(self) -> None:
-        """Does one cycle.
+        """Do one cycle.
 
         Raises:
             RuntimeError: the simulation failed.
         """
         for packet in self._lines[ACT].arrivals(self.cycle):
-            self._inlets[packet.channel].take(packet.channel, packet.data)
-        for name, reception in self._receptions.items():
-            if reception.count > self._counts[name]:
-                self._counts[name] = reception.count
-                self._accept(name, reception)
+            self._readers[packet.channel].take(packet.channel, packet.data)
+        for name, received in self._received.items():
+            if received.count > self._counts[name]:
+                self._counts[name] = received.count
+                self._accept(name, received)
         coasting = NoBrake.name in self._lines[SENSE].faults
-        self._silent = self._find_silent()
+        oldest = self.cycle - self._patience
+        self._silent = [
+            map.channel for map in self.protocol.act if max(self._accepted[name] for name in map.signals) < oldest
+        ]
         self._brake.set(self._context, bool(self._silent) and not coasting)
-        for name in self._receptions:
-            self._give(name, self._command(name, self._commands[name], coasting))
+        for name, command in self._commands.items():
+            # A signal may be missing in the messages that arrive; its last command becomes stale.
+            stale = self._accepted[name] < oldest and not coasting
+            self._apply(name, self._brake.actuation(name, command, stale))
         self._simulator.AdvanceTo((self.cycle + 1) * self.config.period)
         self.cycle += 1
 
-    def _accept(self, name: str, reception: ReceivedSignal) -> None:
-        delay = self._delays.get(name)
-        if delay is not None and delay.excess(reception) > delay.limit:
-            reception.reject("late")
+    def _accept(self, name: str, received: ReceivedSignal) -> None:
+        latency = self._latencies.get(name)
+        if latency is not None and latency.excess(received) > latency.limit:
+            received.reject("late")
         else:
-            self._accepted[name], self._commands[name] = self.cycle, reception.value
+            self._accepted[name], self._commands[name] = self.cycle, received.value
 
-    def _find_silent(self) -> list[str]:
-        since = self.cycle - self._patience
-        return [map.channel for map in self.protocol.act if max(self._accepted[name] for name in map.signals) < since]
-
-    def _command(self, name: str, last: Any, coasting: bool) -> Any:
-        if self._brake.engaged:
-            return self._brake.command(name, last)
-        # A signal may be missing in messages that come; what was said of it long ago is not a command any more.
-        stale = self._accepted[name] < self.cycle - self._patience and not coasting
-        return self._brake.idle()[name] if stale or last is None else last
-
-    def _give(self, name: str, value: Any) -> None:
-        # Receptions hold a new object for every message: what is the same object has not changed.
-        if self._given[name] is not value:
-            self._given[name] = value
+    def _apply(self, name: str, value: Any) -> None:
+        # Every message makes a new object: what is the same object has not changed.
+        if self._actuation[name] is not value:
+            self._actuation[name] = value
             self._feed(name, value)
 
     def messages(self) -> list[tuple[str, bytes]]:
-        """Tells the present state: channel and bytes of what arrives at the controller now, in order."""
+        """Measure the present state, and return channel and bytes of what arrives at the controller now, in order."""
         line = self._lines[SENSE]
-        utime = self._epoch + round(self.time * _MICROSECONDS)
-        errors = {channel: round(line.clock_error(channel) * _MICROSECONDS) for channel in self._sensors.channels}
-        for packet in self._sensors.packets(self._context, self.cycle, utime, errors):
+        for packet in self._sensors.packets(self._context, self.cycle, self._message_time):
             line.send(packet)
         return [(packet.channel, packet.data) for packet in line.arrivals(self.cycle)]
+
+    def _message_time(self, channel: str) -> int:
+        error = self._lines[SENSE].clock_error(channel)
+        return self._epoch + round(self.time * _MICROSECONDS) + round(error * _MICROSECONDS)
 
     # -- faults
 
     def begin(self, fault: InjectedFault) -> None:
-        """Begins a fault, from the next message on; it takes the place of one of the same name and side.
+        """Begin a fault, from the next message on, in place of one of the same name and side.
 
         Raises:
-            InjectedFaultError: it names a channel that there is not.
+            InjectedFaultError: the machine has no such channel.
         """
-        line = self._lines[fault.side]
         known = self._sensors.channels if fault.side == SENSE else self.channels
         for channel in fault.channels:
             if channel not in known:
                 raise InjectedFaultError(
                     f"the machine has no {fault.side} channel {channel!r}; it has: {', '.join(known)}"
                 )
-        line.begin(fault)
+        self._lines[fault.side].begin(fault)
 
-    def normal(self) -> None:
-        """Ends all faults."""
+    def end_faults(self) -> None:
+        """End all injected faults."""
         for line in self._lines.values():
-            line.end()
+            line.end_faults()
 
     def status(self) -> MachineStatus:
-        """How it is now."""
+        """Return the present status."""
         return MachineStatus(
             cycle=self.cycle,
             time=self.time,
             braking=self._brake.engaged,
             silent=list(self._silent),
-            accepted={name: reception.count for name, reception in self._receptions.items()},
-            rejected={name: dict(reception.rejected) for name, reception in self._receptions.items()},
+            accepted={name: received.count for name, received in self._received.items()},
+            rejected={name: dict(received.rejected) for name, received in self._received.items()},
             faults=[fault.to_dict() for line in self._lines.values() for fault in line.faults.values()],
         )
+
+
+class HoldingBrake:
+    """The safety of the machine itself, when no commands arrive.
+
+    ``lock``: the joints that have actuators stop at once, as if brakes engaged, and the actuators get their idle
+    commands; it needs a discrete plant. ``idle``: the actuators get their idle commands. ``hold``: they keep the last
+    ones, which is right for position commands.
+
+    Args:
+        world: the world of the machine.
+        kind: one of `BRAKES`; empty for ``lock`` if the plant is discrete, else ``idle``.
+
+    Attributes:
+        engaged: True while it brakes.
+        idle: the idle commands by actuator signal; arrays for vector signals.
+
+    Raises:
+        ValueError: joints of a continuous plant cannot be locked.
+    """
+
+    def __init__(self, world: WorldAlone, kind: str) -> None:
+        plant = world.plant
+        lockable = plant is not None and plant.time_step() > 0.0
+        if kind == LOCK and not lockable:
+            raise ValueError("only the joints of a discrete plant can be locked: choose the brake idle or hold")
+        self._kind = kind or (LOCK if lockable else IDLE)
+        self.engaged = False
+        self.idle = {s.name: s.vector(s.idle) if s.is_vector else s.idle for s in world.interface.act}
+        self._plant = plant
+        self._joints = []
+        if plant is not None and self._kind == LOCK:
+            self._joints = [plant.get_joint_actuator(index).joint() for index in plant.GetJointActuatorIndices()]
+
+    def actuation(self, name: str, command: Any, stale: bool) -> Any:
+        """Return what acts on an actuator.
+
+        Args:
+            name: the actuator signal.
+            command: its last command; None if there was none.
+            stale: True if the command is too old to be obeyed.
+        """
+        idle = self._kind != HOLD if self.engaged else stale
+        return self.idle[name] if idle or command is None else command
+
+    def set(self, context: Context, engaged: bool) -> None:
+        """Engage or release the brake in a context of the world."""
+        if engaged == self.engaged:
+            return
+        self.engaged = engaged
+        if self._plant is not None:
+            own = self._plant.GetMyMutableContextFromRoot(context)
+            for joint in self._joints:
+                if engaged:
+                    joint.Lock(own)
+                else:
+                    joint.Unlock(own)
+
+
+class _Sensors:
+    """Makes messages of the simulated sensor signals, with noise, and of the actuation that the machine reports."""
+
+    def __init__(
+        self,
+        world: WorldAlone,
+        protocol: Protocol,
+        config: MachineConfig,
+        random: np.random.Generator,
+        *,
+        actuation: Mapping[str, Any],
+    ) -> None:
+        signals = {signal.name: signal for signal in world.interface.sense}
+        vectors = [signal.name for signal in signals.values() if signal.is_vector]
+        for name in config.noise:
+            if name not in vectors:
+                raise ValueError(f"noise is added to vector sensor signals ({', '.join(vectors)}), not to {name!r}")
+        self._noise = config.noise
+        self._random = random
+        self._actuation = actuation  # Kept up to date by the machine.
+        carriers = reported_signals(world.interface, protocol.reported)
+        known = signals | {signal.name: signal for signal in carriers.values()}
+        self._reported = {signal.name: name for name, signal in carriers.items()}
+        self._maps = [(map, map.encoder([known[name] for name in map.signals])) for map in protocol.sense]
+        self._cycles = {
+            map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
+            for map in protocol.sense
+        }
+        self._ports = {name: world.diagram.GetOutputPort(f"sense.{name}") for name in vectors}
+        self._readers = {name: world.reader(f"sense.{name}") for name in signals if name not in vectors}
+        self.channels = list(self._cycles)
+
+    def packets(self, context: Context, cycle: int, time: Callable[[str], int]) -> list[Packet]:
+        """Return the messages of this cycle.
+
+        Args:
+            context: the context of the world.
+            cycle: the number of the cycle.
+            time: the time of a message in microseconds, as a function of its channel.
+        """
+        return [
+            Packet(
+                map.channel,
+                map.type,
+                encode({name: self._measure(name, context) for name in map.signals}, time(map.channel)),
+                cycle,
+            )
+            for map, encode in self._maps
+            if cycle % self._cycles[map.channel] == 0
+        ]
+
+    def _measure(self, name: str, context: Context) -> Any:
+        if name in self._reported:
+            return self._actuation[self._reported[name]]
+        if name not in self._ports:
+            return self._readers[name](context)
+        # Not a copy: it becomes a message before anything changes.
+        value = self._ports[name].Eval(context)
+        deviation = self._noise.get(name)
+        return value if deviation is None else value + deviation * self._random.standard_normal(value.shape)
+
+
+def perturbed_values(
+    world: WorldAlone, context: Context, relative: float, random: np.random.Generator
+) -> dict[str, Any]:
+    """Return new values, by address, of all variables of the world that `PERTURBED` names.
+
+    Every entry is multiplied by its own factor, uniform in [1 - relative, 1 + relative], drawn in the order of the
+    addresses. Values beyond the bounds of a variable are set to the bound.
+    """
+    changed = {}
+    for address, variable in world.variables().items():
+        if variable.kind != A or variable.derived or address.rpartition(".")[2] not in PERTURBED:
+            continue
+        factor = 1.0 + relative * random.uniform(-1.0, 1.0, variable.shape)
+        value = np.clip(variable.get(context) * factor, *variable.bounds)
+        changed[address] = value if variable.shape else float(value)
+    return changed

@@ -1,8 +1,9 @@
-"""A machine in a process of its own."""
+"""A machine in a child process."""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import socket
@@ -14,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.child_process import ChildProcess, StartError
+from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
-from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.faults import InjectedFault
-from vtbdrake.machine.machine import MachineStatus
-from vtbdrake.machine.serve import serve_child
+from vtbdrake.machine.injected_faults import InjectedFault
+from vtbdrake.machine.loop import MachineLoop, epoch, serve
+from vtbdrake.machine.machine import Machine, MachineConfig, MachineStatus
 from vtbdrake.testbed import Scenario
 
 _START_TIMEOUT = 60.0
@@ -27,17 +28,17 @@ _ANSWER_TIMEOUT = 10.0
 
 
 class MachineError(RuntimeError):
-    """A machine that does not start, does not answer, or refuses a request."""
+    """A machine does not start, does not answer, or rejects a request."""
 
 
 @dataclass(frozen=True)
 class MachineStatistics:
-    """What a machine measured of its loop.
+    """Statistics of the loop of a machine; see `MachineLoop`.
 
     Attributes:
-        loop: its cycles; ``step`` is the simulation.
-        state_to_command: from telling a state to the next command's arrival, in seconds.
-        lost: seconds that the simulation could not keep up with.
+        loop: the statistics of its cycles; ``step`` is the simulation.
+        state_to_command: the times from sending a state to the arrival of the next command, in seconds.
+        lost: the time in seconds by which the simulation did not keep up with the clock.
     """
 
     loop: LoopStatistics
@@ -46,21 +47,21 @@ class MachineStatistics:
 
 
 class MachineProcess:
-    """A machine in a process of its own, which ends with `close`, and with the process that started it.
+    """A machine in a child process, which ends with `close`, and with the process that started it.
 
         with Hub(port=0) as hub, MachineProcess(scenario, hub.url) as machine:
             machine.begin(Delay(seconds=0.05))
 
-    Requests are answered between two cycles: what is begun holds from the next message on.
+    Requests are answered between two cycles: a fault acts from the next message on.
 
     Args:
-        scenario: whose world it is; a class that other processes can import.
-        url: of the bus.
-        config: see there.
-        lock_step: cycles begin with commands, instead of with the clock; see `MachineLoop.run`.
-        cycles: after how many it ends by itself.
-        priority: of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
-        options: fields of the config, in its place or to change it.
+        scenario: the scenario of its world.
+        url: the URL of the LCM bus.
+        config: the differences from the simulated world.
+        lock_step: begin cycles with commands, instead of with the clock; see `MachineLoop.run`.
+        cycles: the number of cycles after which it ends; by default it goes on.
+        priority: the priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
+        options: fields of the config, which replace those of ``config``.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        self._child = ChildProcess(serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
+        self._child = ChildProcess(_serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
         try:
             self._child.wait_until_ready(_START_TIMEOUT)
         except BaseException as error:
@@ -119,7 +120,7 @@ class MachineProcess:
         return self._child is not None and self._child.alive
 
     def status(self) -> MachineStatus:
-        """How it is now.
+        """Return the present status.
 
         Raises:
             MachineError: it does not answer.
@@ -127,7 +128,7 @@ class MachineProcess:
         return self._status({"request": "status"})
 
     def statistics(self) -> MachineStatistics:
-        """What it measured since its start, or since `reset_statistics`."""
+        """Return the statistics since the start, or since `reset_statistics`."""
         answer = self._ask({"request": "statistics"})
         return MachineStatistics(
             LoopStatistics.from_dict(answer["statistics"]),
@@ -136,40 +137,40 @@ class MachineProcess:
         )
 
     def reset_statistics(self) -> None:
-        """Forgets what it measured, of a warm-up say."""
+        """Reset the statistics, after a warm-up for example."""
         self._ask({"request": "reset statistics"})
 
     def until(self, condition: Callable[[MachineStatus], bool], *, timeout: float = 10.0) -> MachineStatus:
-        """Waits for a status that fulfils the condition, and returns it.
+        """Wait for a status that fulfils the condition, and return it.
 
         Raises:
-            MachineError: there was none in ``timeout`` seconds.
+            MachineError: there was none within ``timeout`` seconds.
         """
         limit = time.monotonic() + timeout
         while not condition(status := self.status()):
             if time.monotonic() > limit:
-                raise MachineError(f"the machine did not get there in {timeout} s; it is at {status}")
+                raise MachineError(f"the machine did not reach the expected status within {timeout} s; it has {status}")
         return status
 
     def write(self, values: Mapping[str, Any]) -> MachineStatus:
-        """Sets variables of its world, by address: a tool that is changed while it runs, say.
+        """Set variables of its world by address, as if a tool was changed while it runs.
 
         Raises:
             MachineError: an address is unknown, or a value impossible; nothing has changed.
         """
-        return self._status({"set": _lists(values)})
+        return self._status({"set": {address: np.asarray(value).tolist() for address, value in values.items()}})
 
-    # -- what goes wrong
+    # -- faults
 
     def begin(self, *faults: InjectedFault) -> MachineStatus:
-        """Begins faults; each lasts until `normal`, or until one of the same name and side takes its place."""
+        """Begin faults; each lasts until `end_faults`, or until one of the same name and side replaces it."""
         status = None
         for fault in faults:
             status = self._status(fault.to_dict())
         return status or self.status()
 
-    def normal(self) -> MachineStatus:
-        """Ends all faults."""
+    def end_faults(self) -> MachineStatus:
+        """End all injected faults."""
         return self._status({"request": "normal"})
 
     def die(self) -> int:
@@ -182,13 +183,12 @@ class MachineProcess:
         return self._running().kill()
 
     def pause(self) -> None:
-        """Stops it in the middle of what it does (SIGSTOP)."""
+        """Stop the process (SIGSTOP)."""
         os.kill(self.pid, signal.SIGSTOP)
         self._paused = True
 
     def resume(self) -> None:
-        """Lets it go on after `pause`; its world catches up with the time that has passed, if that was short, and loses
-        the rest (see `MachineStatistics.lost`)."""
+        """Continue after `pause`. The world catches up with a short pause; the rest of a long one is lost time."""
         os.kill(self.pid, signal.SIGCONT)
         self._paused = False
 
@@ -248,5 +248,14 @@ class MachineProcess:
         return told
 
 
-def _lists(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {address: np.asarray(value).tolist() for address, value in values.items()}
+def _serve_child(
+    connection: socket.socket, scenario: Scenario, url: str, config: MachineConfig, options: Mapping[str, Any]
+) -> None:
+    """Run the child process of a `MachineProcess`; ``options`` are those of `serve`."""
+    logging.basicConfig(format="machine: %(message)s")
+    try:
+        machine = Machine(scenario, config, epoch=epoch(lock_step=options["lock_step"]))
+        loop = MachineLoop(machine, url, control=connection)
+    except (ValueError, BridgeError) as error:
+        raise StartError(str(error)) from error
+    serve(loop, ready=lambda: report_ready(connection), **options)

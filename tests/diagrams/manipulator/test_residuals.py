@@ -13,8 +13,7 @@ from diagrams.manipulator import ManipulatorScenario
 from diagrams.manipulator.motions import CIRCLE
 from tests.monitoring.residuals.line import Together
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.machine import Machine
+from vtbdrake.machine.machine import Machine, MachineConfig
 from vtbdrake.monitoring.residuals import ResidualMonitor
 
 TOOL = "sim.sys.arm.tool.mass"

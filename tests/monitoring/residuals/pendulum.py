@@ -16,8 +16,7 @@ from tests.testbeds import PENDULUM
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.machine.config import MachineConfig
-from vtbdrake.machine.machine import Machine
+from vtbdrake.machine.machine import Machine, MachineConfig
 from vtbdrake.state import discrete_state
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 

@@ -71,7 +71,7 @@ def test_any_horizon_is_aligned(horizon: int) -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("options", [{"act_delay": 2 * PERIOD}, {"sense_delay": 2 * PERIOD}])
+@pytest.mark.parametrize("options", [{"act_latency": 2 * PERIOD}, {"sense_latency": 2 * PERIOD}])
 def test_declared_delay_is_aligned(options: dict[str, float]) -> None:
     found = twin(DrivenPendulum(), replace(CONFIG, delay=2), **options)
     np.testing.assert_allclose(found, 0.0, atol=1e-12)

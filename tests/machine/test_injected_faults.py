@@ -27,8 +27,7 @@ from vtbdrake.machine import (
     Reorder,
     fault_from_dict,
 )
-from vtbdrake.machine.faults import FAULTS, Packet, whole_cycles
-from vtbdrake.machine.line import Line
+from vtbdrake.machine.injected_faults import FAULTS, DelayLine, Packet, whole_cycles
 
 A, B = "A", "B"
 
@@ -37,14 +36,14 @@ def message(number: int) -> bytes:
     return status(number).encode()
 
 
-def line(*faults: InjectedFault, delay: int = 0, seed: int = 0) -> Line:
-    made = Line("sense", delay=delay, period=0.001, random=np.random.default_rng(seed))
+def line(*faults: InjectedFault, delay: int = 0, seed: int = 0) -> DelayLine:
+    made = DelayLine(delay=delay, period=0.001, random=np.random.default_rng(seed))
     for fault in faults:
         made.begin(fault)
     return made
 
 
-def carry(way: Line, cycles: int, *channels: str) -> list[list[tuple[str, int]]]:
+def carry(way: DelayLine, cycles: int, *channels: str) -> list[list[tuple[str, int]]]:
     """Channel and number of what arrives in each cycle, if each channel is sent the cycle's number in each."""
     arrived = []
     for cycle in range(cycles):
@@ -128,14 +127,14 @@ def test_fault_takes_the_place_of_one_of_its_name() -> None:
 def test_faults_end_and_what_is_on_its_way_arrives() -> None:
     way = line(Delay(seconds=0.002))
     way.send(Packet(A, lcmt_iiwa_status, message(7), 0))
-    way.end()
+    way.end_faults()
     assert carry(way, 3) == [[(A, 0)], [(A, 1)], [(A, 7), (A, 2)]]
 
 
 def test_clock_error_is_that_of_the_channels_named() -> None:
     way = line(ClockJump(seconds=-2.0, channels=[A]))
     assert (way.clock_error(A), way.clock_error(B)) == (-2.0, 0.0)
-    way.end()
+    way.end_faults()
     assert way.clock_error(A) == 0.0
 
 
@@ -219,19 +218,22 @@ def test_all_faults_are_examples() -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"fault": "melt"}, "a fault is one of clock_jump, .*, not 'melt'"),
-        ({"fault": ["drop"]}, "a fault is one of"),
-        ({"fault": "drop", "share": 0.5}, "drop takes .*fraction.*, not share"),
-        ({"fault": "drop", "fraction": 1.5}, "fraction of the fault drop lies between 0 and 1, not at 1.5"),
-        ({"fault": "drop", "fraction": "all"}, "not at 'all'"),
-        ({"fault": "drop", "fraction": math.nan}, "not at nan"),
+        ({"fault": "melt"}, "a fault must be one of clock_jump, .*, not 'melt'"),
+        ({"fault": ["drop"]}, "a fault must be one of"),
+        ({"fault": "drop", "share": 0.5}, "drop has no share; it has: .*fraction"),
+        ({"fault": "drop", "fraction": 1.5}, "fraction of the fault drop must be a number from 0 to 1, not 1.5"),
+        ({"fault": "drop", "fraction": "all"}, "not 'all'"),
+        ({"fault": "drop", "fraction": math.nan}, "not nan"),
         ({"fault": "drop", "side": "left"}, "sense or act, not 'left'"),
-        ({"fault": "drop", "channels": "A"}, r"a list of channels, such as \['A'\]"),
+        ({"fault": "drop", "channels": "A"}, r"channels of the fault drop must be a list, such as \['A'\], not 'A'"),
         ({"fault": "delay"}, "the fault delay is not complete: .*seconds"),
         ({"fault": "delay", "seconds": -1.0}, "seconds of the fault delay"),
         ({"fault": "duplicate", "copies": 1.5}, "whole number"),
         ({"fault": "corrupt", "kind": "burn"}, "one of bits, truncate, .*, not 'burn'"),
-        ({"fault": "clock_jump", "seconds": 1.0, "side": "act"}, "not one of received messages"),
+        (
+            {"fault": "clock_jump", "seconds": 1.0, "side": "act"},
+            "side of the fault clock_jump must be sense, not 'act'",
+        ),
     ],
 )
 def test_faults_that_cannot_be_are_refused(data: dict[str, Any], message: str) -> None:

@@ -1,0 +1,345 @@
+"""Injected faults: what goes wrong, on request, with the messages between a machine and its controller."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import count
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+SENSE, ACT = "sense", "act"
+
+
+class InjectedFaultError(ValueError):
+    """A request for a fault that does not exist, or with impossible values."""
+
+
+class Packet(NamedTuple):
+    """A message on its way.
+
+    Attributes:
+        channel: the LCM channel.
+        type: the message type, a class made by lcm-gen.
+        data: the bytes.
+        due: the cycle of the machine in which it arrives.
+    """
+
+    channel: str
+    type: Any
+    data: bytes
+    due: int
+
+
+Effect = Callable[[Packet], Iterable[Packet]]
+"""A function from a packet to the packets that arrive instead, in this order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InjectedFault:
+    """One thing that goes wrong with messages until it is ended.
+
+    Attributes:
+        side: ``sense`` for messages that the machine sends, ``act`` for those that it receives.
+        channels: the channels that are affected; all of that side if empty.
+    """
+
+    name: ClassVar[str]
+    sides: ClassVar[Sequence[str]] = (SENSE, ACT)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # of fields; those of whole numbers are integers
+
+    side: str = SENSE
+    channels: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.side not in self.sides:
+            self._refuse("side", " or ".join(self.sides))
+        if isinstance(self.channels, str):
+            self._refuse("channels", f"a list, such as [{self.channels!r}]")
+        object.__setattr__(self, "channels", tuple(self.channels))
+        for name, (lower, upper) in self.ranges.items():
+            value, whole = getattr(self, name), isinstance(upper, int)
+            valid = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+            if not (valid and lower <= value <= upper):
+                self._refuse(name, f"a {'whole ' if whole else ''}number from {lower:g} to {upper:g}")
+
+    def _refuse(self, name: str, expected: str) -> None:
+        raise InjectedFaultError(f"{name} of the fault {self.name} must be {expected}, not {getattr(self, name)!r}")
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        """Return the effect on the packets of the channels, from now on.
+
+        Args:
+            random: the source of random numbers.
+            period: the period of the machine's cycles, in seconds.
+        """
+        return lambda packet: (packet,)
+
+    def affects(self, channel: str) -> bool:
+        """Return whether a channel of the fault's side is affected."""
+        return not self.channels or channel in self.channels
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fault as plain data for JSON, which `fault_from_dict` reads."""
+        return {"fault": self.name, **asdict(self), "channels": list(self.channels)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockJump(InjectedFault):
+    """The time in the machine's messages is wrong by ``seconds``. (The machine applies it when it makes them.)"""
+
+    name = "clock_jump"
+    sides = (SENSE,)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"seconds": (-1e9, 1e9)}
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoBrake(InjectedFault):
+    """The machine does not brake when commands stop: it goes on with the last ones."""
+
+    name = "no_brake"
+    sides = (SENSE,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Freeze(InjectedFault):
+    """The first message on a channel is repeated, byte for byte, in place of all that follow."""
+
+    name = "freeze"
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        held: dict[str, bytes] = {}
+        return lambda packet: (packet._replace(data=held.setdefault(packet.channel, packet.data)),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corrupt(InjectedFault):
+    """Messages arrive corrupted.
+
+    Attributes:
+        kind: a key of `CORRUPTIONS`.
+        fraction: the probability for each message.
+    """
+
+    name = "corrupt"
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"fraction": (0.0, 1.0)}
+    kind: str = "bits"
+    fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind not in CORRUPTIONS:
+            self._refuse("kind", f"one of {', '.join(CORRUPTIONS)}")
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        corrupt = CORRUPTIONS[self.kind]
+
+        def effect(packet: Packet) -> Iterable[Packet]:
+            if random.random() >= self.fraction:
+                return (packet,)
+            return (packet._replace(data=corrupt(packet.type, packet.data, random)),)
+
+        return effect
+
+
+@dataclass(frozen=True, kw_only=True)
+class Duplicate(InjectedFault):
+    """Every message arrives ``copies`` times more."""
+
+    name = "duplicate"
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"copies": (1, 1000)}
+    copies: int = 1
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        return lambda packet: (packet,) * (1 + self.copies)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drop(InjectedFault):
+    """Messages are lost, each with the probability ``fraction``."""
+
+    name = "drop"
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"fraction": (0.0, 1.0)}
+    fraction: float = 1.0
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        return lambda packet: () if random.random() < self.fraction else (packet,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay(InjectedFault):
+    """Messages arrive ``seconds`` later, in whole cycles of the machine, rounded up."""
+
+    name = "delay"
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"seconds": (0.0, 1e6)}
+    seconds: float
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        cycles = whole_cycles(self.seconds, period)
+        return lambda packet: (packet._replace(due=packet.due + cycles),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reorder(InjectedFault):
+    """Of every two messages of a channel the second arrives first, and the first right after it.
+
+    A message that waits for its partner when the fault ends is lost.
+    """
+
+    name = "reorder"
+
+    def effect(self, random: np.random.Generator, period: float) -> Effect:
+        held: dict[str, Packet] = {}
+
+        def effect(packet: Packet) -> Iterable[Packet]:
+            first = held.pop(packet.channel, None)
+            if first is None:
+                held[packet.channel] = packet
+                return ()
+            return (packet, first._replace(due=packet.due))
+
+        return effect
+
+
+# Several faults act in this order.
+FAULTS: dict[str, type[InjectedFault]] = {
+    kind.name: kind for kind in (ClockJump, NoBrake, Freeze, Corrupt, Duplicate, Drop, Delay, Reorder)
+}
+
+
+def fault_from_dict(data: Mapping[str, Any]) -> InjectedFault:
+    """Return the fault that plain data describe, such as ``{"fault": "drop", "fraction": 0.5}``.
+
+    Raises:
+        InjectedFaultError: there is no such fault, or it has no such fields or values.
+    """
+    name = data.get("fault")
+    kind = FAULTS.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise InjectedFaultError(f"a fault must be one of {', '.join(FAULTS)}, not {name!r}")
+    given = {key: value for key, value in data.items() if key != "fault"}
+    known = [item.name for item in fields(kind)]
+    if unknown := sorted(map(str, given.keys() - set(known))):
+        raise InjectedFaultError(f"the fault {name} has no {', '.join(unknown)}; it has: {', '.join(known)}")
+    try:
+        return kind(**given)
+    except TypeError as error:
+        raise InjectedFaultError(f"the fault {name} is not complete: {error}") from None
+
+
+def whole_cycles(seconds: float, period: float) -> int:
+    """Return a time as a number of cycles, rounded up (but 0.003 s are three cycles of 0.001 s)."""
+    return math.ceil(seconds / period - 1e-6)
+
+
+class DelayLine:
+    """One direction of the way between a machine and its controller: a delay, and the faults that have begun.
+
+    Args:
+        delay: the number of cycles that every packet takes, without faults.
+        period: the period of a cycle, in seconds.
+        random: the source of random numbers of the faults.
+
+    Attributes:
+        faults: the faults that have begun, by name.
+    """
+
+    def __init__(self, *, delay: int, period: float, random: np.random.Generator) -> None:
+        self.faults: dict[str, InjectedFault] = {}
+        self._effects: dict[str, Effect] = {}
+        self._delay = delay
+        self._period = period
+        self._random = random
+        self._waiting: list[tuple[int, int, Packet]] = []
+        self._numbers = count()
+
+    def begin(self, fault: InjectedFault) -> None:
+        """Begin a fault, in place of one of the same name."""
+        self.faults[fault.name] = fault
+        self._effects[fault.name] = fault.effect(self._random, self._period)
+
+    def end_faults(self) -> None:
+        """End all faults. Packets that are on their way arrive when they are due."""
+        self.faults.clear()
+        self._effects.clear()
+
+    def clock_error(self, channel: str) -> float:
+        """Return the time in seconds by which the time in messages on ``channel`` is wrong."""
+        jump = self.faults.get(ClockJump.name)
+        return jump.seconds if isinstance(jump, ClockJump) and jump.affects(channel) else 0.0
+
+    def send(self, packet: Packet) -> None:
+        """Take a packet, whose ``due`` is the present cycle."""
+        packets = [packet]
+        for name in FAULTS:
+            if name in self.faults and self.faults[name].affects(packet.channel):
+                packets = [arrived for sent in packets for arrived in self._effects[name](sent)]
+        for sent in packets:
+            due = sent.due + self._delay
+            heapq.heappush(self._waiting, (due, next(self._numbers), sent._replace(due=due)))
+
+    def arrivals(self, cycle: int) -> list[Packet]:
+        """Return the packets that arrive up to ``cycle``, in order."""
+        arrived = []
+        while self._waiting and self._waiting[0][0] <= cycle:
+            arrived.append(heapq.heappop(self._waiting)[2])
+        return arrived
+
+
+# -- corrupted messages
+
+
+def _bits(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
+    corrupted = np.frombuffer(data, np.uint8).copy()
+    flipped = random.choice(8 * len(data), size=int(random.integers(1, 9)), replace=False)
+    np.bitwise_xor.at(corrupted, flipped // 8, (1 << (flipped % 8)).astype(np.uint8))
+    return corrupted.tobytes()
+
+
+def _nan(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
+    try:
+        message = message_type.decode(data)
+    except Exception:  # Another fault has corrupted it.
+        return data
+    _fill_with_nan(message)
+    return bytes(message.encode())
+
+
+def _fill_with_nan(message: Any) -> None:
+    for name, typename in zip(message.__slots__, message.__typenames__, strict=True):
+        value = getattr(message, name)
+        if typename in ("double", "float"):
+            setattr(message, name, _nan_like(value))
+        else:
+            for part in _messages_in(value):
+                _fill_with_nan(part)
+
+
+def _nan_like(value: Any) -> Any:
+    return [_nan_like(entry) for entry in value] if isinstance(value, list | tuple) else math.nan
+
+
+def _messages_in(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [part for entry in value for part in _messages_in(entry)]
+    return [value] if hasattr(value, "__typenames__") else []
+
+
+CORRUPTIONS: dict[str, Callable[[Any, bytes, np.random.Generator], bytes]] = {
+    "bits": _bits,
+    "truncate": lambda _, data, random: data[: int(random.integers(0, len(data)))],
+    "trailing": lambda _, data, random: data + random.bytes(int(random.integers(1, 65))),
+    "random": lambda _, data, random: random.bytes(len(data)),
+    "type": lambda _, data, random: bytes([data[0] ^ 0xFF]) + data[1:],  # No other type has a fingerprint so close.
+    "nan": _nan,
+}
+"""Functions from a message's type, its bytes and a source of random numbers to the corrupted bytes.
+
+``bits``: one to eight bits are flipped; ``truncate``: the end is missing, from the last byte to all; ``trailing``: 1 to
+64 random bytes follow; ``random``: all bytes are random; ``type``: the fingerprint is wrong; ``nan``: every
+floating-point number is NaN.
+"""
