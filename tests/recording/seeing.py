@@ -1,4 +1,4 @@
-"""A DPS that sees: a camera's image comes by raw messages, and what is commanded depends on every pixel."""
+"""A DPS with a camera, whose images come by raw messages; its actuator command depends on every pixel."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Gaze(LeafSystem):
 
 
 def brightness(pixels: np.ndarray) -> float:
-    """What `Gaze` makes of an image."""
+    """Return the actuator command of `Gaze` for an image."""
     return float(np.sin(np.arange(pixels.size)) @ pixels.ravel().astype(float))
 
 
 @dataclass
 class SeeingScenario(Scenario):
-    """The camera sees nothing in simulation."""
+    """A scenario whose simulated camera shows a blank image."""
 
     simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1, accuracy=1e-6))
 
@@ -78,7 +78,7 @@ class SeeingScenario(Scenario):
 
 
 def picture(utime: int, pixels: np.ndarray) -> bytes:
-    """A message of the camera."""
+    """Return a message of the camera."""
     message = lcmt_image()
     message.header.utime = utime
     message.width, message.height, message.row_stride = WIDTH, HEIGHT, WIDTH

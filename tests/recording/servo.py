@@ -1,4 +1,4 @@
-"""The two axes of `tests.control.scripted`, with sensors that tell something else in every cycle."""
+"""The two axes of `tests.control.scripted`, with sensor values that change in every cycle."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vtbdrake.testbed import DpsAlone
 
 
 def wandering(t: float) -> Mapping[str, Any]:
-    """Both signals, at any time other values; the position only in every other cycle."""
+    """Return values of both signals that differ at any time; the position comes in every other cycle only."""
     cycle = round(t / PERIOD)
     values = {"speed": np.cos([5.0 * t, 3.0 * t])}
     return values | ({"position": 0.3 * np.sin([37.0 * t + 1.0, 11.0 * t])} if cycle % 2 == 0 else {})
@@ -54,5 +54,5 @@ class Servo:
 
     @property
     def commands(self) -> np.ndarray:
-        """Of the DPS, (n, 2); NaN where it had none."""
+        """Return the actuator commands of the DPS, (n, 2); NaN where it had none."""
         return np.array([cycle.actuation.get("velocity", [np.nan, np.nan]) for cycle in self.cycles])

@@ -79,7 +79,7 @@ def entries(log: ControlLog, tmp_path_factory: pytest.TempPathFactory) -> list[E
 
 
 def exported(log: ControlLog, path: Path) -> list[Entry]:
-    """Topic, schema, time and content of all messages."""
+    """Return topic, schema, time and content of all messages."""
     export(log, path)
 
     def strict(name: str) -> None:

@@ -22,7 +22,7 @@ Event = tuple[bytes, int, int, int, int]
 
 
 def events_of(content: bytes) -> tuple[list[Event], list[tuple[int, str]]]:
-    """Channel, number, time, begin and end of all events; and the damages."""
+    """Return channel, number, time, begin and end of all events, and the damages."""
     events: list[Event] = []
     damages: list[tuple[int, str]] = []
     at = 0
@@ -53,7 +53,7 @@ def event_at(content: bytes, at: int) -> Event | None:
 
 
 def cycles_of(content: bytes, places: list[tuple[int, int]]) -> tuple[list[bytes], list[tuple[int, int]], list[int]]:
-    """Of the cycles that count their bytes and their frames; where the others begin."""
+    """Return bytes and frames of the whole cycles, and where the others begin."""
     cycles: list[bytes] = []
     frames: list[tuple[int, int]] = []
     wrong = []
@@ -74,7 +74,7 @@ def cycles_of(content: bytes, places: list[tuple[int, int]]) -> tuple[list[bytes
 
 
 def log(chosen: random.Random) -> bytes:
-    """Messages and cycles; some messages look like a part of a log."""
+    """Return a log with messages and cycles; some messages look like a part of a log."""
     content = b""
     for number in range(chosen.randrange(1, 12)):
         frame = b""

@@ -1,4 +1,4 @@
-"""Reading logs: whole ones, and all kinds of damage."""
+"""Reading of whole and of damaged logs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def reference(whole: bytes, tmp_path: Path) -> ControlLog:
 
 
 def ends(log: ControlLog) -> list[int]:
-    """Of the cycles' events, in bytes."""
+    """Return the ends of the cycles' events in the file."""
     return [end for *_, end in log.events.on("VTB_CYCLE")]
 
 
@@ -61,7 +61,7 @@ def read(tmp_path: Path, content: bytes) -> ControlLog:
 
 
 def assert_same(log: ControlLog, reference: ControlLog, rows: list[int]) -> None:
-    """The log has these rows of the reference, and nothing else."""
+    """Check that the log has these rows of the reference and nothing else."""
     assert log.numbers.tolist() == reference.numbers[rows].tolist()
     for name in ("times", "now", "utimes", "ok"):
         assert np.array_equal(getattr(log, name), getattr(reference, name)[rows])
@@ -178,7 +178,7 @@ def test_change_of_a_damaged_cycle_is_dropped(whole: bytes, reference: ControlLo
 
 
 def shifted(content: bytes, reference: ControlLog, first: int, seconds: float) -> bytes:
-    """The log with other times of day from a cycle on, as if the clock had been set; checksums as they should be."""
+    """Return the log with other times of day from a cycle on, as if the clock had been set, and right checksums."""
     data = bytearray(content)
     begin = 0
     for i, (_, _, start, end) in enumerate(reference.events.on("VTB_CYCLE")):
@@ -277,22 +277,22 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_killed_loop_leaves_its_recording(tmp_path: Path) -> None:
-    """The process that writes notices, and writes what has reached it."""
+    """The worker process notices it and writes what has arrived."""
     path = tmp_path / "run.lcm"
     done = subprocess.run([sys.executable, "-c", KILLED, path], cwd=ROOT, capture_output=True, timeout=120)
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
-    # It held the other end of this pipe, too: the end of its output is the end of both processes.
+    # The worker process holds the other end of this pipe, too: it ends when both processes have ended.
     log = read_log(path)
     assert not log.closed and not log.gaps and not log.damages
     assert len(log) == 500 and os.path.getsize(path) == len(log.events.content)
     assert replay(log).identical
 
 
-# -- logs from strangers: every checksum is right, and what they say cannot be
+# -- impossible logs whose checksums are right
 
 
 def with_header(whole: bytes, reference: ControlLog, **fields: object) -> bytes:
-    """The same log, whose header has other values."""
+    """Return the log with other values in its header."""
     _, utime, begin, end = reference.events.on("VTB_LOG")[0]
     message = decode(lcmt_vtb_log, whole[begin:end])
     message.header = json.dumps({**json.loads(message.header), **fields})
@@ -341,7 +341,7 @@ def test_impossible_header_is_rejected(
 
 
 def test_memory_is_limited_by_the_file_size(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
-    """The header tells of cycles of 8 MiB, the file has 1,000 of one byte."""
+    """The header describes cycles of 8 MiB; the file has 1,000 cycles of one byte."""
     content = with_header(whole, reference, sense=[["position", 1 << 20, "m"]])
     path = tmp_path / "large.lcm"
     path.write_bytes(content + b"".join(event(i, 0, b"VTB_CYCLE", b"x") for i in range(1000)))
@@ -359,7 +359,7 @@ print(len(log), len(log.damages))
 
 
 def framed(number: int, *messages: tuple[str, bytes], reference: ControlLog, whole: bytes) -> bytes:
-    """A whole cycle with these messages before it, as the recorder writes them."""
+    """Return a whole cycle with these messages before it, as the recorder writes it."""
     _, _, begin, end = reference.events.on("VTB_CYCLE")[-1]
     before = b"".join(event(0, 0, channel.encode(), data) for channel, data in messages)
     layout = CycleLayout(reference.header.sense, reference.header.act)

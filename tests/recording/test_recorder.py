@@ -237,7 +237,7 @@ def test_stopped_worker_process_loses_cycles_only(tmp_path: Path, caplog: pytest
     assert f"missing: {log.gaps[0]}" in caplog.text
 
 
-# -- what is refused
+# -- rejected recordings
 
 
 def test_log_is_overwritten_only_on_request(tmp_path: Path) -> None:

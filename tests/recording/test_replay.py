@@ -31,7 +31,7 @@ from vtbdrake.testbed import DpsAlone
 
 
 def recorded(tmp_path: Path, servo: Servo, act: Callable[[], None] = lambda: None, *, cycles: int = 30) -> ControlLog:
-    """Cycles, what ``act`` does, and cycles, with a digest after each."""
+    """Return the log of ``cycles``, of ``act``, and of as many cycles, with a digest after each."""
     with Recorder(servo.runtime, tmp_path / "run.lcm", digest_period=PERIOD, overwrite=True):
         servo.runtime.run(cycles=cycles)
         act()
@@ -51,7 +51,7 @@ def test_replay_is_identical(tmp_path: Path, alone: bool) -> None:
 
 
 def test_testbed_replays_every_switch(tmp_path: Path) -> None:
-    """Where the DPS is fed by the simulated world, by the machine, and by the world again, from what it believes."""
+    """The DPS is fed by the simulated world, by the machine, and again by the world, set to its belief."""
     servo = Servo(alone=False, begun=False)
     with Recorder(servo.runtime, tmp_path / "run.lcm", digest_period=PERIOD):
         for mode in ("sim", "shadow", "real", "twin", "sim", "real"):
@@ -68,7 +68,7 @@ def test_testbed_replays_every_switch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("before", [18, 19])
 def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
-    """With what lay at the real ports by then: the position comes in every other cycle only."""
+    """Values at the real ports count: the position comes in every other cycle only."""
     servo = Servo()
     servo.runtime.run(cycles=before)
     report = replay(recorded(tmp_path, servo))
@@ -76,7 +76,7 @@ def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
 
 
 class Prepared(ServoSystem):
-    """Counts from 100 on, which it does when it is initialized.
+    """A DPS that is initialized to count from 100 on.
 
     .. pydrake_system::
 
@@ -96,7 +96,7 @@ class Prepared(ServoSystem):
 
 @dataclass
 class PreparedScenario(ServoScenario):
-    """With a DPS that has to be initialized."""
+    """A scenario with a DPS that must be initialized."""
 
     def make_dps(self) -> System:
         return Prepared()
@@ -188,7 +188,7 @@ def test_dps_alone_rejects_simulated_sensors(tmp_path: Path) -> None:
         replay(log, DpsAlone(servo.scenario))
 
 
-# -- abroad
+# -- other values and recorded addresses
 
 
 def test_replay_records_variables_and_ports(tmp_path: Path) -> None:
@@ -217,11 +217,11 @@ def test_unknown_address_is_rejected(tmp_path: Path) -> None:
         replay(log, values={"dps.gai": 1.0})
 
 
-# -- what is not the same
+# -- differences
 
 
 class Worse(ServoSystem):
-    """It forgets a bit now and then.
+    """A DPS that changes the last bit of its actuator command in one cycle.
 
     .. pydrake_system::
 
@@ -242,7 +242,7 @@ class Worse(ServoSystem):
 
 
 class Altered(DpsAlone):
-    """Says that it is of the recorded scenario, and has another DPS."""
+    """A target of the recorded scenario with another DPS."""
 
     def __init__(self, scenario: ServoScenario) -> None:
         class Other(ServoScenario):
@@ -265,7 +265,7 @@ def test_one_bit_of_actuation_is_found(tmp_path: Path) -> None:
 def test_hidden_state_is_found_by_digest(tmp_path: Path) -> None:
     servo = Servo()
     log = recorded(tmp_path, servo)
-    # As if the DPS had counted otherwise when it was recorded.
+    # As if the DPS had had another state when it was recorded.
     object.__setattr__(log, "digests", [(i, bytes(16) if i >= 40 else digest) for i, digest in log.digests])
     report = replay(log)
     assert report.outcome == "different" and report.first_difference is not None
@@ -318,7 +318,7 @@ def rushing(t: float) -> Mapping[str, list[float]]:
 
 @pytest.mark.parametrize("function", [chaotic, picky], ids=["results", "missing results"])
 def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[..., object]) -> None:
-    """And not computed anew: those that were missing are missing again."""
+    """They are not computed again: missing results are missing again."""
     more: dict[str, object] = {} if function is picky else {"memory": np.array([0.3, 0.6])}
     scenario = SlowScenario(function=function, period=0.004, latency=0.003, more=more)
     clock = SimulatedClock()
@@ -352,7 +352,7 @@ def hub() -> Iterator[Hub]:
 
 
 class Seeing:
-    """A loop, and a camera on its bus."""
+    """A loop with a camera on its bus."""
 
     def __init__(self, hub: Hub) -> None:
         self.bridge: LcmBridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), hub.url)
@@ -362,7 +362,7 @@ class Seeing:
         self._utime = 0
 
     def show(self, *, late: bool = False) -> np.ndarray:
-        """A new image, which has come; a late one is rejected."""
+        """Send a new image and return it when it has arrived; a late one is rejected."""
         pixels = self._random.integers(0, 256, (HEIGHT, WIDTH))
         self._utime += 1000
         self._camera.publish("CAMERA", picture(self._utime - 5000 * late, pixels))
@@ -373,7 +373,7 @@ class Seeing:
 
 
 def test_images_are_replayed_from_raw_messages(hub: Hub, tmp_path: Path) -> None:
-    """Of several in one cycle the last good one; of those that were rejected none."""
+    """Of several images in a cycle the last accepted one counts."""
     loop = Seeing(hub)
     shown = []
     with Recorder(loop.runtime, tmp_path / "run.lcm", digest_period=PERIOD):

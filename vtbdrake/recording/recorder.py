@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pydrake.systems.framework import Context
 
@@ -106,7 +106,13 @@ class Recorder:
         self._last = runtime.cycles - 1
         self._warned = False
         self._closed = False
-        first_events = [self._header_event(header), self._state_event()]
+        text, target, utime = header.to_json(), runtime.target, self._utime()
+        state = snapshots.take(target.diagram, runtime.context, target.variables()).to_bytes()
+        fields = {"utime": utime, "size": len(state), "snapshot": state, "crc": _signed_crc(state)}
+        first_events = [
+            self._message_event(LOG, lcmt_vtb_log(), utime=utime, header=text, crc=_signed_crc(text.encode())),
+            self._message_event(STATE, lcmt_vtb_state(), **fields),
+        ]
         if overwrite and self.path.is_file():
             # A new file: whoever has mapped the old one keeps it.
             self.path.unlink()
@@ -147,8 +153,11 @@ class Recorder:
         self._count += 1
         return event(self._count - 1, utime, channel.encode(), data)
 
-    def _add(self, channel: str, data: bytes, utime: int) -> None:
-        self._events.append(self._event(channel, data, utime))
+    def _message_event(self, channel: str, message: Any, **fields: Any) -> bytes:
+        """Return the event of an LCM message after its fields have been set."""
+        for name, value in fields.items():
+            setattr(message, name, value)
+        return self._event(channel, message.encode(), message.utime)
 
     def _tap(self, channel: str, data: bytes) -> None:
         if self._next_tap is not None:
@@ -156,19 +165,20 @@ class Recorder:
         if self._closed:  # Another recorder that began later may still call this tap.
             return
         self._cycle.note_message(channel, self._count)
-        self._add(channel, data, self._utime())
+        self._events.append(self._event(channel, data, self._utime()))
 
     def __call__(self, cycle: Cycle) -> None:
         """Record a cycle, as a watcher of the runtime."""
         utime = self._utime()
         if cycle.changes:
-            for message in encode_changes(cycle.changes, cycle.number, utime):
-                self._add(CHANGE, message.encode(), utime)
+            for change in encode_changes(cycle.changes, cycle.number, utime):
+                self._events.append(self._event(CHANGE, change.encode(), utime))
         faults = cycle.verdict.faults
         if faults or self._faults:
             self._add_faults(cycle, utime)
         if (cycle.number + 1) % self._digest_every == 0:
-            self._add_digest(cycle.number, utime)
+            fields = {"utime": utime, "number": cycle.number, "digest": self._digest()}
+            self._events.append(self._message_event(DIGEST, lcmt_vtb_digest(), **fields))
             self._take_losses()
         self._events.append(self._cycle.event(cycle, self._count, utime, sum(map(len, self._events))))
         self._count += 1
@@ -185,16 +195,9 @@ class Recorder:
         if faults == self._faults:
             return
         self._faults = faults
-        message = lcmt_vtb_fault()
-        message.utime, message.number = utime, cycle.number
-        message.reasons = [fault.reason for fault in cycle.verdict.faults]
-        message.count = len(message.reasons)
-        self._add(FAULT, message.encode(), utime)
-
-    def _add_digest(self, number: int, utime: int) -> None:
-        message = lcmt_vtb_digest()
-        message.utime, message.number, message.digest = utime, number, self._digest()
-        self._add(DIGEST, message.encode(), utime)
+        reasons = [fault.reason for fault in cycle.verdict.faults]
+        fields = {"utime": utime, "number": cycle.number, "count": len(reasons), "reasons": reasons}
+        self._events.append(self._message_event(FAULT, lcmt_vtb_fault(), **fields))
 
     def _take_losses(self) -> None:
         for data in self._worker.take():
@@ -208,22 +211,6 @@ class Recorder:
             _log.error("cycles of the loop are not recorded in %s: %s", self.path, reason)
 
     # -- begin and end
-
-    def _header_event(self, header: LogHeader) -> bytes:
-        message = lcmt_vtb_log()
-        message.utime = self._utime()
-        message.header = header.to_json()
-        message.crc = _signed_crc(message.header.encode())
-        return self._event(LOG, message.encode(), message.utime)
-
-    def _state_event(self) -> bytes:
-        target = self._runtime.target
-        message = lcmt_vtb_state()
-        message.utime = self._utime()
-        message.snapshot = snapshots.take(target.diagram, self._runtime.context, target.variables()).to_bytes()
-        message.size = len(message.snapshot)
-        message.crc = _signed_crc(message.snapshot)
-        return self._event(STATE, message.encode(), message.utime)
 
     def close(self) -> None:
         """End the recording: write what is pending and count what is lost.

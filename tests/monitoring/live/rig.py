@@ -1,4 +1,4 @@
-"""A loop that others look at: it runs in this thread, they in another, and the worker process in its process."""
+"""A loop with live values: it runs in this thread, and its clients in another one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def moving(t: float) -> dict[str, Any]:
 
 
 class Rig:
-    """A servo that commands, on a clock that nobody waits for."""
+    """A servo on real, with a simulated clock."""
 
     def __init__(self, *, rate: float = 0.0) -> None:
         scenario = ServoScenario(rate=rate)
@@ -49,7 +49,7 @@ class Rig:
         return np.array([commands["velocity"] for _, commands in self.bridge.sent])
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Cycles until the condition is fulfilled."""
+        """Run cycles until the condition is fulfilled."""
         limit = time.monotonic() + 2 * PATIENCE
         while not condition():
             assert time.monotonic() < limit
@@ -58,7 +58,7 @@ class Rig:
             time.sleep(1e-4)  # Others want the interpreter, too.
 
     def during(self, function: Callable[..., T], *arguments: Any, **options: Any) -> T:
-        """Cycles while somebody else does something, and gives what he gets."""
+        """Run cycles while another thread calls a function, and return its result."""
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(function, *arguments, **options)
             self.until(future.done)

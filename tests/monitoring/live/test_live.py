@@ -1,4 +1,4 @@
-"""A running DPS is set, read and watched from outside, and goes on as if nobody looked."""
+"""Live values: a running DPS is set, read and watched from outside without being disturbed."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError, LiveWatch, watch
 from vtbdrake.monitoring.live.server import MAX_WAITING
 
-# Enough to read everything in one cycle, on a computer that is busy.
+# Enough to read everything in one cycle, even on a busy computer.
 AMPLE = {"budget": 10.0, "longest": 10.0}
 
-# Seconds to wait for what nobody says; on a computer that is busy, what is said before may take longer than the first.
+# Timeouts in seconds; on a busy computer, the first ones may be too short for what precedes the error.
 LONGER_AND_LONGER = [0.5 * 2**k for k in range(8)]
 
 
@@ -36,7 +36,7 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Rig]:
-    """For tests that change nothing, on a bus of its own."""
+    """Yield a rig on a bus of its own for tests that change nothing."""
     with Hub(port=0) as bus, served(bus.url, **AMPLE) as (rig, _):
         yield rig
 
@@ -105,7 +105,7 @@ def test_noise_is_not_taken_for_an_answer(hub: Hub, noise: bytes) -> None:
 
 @contextmanager
 def impostor(url: str, channel: str, answers: list[tuple[str, dict[str, Any]]]) -> Iterator[None]:
-    """Somebody who answers each request on a channel with the right id; ``ID`` in a channel stands for it, too."""
+    """Answer each request on a channel with the right id; ``ID`` in a channel is replaced by it."""
     bus, stop = lcm.LCM(url), threading.Event()
 
     def answer(_: str, data: bytes) -> None:
@@ -247,7 +247,7 @@ def test_flood_costs_one_request_per_cycle(hub: Hub) -> None:
         before = len(rig.cycles)
         for k in range(100):
             bus.publish("VTB_SET", json.dumps({"id": f"me{k}", "set": {"dps.gain": k}}).encode())
-        # Those that the loop is not bothered with are refused without it.
+        # The server rejects those that it does not pass on to the loop.
         while len(answers) < 100 - MAX_WAITING:
             assert bus.handle_timeout(round(1e3 * PATIENCE))
         assert all("requests are waiting" in answer["error"] for answer in answers)
@@ -374,7 +374,7 @@ def test_watch_ends_with_its_lease(hub: Hub) -> None:
         bus.publish("VTB_WATCH", json.dumps({"id": "me", "watch": ["dps.gain"], "lease": 0.2}).encode())
         rig.until(lambda: service.watches == 1)
         rig.until(lambda: service.watches == 0)
-        # Who renews his lease goes on; if he was so busy that he came too late, he is watching again since.
+        # A client that renews its lease goes on, even if a renewal came too late.
         with LiveWatch(hub.url, ["dps.ticks"], lease=0.3, timeout=PATIENCE) as live:
             rig.during(live.wait, 1, timeout=PATIENCE)
             end = time.monotonic() + 1.0

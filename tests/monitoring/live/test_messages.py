@@ -1,4 +1,4 @@
-"""What is a request, and why the others are not."""
+"""Valid and invalid requests."""
 
 import json
 

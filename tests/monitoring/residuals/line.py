@@ -1,4 +1,4 @@
-"""A machine in the same process, in lock-step with the loop that commands it, and loops that listen to both."""
+"""A machine in the same process, in lock-step with the loop that commands it, and loops that only listen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Falsify = Callable[[str, bytes], bytes]
 
 
 class Ear(Bridge):
-    """Hears messages that somebody puts into ``heard``, as an `LcmBridge` would."""
+    """A bridge that takes messages from ``heard``, as an `LcmBridge` does from the bus."""
 
     def __init__(self, scenario: Scenario) -> None:
         protocol, self.interface = protocol_of(scenario), scenario.interface()
@@ -58,7 +58,7 @@ class Ear(Bridge):
 
 
 class Line(Ear):
-    """The way to a machine: every poll but the first has it do one cycle, and tell its state.
+    """A bridge to a machine: every poll but the first advances it by one cycle and takes its state.
 
     Attributes:
         falsify: changes messages of the machine on their way to all who listen.
@@ -100,7 +100,7 @@ class Line(Ear):
 def loop(
     target: VirtualTestbed | DpsAlone, bridge: Bridge, period: float, *, begin: bool = True, **values: Any
 ) -> Runtime:
-    """A runtime on a clock of its own, whose sensors never grow old; ``values`` of variables by address."""
+    """Return a runtime with a simulated clock, whose sensors are never stale; ``values`` are by address."""
     context = target.default_context()
     target.write(context, values)
     guards = Guards(target.interface, period, max_missed=inf)

@@ -25,7 +25,7 @@ PAYLOAD, MASS = "sim.sys.Pendulum.arm_com.mass", 0.5
 
 
 class Rhythm(LeafSystem):
-    """A torque in time, and some against the motion; it remembers what it was told of the joint.
+    """A torque over time with damping; its state has the last sensor values.
 
     .. pydrake_system::
 
@@ -55,7 +55,7 @@ class Rhythm(LeafSystem):
 
 @dataclass
 class DrivenPendulum(Scenario):
-    """Drake's pendulum; a ``time_step`` of 0 is a continuous one, ``sampled`` sensors are a period late."""
+    """Drake's pendulum. A ``time_step`` of 0 makes it continuous; ``sampled`` sensors are a period late."""
 
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     time_step: float = PERIOD
@@ -105,5 +105,5 @@ class DrivenPendulum(Scenario):
 
 
 def machine(scenario: Scenario, **options: Any) -> Machine:
-    """One that is played by ``scenario``; ``options`` are those of `MachineConfig`."""
+    """Return a machine that is simulated by ``scenario``; ``options`` are those of `MachineConfig`."""
     return Machine(scenario, MachineConfig(period=PERIOD, timeout=100.0, **options))

@@ -1,4 +1,4 @@
-"""Alarms: what is found, when, and what is not; calibration and the cumulative sum test."""
+"""Alarms, calibration, and the cumulative sum test."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def nominal() -> Calibration:
 
 
 def telling(field: str, change: Callable[[float], float]) -> Callable[[str, bytes], bytes]:
-    """Changes an entry of what the machine tells."""
+    """Return a function that changes a field of the machine's status messages."""
 
     def falsify(channel: str, data: bytes) -> bytes:
         message = lcmt_iiwa_status.decode(data)
@@ -104,7 +104,7 @@ def test_wrong_reported_actuation_raises_alarm(mode: str) -> None:
     together.run(100)
     alarm = monitors[mode].alarms[0]
     assert (alarm.signal, alarm.entry) == ("act.torque", 0)
-    # In the shadow the other loop is what acts: it commands less than is told.
+    # In the shadow the other loop acts: it commands less than is reported.
     assert alarm.residual == pytest.approx(0.01, abs=0.002)
 
 

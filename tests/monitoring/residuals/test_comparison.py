@@ -1,4 +1,4 @@
-"""Prediction and measurement line up: with a perfect model and exact sensors, there is no difference at all."""
+"""Comparison of prediction and measurement: a perfect model with exact sensors has no residuals."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_lost_messages_cost_one_window() -> None:
     for k in range(30):
         together.run(10)
         if k == 12:
-            # In the middle of a window, the loop sees nothing of a cycle.
+            # In the middle of a window, the loop misses a cycle.
             together.run(3)
             together.line.machine.advance()
             together.run(6)
@@ -124,13 +124,13 @@ def test_prediction_begins_anew_after_gap() -> None:
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin", replace(CONFIG, settle=2))
     together.run(102)
-    # Longer than a window, and shorter than AHEAD: this simulation runs faster than real time, and a sample that is
-    # further ahead than that would be rejected.
+    # Longer than a window, and shorter than AHEAD: in this simulation, which runs faster than real time, a sample
+    # that is further ahead is rejected.
     for _ in range(13):
         together.line.machine.advance()
     together.run(104)
     found = residuals(monitor)
-    # Ten windows before the gap, less the two that settle; it costs two, and after it two settle again.
+    # Ten windows before the gap less two that settle; the gap costs two, and after it two settle again.
     assert not together.line.sensed["position"].rejected
     assert monitor.skipped == 2
     assert len(monitor.history) == 8 + 7
@@ -138,7 +138,7 @@ def test_prediction_begins_anew_after_gap() -> None:
 
 
 def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
-    """What a comparison of a twin takes, and the rows of a heavier machine."""
+    """Return a comparison of a twin, and the rows of a heavier machine."""
     scenario = DrivenPendulum()
     runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
     predictor = Predictor(scenario, period=PERIOD, values={})

@@ -1,4 +1,4 @@
-"""Residuals beside a loop, made by another process."""
+"""Residuals beside a loop, computed by a worker process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATIENCE = 60.0  # s
 
 
 def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -> None:
-    """Cycles, without haste, until so many windows are known to the loop."""
+    """Run cycles until ``count`` windows have come back."""
     end = time.monotonic() + PATIENCE
     while len(monitor.history) < count:
         assert time.monotonic() < end, "no residuals come back"
@@ -113,7 +113,7 @@ def test_skipped_windows_are_reported_while_running() -> None:
         together.driver.watch(lambda cycle: monitor(cycle) if cycle.number % 2 else None)
         end = time.monotonic() + PATIENCE
         while monitor.skipped < 20:
-            assert time.monotonic() < end, "nobody hears of it"
+            assert time.monotonic() < end, "skipped windows are not reported"
             together.run(10)
             assert monitor._worker is not None
             select.select((monitor._worker,), (), (), 0.05)
@@ -147,7 +147,7 @@ def test_idle_dps_is_not_compared() -> None:
 
 
 class Moody(Rhythm):
-    """A rhythm that commands only while it is in the mood."""
+    """A rhythm that raises while its parameter is 0."""
 
     def __init__(self) -> None:
         super().__init__(PERIOD)
@@ -196,7 +196,7 @@ def test_exceptions_of_the_dps_skip_windows(caplog: pytest.LogCaptureFixture) ->
 
 
 class HalfTimeless(Line):
-    """A way on which only the position tells its time."""
+    """A bridge on which only the position has a time of its own."""
 
     def poll(self, timeout: float = 0.0) -> int:
         count = super().poll(timeout)

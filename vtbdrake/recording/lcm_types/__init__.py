@@ -1,1 +1,1 @@
-"""LCM types of what a recorder writes: `vtb_log.lcm`, and what lcm-gen makes of it."""
+"""LCM types of the recorder's own channels; lcm-gen makes the modules from ``vtb_log.lcm``."""
