@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import vtbdrake
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -54,3 +56,10 @@ def test_links_and_paths_of_a_page_exist(page: Path) -> None:
     missing = [link for link in links if not (page.parent / link).exists()]
     missing += [path for path in paths if not (ROOT / path).exists()]
     assert not missing, f"{page.name} names what is not there: {missing}"
+
+
+def test_every_public_name_is_shown_to_users() -> None:
+    pages = [*PAGES, *sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    shown = set(re.findall(r"\bvtb\.(\w+)", "\n".join(page.read_text("utf-8") for page in pages)))
+    assert set(vtbdrake.__all__) == shown
+    assert all(hasattr(vtbdrake, name) for name in vtbdrake.__all__)

@@ -29,11 +29,13 @@ BELOW: dict[str, set[str]] = {
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
-# Two modules that need neither Drake nor the layers: how other processes start, and how objects travel to them.
+# Modules that need neither Drake nor the layers: how other processes start, how objects travel to them, and when the
+# names of a package are imported.
 for _layers in BELOW.values():
-    _layers.update({"child_process", "pickling"})
+    _layers.update({"child_process", "lazy", "pickling"})
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
+BELOW["lazy"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

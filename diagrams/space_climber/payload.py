@@ -25,6 +25,7 @@ import vtbdrake as vtb
 from diagrams.space_climber.gait import TRIPOD
 from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, LEGS
 from diagrams.space_climber.scenario import SpaceClimberScenario
+from vtbdrake.testbed import VirtualTestbed
 
 MASS = "sim.sys.payload.mass"
 PITCH = "sim.sys.climber.base.pitch"
@@ -80,7 +81,7 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
     )
 
 
-def static_limit(testbed: vtb.VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: float = 0.0) -> float:
+def static_limit(testbed: VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: float = 0.0) -> float:
     """Return the attached mass in kg at which the centre of mass lies over the front edge of the support polygon.
 
     The robot is in its default posture on level ground; the rest is the balance of moments
@@ -119,7 +120,7 @@ def _front_edge(feet: np.ndarray, y: float) -> float:
     return float(max(found))
 
 
-def statics(testbed: vtb.VirtualTestbed) -> dict[str, float]:
+def statics(testbed: VirtualTestbed) -> dict[str, float]:
     """Return the static limit in kg for each phase of a tripod gait, and for six feet at rest."""
     half = testbed.read(testbed.default_context(), STROKE) / 2.0
     tripod = [leg for leg, delay in zip(LEGS, TRIPOD.delays, strict=True) if delay == 0.0]

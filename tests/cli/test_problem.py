@@ -6,8 +6,9 @@ import numpy as np
 
 from tests.cli.program import ACROBOT, ANGLE, DAMPING, PENDULUM, RATE, run
 from tests.testbeds import PendulumScenario
-from vtbdrake import Parameter, Problem, Quality, Sweep
+from vtbdrake import Parameter, Problem, Quality
 from vtbdrake.cli.problem import magnitude
+from vtbdrake.optimization import Sweep
 
 
 def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import vtbdrake as vtb
 from tests.testbeds import PendulumScenario
-from vtbdrake.optimization import Risk
+from vtbdrake.optimization import Quantile, Risk, Sweep
 from vtbdrake.rollout import Executor, SerialExecutor
 
 THETA = "sim.sys.Pendulum.theta.position"
@@ -114,7 +114,7 @@ def test_an_interrupted_sweep_has_no_boundary():
 def test_an_interrupted_sweep_is_still_one_after_its_file(tmp_path):
     half = _problem().sweep(values=[1.0, 2.0], executor=Interrupted(1), progress=False)
     half.save(tmp_path / "half.vtb")
-    loaded = vtb.Sweep.load(tmp_path / "half.vtb")
+    loaded = Sweep.load(tmp_path / "half.vtb")
     assert not loaded.complete
     with pytest.raises(ValueError, match="the sweep was interrupted"):
         loaded.boundary()
@@ -129,7 +129,7 @@ def _speed(omega):
     return abs(omega)
 
 
-@pytest.mark.parametrize("risk", ["worst", "mean", vtb.Quantile(0.5), vtb.CVaR(0.7)])
+@pytest.mark.parametrize("risk", ["worst", "mean", Quantile(0.5), vtb.CVaR(0.7)])
 @pytest.mark.parametrize(("minimize", "limit"), [(False, 9.0), (False, 2.0), (True, 2.0)])
 def test_the_best_of_a_sweep_is_that_of_a_study(risk, minimize, limit, tmp_path):
     problem = _problem(
@@ -149,7 +149,7 @@ def test_the_best_of_a_sweep_is_that_of_a_study(risk, minimize, limit, tmp_path)
     # With the lower limit, the fast ones violate the constraint.
     assert any(not trial.feasible for trial in study.trials) == (limit == 2.0)
     sweep.save(tmp_path / "sweep.vtb")
-    assert vtb.Sweep.load(tmp_path / "sweep.vtb").best() == sweep.best()
+    assert Sweep.load(tmp_path / "sweep.vtb").best() == sweep.best()
 
 
 def test_a_sweep_without_a_single_best_point_says_why():
@@ -183,7 +183,7 @@ def test_a_risk_that_a_file_cannot_hold_is_asked_for(tmp_path):
     problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}], risk=Best(), horizon=0.5)
     sweep = problem.sweep(values=[1.0, 2.0], executor="serial", progress=False)
     sweep.save(tmp_path / "sweep.vtb")
-    loaded = vtb.Sweep.load(tmp_path / "sweep.vtb")
+    loaded = Sweep.load(tmp_path / "sweep.vtb")
     with pytest.raises(ValueError, match=r"set it by dataclasses.replace\(sweep, risk=...\)"):
         loaded.best()
     assert replace(loaded, risk=Best()).best() == sweep.best()

@@ -8,6 +8,7 @@ from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.optimization import Sweep
 from vtbdrake.state import ArchiveError, SnapshotError
 from vtbdrake.state.archive import write_archive
 from vtbdrake.testbed import DpsAlone
@@ -101,17 +102,17 @@ def test_the_worst_condition_counts_for_the_best_point():
 def test_a_sweep_survives_its_file(tmp_path):
     sweep = _problem().sweep(points=3, executor="serial", record=[THETA, "plant.state"], progress=False)
     sweep.save(tmp_path / "sweep.vtb")
-    loaded = vtb.Sweep.load(tmp_path / "sweep.vtb")
+    loaded = Sweep.load(tmp_path / "sweep.vtb")
     assert all(a.identical(b) for a, b in zip(sweep.rollouts, loaded.rollouts, strict=True))
     assert loaded.boundary() == sweep.boundary()
     assert loaded.parameters == sweep.parameters
     assert loaded.scenario == sweep.scenario
     (tmp_path / "half.vtb").write_bytes((tmp_path / "sweep.vtb").read_bytes()[:1000])
     with pytest.raises(ArchiveError, match="damaged"):
-        vtb.Sweep.load(tmp_path / "half.vtb")
+        Sweep.load(tmp_path / "half.vtb")
     write_archive(tmp_path / "other.vtb", kind="vtbdrake sweep", version=3, header={"parameters": []}, arrays={})
     with pytest.raises(ArchiveError, match="it has no 'conditions'"):
-        vtb.Sweep.load(tmp_path / "other.vtb")
+        Sweep.load(tmp_path / "other.vtb")
 
 
 def test_a_sweep_is_a_table():

@@ -87,7 +87,9 @@ executor_options: Callable[[F], F] = _all(
     ),
 )
 _file_options: Callable[[F], F] = _all(
-    click.option("--save", callback=output(), metavar="FILE", help="Write the sweep for vtbdrake.Sweep.load."),
+    click.option(
+        "--save", callback=output(), metavar="FILE", help="Write the sweep for vtbdrake.optimization.Sweep.load."
+    ),
     click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write the table."),
     click.option("--plot", callback=output(".png", ".svg", ".pdf"), metavar="FILE", help="Draw h and the qualities."),
 )

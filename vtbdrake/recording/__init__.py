@@ -14,3 +14,7 @@ the boundary, each on its own channel. Whatever else determined the DPS is on ch
 Playing a log onto a bus plays its actuator commands too: select channels with ``lcm-logplayer --regexp``, or protect
 the command channels with a hub.
 """
+
+from vtbdrake.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

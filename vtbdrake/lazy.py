@@ -1,0 +1,35 @@
+"""Packages that import their public names when these are first used."""
+
+import ast
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+
+def lazy_names(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
+
+    Its stub ``__init__.pyi`` tells the names, to editors and type checkers as well: it contains nothing but imports
+    such as ``from vtbdrake.control.runtime import Runtime as Runtime``.
+
+    Args:
+        package: The ``__name__`` of the package.
+        file: The ``__file__`` of the package.
+    """
+    stub = ast.parse(Path(file).with_name("__init__.pyi").read_text("utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
+
+    def getattr_(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(homes[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    def dir_() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return getattr_, dir_, sorted(homes)
