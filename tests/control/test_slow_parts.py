@@ -1,4 +1,4 @@
-"""Slow parts beside the loop, in real processes: timing, exactness, and what becomes of results that do not come."""
+"""Slow parts beside the loop, in real processes: timing, exactness, and results that do not arrive."""
 
 import os
 import signal
@@ -57,7 +57,7 @@ class Loop:
         return self.runtime.slow_parts.wait(TIMEOUT)
 
     def run(self, cycles):
-        """Runs as fast as it can: nobody waits for the slow part."""
+        """Run without waiting for the slow part."""
         self.runtime.run(cycles=cycles)
 
     def run_patiently(self, cycles):
@@ -111,7 +111,7 @@ def replayed(scenario, cycles, *, results):
 
 
 @pytest.mark.parametrize("latency", [0.01, 0.05])
-def test_the_loop_does_what_a_simulation_does_bit_for_bit(latency):
+def test_loop_and_simulation_agree_bit_for_bit(latency):
     with loop(latency=latency) as real:
         real.run_patiently(300)
         assert real.counts.results >= 12 and real.counts.missed == 0
@@ -121,7 +121,7 @@ def test_the_loop_does_what_a_simulation_does_bit_for_bit(latency):
             assert np.array_equal(state[f"{PATH}.{name}"], real.states[n][f"{PATH}.{name}"])
 
 
-def test_a_replay_with_missed_and_late_results_is_exact(gate):
+def test_replay_with_missed_and_late_results_is_exact(gate):
     with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
         real.run(45)
         assert real.counts.missed == 2 and real.counts.late == 0
@@ -136,7 +136,7 @@ def test_a_replay_with_missed_and_late_results_is_exact(gate):
     assert states[-1][f"{PATH}.missed"] == real.counts.missed
 
 
-def test_the_memory_of_a_late_result_is_the_next_calls(gate):
+def test_memory_of_a_late_result_is_used_next(gate):
     with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
         real.run(30)
         with opened(gate):
@@ -149,7 +149,7 @@ def test_the_memory_of_a_late_result_is_the_next_calls(gate):
         assert np.array_equal(real.read("estimate"), estimate)
 
 
-def test_nothing_waits_for_a_part_that_never_returns(gate):
+def test_loop_does_not_wait_for_a_function_that_hangs(gate):
     with loop(function=partial(gated, gate=str(gate)), more={"memory": np.zeros(2), "patience": 20.0}) as real:
         real.run(100)
         assert real.runtime.time == 100 * PERIOD and len(real.bridge.sent) == 100
@@ -167,22 +167,22 @@ def test_nothing_waits_for_a_part_that_never_returns(gate):
         assert real.counts.results >= 1 and real.read("valid") == 1.0
 
 
-def test_a_process_that_dies_is_replaced():
+def test_worker_that_dies_is_replaced():
     with loop(function=processes, more={"patience": 1.0}) as real:
         real.run_patiently(50)
-        pid, keeper = real.read("estimate")
+        pid, supervisor = real.read("estimate")
         os.kill(int(pid), signal.SIGKILL)
         while real.counts.restarts == 0:
             real.run(1)
         assert real.wait()
         real.run_patiently(50)
         another, same = real.read("estimate")
-        assert another != pid and same == keeper
+        assert another != pid and same == supervisor
         assert real.read("missed") == real.counts.missed
         assert real.runtime.time == pytest.approx(len(real.cycles) * PERIOD)
 
 
-def test_a_sample_that_kills_its_process_is_missing_and_does_not_kill_the_next(caplog):
+def test_sample_that_kills_the_worker_is_missing(caplog):
     settings = {"function": deadly, "period": 0.3, "latency": 0.25, "more": {"patience": 4.0}}
     with loop(sensors=lambda t: {"position": [t - 0.1, 0.0]}, **settings) as real:
         real.run_patiently(2)
@@ -194,19 +194,19 @@ def test_a_sample_that_kills_its_process_is_missing_and_does_not_kill_the_next(c
     assert any("died (exit code 7)" in record.getMessage() for record in caplog.records)
 
 
-def test_without_its_processes_everything_is_missing_and_the_loop_goes_on():
+def test_loop_goes_on_without_the_processes():
     with loop(function=processes, more={}) as real:
         real.run_patiently(50)
-        _, keeper = real.read("estimate")
-        os.kill(int(keeper), signal.SIGKILL)
-        os.waitid(os.P_PID, int(keeper), os.WEXITED | os.WNOWAIT)
+        _, supervisor = real.read("estimate")
+        os.kill(int(supervisor), signal.SIGKILL)
+        os.waitid(os.P_PID, int(supervisor), os.WEXITED | os.WNOWAIT)
         before = real.counts.results
         real.run(200)
         assert real.counts.results == before and real.counts.missed >= 9
         assert len(real.bridge.sent) == 250
 
 
-def test_no_process_is_left_behind():
+def test_no_process_is_left():
     with loop(function=processes, more={}) as real:
         real.run_patiently(50)
         pids = [int(pid) for pid in real.read("estimate")]
@@ -215,7 +215,7 @@ def test_no_process_is_left_behind():
             os.kill(pid, 0)
 
 
-def test_an_exception_makes_results_missing_and_is_told_once(caplog):
+def test_exception_makes_results_missing_and_is_logged_once(caplog):
     with loop(function=picky, more={}, sensors=lambda t: {"position": [0.055 - t, 1.0]}) as real:
         real.run_patiently(200)
         # It raises from the sample at 60 ms on (one cycle passed before the DPS began).
@@ -226,7 +226,7 @@ def test_an_exception_makes_results_missing_and_is_told_once(caplog):
     assert len(told) == 1 and PATH in told[0].getMessage()
 
 
-def test_a_copy_of_a_running_context_computes_by_itself(gate):
+def test_copy_of_a_running_context_computes_itself(gate):
     function = partial(gated, gate=str(gate))
     with loop(function=function, more=PATIENT) as real:
         real.run(25)
@@ -242,7 +242,7 @@ def test_a_copy_of_a_running_context_computes_by_itself(gate):
     assert target.read(copy, f"{PATH}.missed") == 1.0
 
 
-def test_a_part_that_takes_50_ms_works_beside_a_loop_of_1_ms():
+def test_function_of_50_ms_runs_beside_a_loop_of_1_ms():
     settings = {"function": busy, "period": 0.1, "latency": 0.4, "more": {}}
     with loop(clock=WallClock(), **settings) as real:
         real.runtime.run(cycles=60_000, until=lambda: real.counts.results >= 3)
@@ -262,7 +262,7 @@ def mean_colour(camera):
     return {"colour": camera.data.mean(axis=(0, 1)), "mirrored": camera.data[:, ::-1]}
 
 
-def test_images_go_there_and_back():
+def test_images_are_sent_both_ways():
     image = ImageRgba8U(640, 480)
     image.mutable_data[:] = np.random.default_rng(1).integers(0, 256, size=(480, 640, 4), dtype=np.uint8)
     builder = DiagramBuilder()
@@ -314,13 +314,13 @@ class Stubborn:
         ({"function": partial(chaotic, own=Stubborn())}, "the function of the slow part dps.perception cannot"),
     ],
 )
-def test_a_part_that_cannot_work_beside_the_loop_is_refused(settings, told):
+def test_impossible_slow_part_is_refused(settings, told):
     with pytest.raises(ValueError) as error:
         Loop(SlowScenario(**settings), SimulatedClock(), moving)
     assert told in str(error.value)
 
 
-def test_messages_keep_every_array():
+def test_messages_keep_arrays():
     rng = np.random.default_rng(2)
     arrays = {
         "image": rng.integers(0, 255, size=(48, 64, 3), dtype=np.uint8),

@@ -1,4 +1,4 @@
-"""The slow parts of a DPS that runs in a loop: each is computed beside it, in a process of its own."""
+"""The slow parts of a DPS in a control loop: their functions run in other processes, beside the loop."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.clock import Clock
-from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, keep, pack, unpack
+from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, pack, supervise, unpack
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import RESULT as CHANGE
 from vtbdrake.control.worker_process import WorkerProcess
@@ -21,21 +21,21 @@ from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
 
 _log = logging.getLogger(__name__)
 
-# Of a cycle: where a step ends is a sum of floating-point numbers, and a result may be due just there.
+# Relative to a period: the end of a step is a sum of floating-point numbers, and a result may be due just then.
 _ROUNDING = 1e-6
 
 
 @dataclass
 class SlowStatistics:
-    """How a slow part fares beside the loop.
+    """Statistics of a slow part beside the loop.
 
     Attributes:
-        results: how many came in time.
-        missed: how many were declared missing.
-        late: how many came after that, and were not used.
-        errors: how many times its function raised.
-        restarts: how many times its process died, or was ended because it did not answer, and another was started.
-        took: from a request to its answer, in seconds on the loop's clock.
+        results: the number of results that arrived in time.
+        missed: the number of results that were declared missing.
+        late: the number of results that arrived after that, and were not used.
+        errors: the number of calls of its function that raised an exception.
+        restarts: the number of times its worker was replaced, because it died or did not answer.
+        took: the times from a request to its answer, in seconds on the loop's clock.
     """
 
     results: int = 0
@@ -47,18 +47,22 @@ class SlowStatistics:
 
 
 class SlowParts:
-    """All of them, looked after once before and once after each step; neither waits.
+    """All slow parts of a DPS, served once before and once after each step, without waiting.
 
-    A result enters the context, and is told as a `Change`, in the cycle before whose step it is there. What is due
-    within the coming step, or at its end, and is not there, is declared missing. So is what its process will not
-    answer any more, as the function raised or the process died. A process works on one request at a time; what cannot
-    begin in time becomes missing, and nothing queues up.
+    A result enters the context, and is reported as a `Change`, before the first step after its arrival. A result that
+    is due by the end of the coming step, and has not arrived, is declared missing; so is one that will not arrive,
+    because the function raised an exception or the worker was lost. A worker has one request at a time; samples that
+    it cannot begin in time become missing, so that no queue grows.
 
-    Attributes:
-        statistics: by path.
+    Args:
+        parts: the slow parts by path.
+        context: the context of the Diagram that contains them.
+        period: the period of the loop, in seconds.
+        clock: the clock of the loop.
+        changed: called with the kind and the values of every `Change`.
 
     Raises:
-        ValueError: a latency is so short that no result could come in time, or a function cannot be sent to another
+        ValueError: a latency is so short that no result could arrive in time, or a function cannot be sent to another
             process.
     """
 
@@ -71,50 +75,61 @@ class SlowParts:
         clock: Clock,
         changed: Callable[[str, Mapping[str, Any]], None],
     ) -> None:
+        functions = {}
         for path, part in parts.items():
             if part.latency < 2.0 * period:
                 raise ValueError(
                     f"the slow part {path} has a latency of {part.latency:g} s; in a loop with a period of "
                     f"{period:g} s it takes at least {2.0 * period:g} s for a result to come back"
                 )
+            try:
+                functions[path] = dumps(part.function)
+            except Exception as error:
+                raise ValueError(
+                    f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "
+                    f"{error}): keep what cannot be pickled out of it"
+                ) from error
         self._context = context
         self._step = period * (1.0 + _ROUNDING)
-        functions = {path: _sendable(path, part) for path, part in parts.items()}
-        self._beside = [_Beside(path, part, functions[path], context, clock, changed) for path, part in parts.items()]
+        # Processes start only when all functions are known to be good.
+        self._parts = [_Part(path, part, functions[path], context, clock, changed) for path, part in parts.items()]
 
     @property
     def statistics(self) -> dict[str, SlowStatistics]:
-        return {beside.path: beside.statistics for beside in self._beside}
+        """The statistics of the slow parts, by path."""
+        return {part.path: part.statistics for part in self._parts}
 
     def receive(self) -> None:
-        """Before a step: hands in what has come, and declares missing what should have."""
-        if self._beside:
+        """Deliver what has arrived, and declare missing what should have; called before a step."""
+        if self._parts:
             end = self._context.get_time() + self._step
-            for beside in self._beside:
-                beside.receive(end)
+            for part in self._parts:
+                part.receive(end)
 
     def send(self) -> None:
-        """After a step: sends off what has been sampled."""
-        for beside in self._beside:
-            beside.send()
+        """Send what has been sampled; called after a step."""
+        for part in self._parts:
+            part.send()
 
     def wait(self, timeout: float) -> bool:
-        """Waits until every process has something to say, at first that it is ready; whether they all had within
-        ``timeout`` seconds.
+        """Wait until every worker has an answer, or is ready for its first request.
 
-        To be called before the first cycle, where no result is to be missing; and between any two of a loop on a
-        simulated clock, which leaves no time to compute.
+        Call it before the first cycle, if no result should be missing; and between the cycles of a loop on a simulated
+        clock, which leaves no time to compute.
+
+        Returns:
+            False if one has no answer within ``timeout`` seconds.
         """
-        return all([beside.wait(timeout) for beside in self._beside])
+        return all([part.wait(timeout) for part in self._parts])
 
     def close(self) -> None:
-        """Ends the processes."""
-        for beside in self._beside:
-            beside.close()
+        """End all processes."""
+        for part in self._parts:
+            part.close()
 
 
-class _Beside:
-    """One slow part and its process."""
+class _Part:
+    """One slow part and its processes."""
 
     def __init__(
         self,
@@ -132,37 +147,32 @@ class _Beside:
         self._clock = clock
         self._changed = changed
         self._waiting = part.waiting(context)
-        self._working: int | None = None
+        self._requested: int | None = None  # The tick of the request that the worker has.
+        self._requested_at = 0.0
         self._ready = False
-        self._asked = 0.0
-        self._trouble = ""
+        self._last_failure = ""
         self._answers: list[bytes] = []
-        self._worker = WorkerProcess(
-            keep,
-            function,
-            part.patience * part.latency,
-            path,
-            name=f"the keeper of the slow part {path}",
-        )
+        name = f"the supervisor of the slow part {path}"
+        self._supervisor = WorkerProcess(supervise, function, part.patience * part.latency, path, name=name)
 
     def receive(self, end: float) -> None:
-        answers, self._answers = self._answers + self._worker.take(), []
+        answers, self._answers = self._answers + self._supervisor.take(), []
         for answer in answers:
-            self._take_in(*unpack(answer))
+            self._handle(*unpack(answer))
         for tick in [tick for tick in self._waiting if self._part.due(tick) <= end]:
             self._miss(tick)
 
-    def _take_in(self, kind: str, content: Any) -> None:
+    def _handle(self, kind: str, content: Any) -> None:
         self._ready = kind != LOST
         if kind == LOST:
             self.statistics.restarts += 1
-            self._fail(self._working, content)
-            self._working = None
+            self._fail(self._requested, content)
+            self._requested = None
         elif kind in (RESULT, ERROR):
             tick, answer = content
-            if tick == self._working:
-                self.statistics.took.record(self._clock.now() - self._asked)
-                self._working = None
+            if tick == self._requested:
+                self.statistics.took.record(self._clock.now() - self._requested_at)
+                self._requested = None
             if kind == RESULT:
                 self._use(tick, answer)
             else:
@@ -180,10 +190,9 @@ class _Beside:
                 self._deliver(tick, memory)
 
     def _fail(self, tick: int | None, reason: str) -> None:
-        # What happens with every sample is told once.
-        if reason != self._trouble:
+        if reason != self._last_failure:  # The same failure with every sample is logged once.
             _log.error("the slow part %s: %s", self.path, reason)
-            self._trouble = reason
+            self._last_failure = reason
         if tick is not None:
             self._miss(tick)
 
@@ -198,36 +207,26 @@ class _Beside:
         self._changed(CHANGE, {self.path: {"tick": tick, **arrays}})
 
     def send(self) -> None:
-        self._worker.flush()
+        self._supervisor.flush()
         self._waiting = self._part.waiting(self._context)
-        if self._ready and self._working is None and self._waiting:
-            self._working = next(iter(self._waiting))
-            self._asked = self._clock.now()
-            arrays = {**self._waiting[self._working], **self._part.memory(self._context)}
-            if not self._worker.post(*pack((self._working, arrays))):
-                _log.error("the slow part %s: its processes are gone, and nothing is computed any more", self.path)
+        if self._ready and self._requested is None and self._waiting:
+            self._requested = next(iter(self._waiting))
+            self._requested_at = self._clock.now()
+            arrays = {**self._waiting[self._requested], **self._part.memory(self._context)}
+            if not self._supervisor.post(*pack((self._requested, arrays))):
+                _log.error("the slow part %s: its processes have ended, and all results will be missing", self.path)
 
     def wait(self, timeout: float) -> bool:
         end = time.monotonic() + timeout
-        while (self._working is not None or not self._ready) and not self._answers:
+        while (self._requested is not None or not self._ready) and not self._answers:
             left = end - time.monotonic()
-            if left <= 0.0 or not self._worker.alive:
+            if left <= 0.0 or not self._supervisor.alive:
                 return False
-            line = [self._worker.fileno()]
-            select.select(line, line if self._worker.unsent else [], [], left)
-            self._worker.flush()
-            self._answers += self._worker.take()
+            descriptor = [self._supervisor.fileno()]
+            select.select(descriptor, descriptor if self._supervisor.unsent else [], [], left)
+            self._supervisor.flush()
+            self._answers += self._supervisor.take()
         return True
 
     def close(self) -> None:
-        self._worker.close()
-
-
-def _sendable(path: str, part: SlowPart) -> bytes:
-    try:
-        return dumps(part.function)
-    except Exception as error:
-        raise ValueError(
-            f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "
-            f"{error}): keep what cannot be pickled out of it"
-        ) from error
+        self._supervisor.close()

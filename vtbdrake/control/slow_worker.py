@@ -1,4 +1,8 @@
-"""The other processes of a slow part: one that computes, and one that keeps it running; and how arrays travel."""
+"""The processes of a slow part: a worker that computes, and a supervisor that restarts it.
+
+The supervisor exists because it takes milliseconds to kill and to start a process, which the loop does not have. This
+module needs no Drake, so that the supervisor starts quickly and stays small.
+"""
 
 from __future__ import annotations
 
@@ -12,47 +16,51 @@ from typing import Any
 
 from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 
-# What comes back: the first of a message, before what it is about.
+# The kinds of messages to the loop, which are pairs of a kind and its content.
 READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
 
 _COUNT = struct.Struct("<I")
 _LENGTH = struct.Struct("<Q")
 
 
-def keep(channel: FrameConnection, function: bytes, patience: float, name: str) -> None:
-    """Keeps a process that computes, and passes requests and answers on.
-
-    To end a process and to start one takes milliseconds that the loop does not have: so it is done from here.
+def supervise(loop: FrameConnection, function: bytes, patience: float, name: str) -> None:
+    """Keep a worker running, and forward requests and answers.
 
     Args:
-        function: see `serve`.
-        patience: in seconds; who takes longer for an answer is ended.
-        name: of the slow part.
+        loop: the connection to the loop.
+        function: see `compute`.
+        patience: the time in seconds after which a worker that does not answer is replaced.
+        name: the name of the slow part.
     """
     while True:
         begin = time.monotonic()
-        worker = WorkerProcess(serve, function, name=f"the process of the slow part {name}")
+        worker = WorkerProcess(compute, function, name=f"the worker of the slow part {name}")
         try:
-            reason = _pass_on(channel, worker, patience)
+            reason = _forward(loop, worker, patience)
         finally:
             worker.kill()
-        channel.send(*pack((LOST, reason)))
-        _pause(channel, begin + patience - time.monotonic())
+        loop.send(*pack((LOST, reason)))
+        # A worker that dies at its start must not be restarted all the time.
+        if (pause := begin + patience - time.monotonic()) > 0.0:
+            try:
+                loop.receive(pause)
+            except TimeoutError:
+                continue
 
 
-def _pass_on(channel: FrameConnection, worker: WorkerProcess, patience: float) -> str:
-    """Until the worker is lost; says how."""
+def _forward(loop: FrameConnection, worker: WorkerProcess, patience: float) -> str:
+    """Forward requests and answers until the worker is lost; return the reason."""
     deadline = inf
     while True:
         left = None if deadline == inf else max(0.0, deadline - time.monotonic())
-        full = [worker.fileno()] if worker.unsent else []
-        readable, _, _ = select.select([channel.fileno(), worker.fileno()], full, [], left)
-        if channel.fileno() in readable:
-            worker.post(channel.receive())
+        writable = [worker.fileno()] if worker.unsent else []
+        readable, _, _ = select.select([loop.fileno(), worker.fileno()], writable, [], left)
+        if loop.fileno() in readable:
+            worker.post(loop.receive())
             deadline = time.monotonic() + patience
         worker.flush()
         for answer in worker.take():
-            channel.send(answer)
+            loop.send(answer)
             deadline = inf
         if not worker.alive:
             return f"died (exit code {worker.close(patience)})"
@@ -60,35 +68,26 @@ def _pass_on(channel: FrameConnection, worker: WorkerProcess, patience: float) -
             return f"did not answer within {patience:g} s"
 
 
-def _pause(channel: FrameConnection, seconds: float) -> None:
-    """A process that dies at its start must not be started all the time."""
-    if seconds > 0.0:
-        try:
-            channel.receive(seconds)
-        except TimeoutError:
-            return
-
-
-def serve(channel: FrameConnection, function: bytes) -> None:
-    """Computes: says that it is ready, then answers every request (tick, arrays) by (tick, arrays) or (tick, the error
-    as text).
+def compute(supervisor: FrameConnection, function: bytes) -> None:
+    """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error).
 
     Args:
-        function: a `SlowFunction`, by cloudpickle.
+        supervisor: the connection to the supervisor.
+        function: a `SlowFunction`, pickled by cloudpickle.
     """
-    compute = pickle.loads(function)
-    channel.send(*pack((READY, None)))
+    evaluate = pickle.loads(function)
+    supervisor.send(*pack((READY, None)))
     while True:
-        tick, arrays = unpack(channel.receive())
+        tick, arrays = unpack(supervisor.receive())
         try:
-            answer = RESULT, (tick, compute(arrays))
+            answer = RESULT, (tick, evaluate(arrays))
         except Exception:
             answer = ERROR, (tick, traceback.format_exc())
-        channel.send(*pack(answer))
+        supervisor.send(*pack(answer))
 
 
 def pack(message: Any) -> list[Any]:
-    """A message as parts of a frame; its arrays are parts of their own, which are not copied."""
+    """Return a message as parts of a frame; its arrays are parts of their own, which are not copied."""
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
     raw = [buffer.raw() for buffer in buffers]
@@ -97,7 +96,7 @@ def pack(message: Any) -> list[Any]:
 
 
 def unpack(frame: bytes) -> Any:
-    """The message in a frame; its arrays lie in the frame, and are read only."""
+    """Return the message in a frame; its arrays are read-only views of the frame."""
     (count,) = _COUNT.unpack_from(frame)
     position = _COUNT.size + count * _LENGTH.size
     parts = []
