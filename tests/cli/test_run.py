@@ -181,7 +181,7 @@ def test_a_step_that_does_not_end_is_ended_and_the_fallback_goes_out(hub: Hub) -
         heard = np.array(ear.listen()).reshape(-1, 2)
     assert program.returncode == 1, errors
     last = errors.splitlines()[-1]
-    assert last.startswith("Error: a real-time thread has computed for 2 s without waiting once: its step does not end")
+    assert last.startswith("Error: a real-time thread has computed for 2 s without waiting: its step does not end")
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
 
 

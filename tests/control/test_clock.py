@@ -165,10 +165,10 @@ def test_work_takes_simulated_time() -> None:
 
 @pytest.mark.parametrize("seconds", [-1.0, nan, inf])
 def test_simulated_time_runs_forwards(seconds: float) -> None:
-    with pytest.raises(ValueError, match="forwards"):
+    with pytest.raises(ValueError, match="from 0 on"):
         SimulatedClock().advance(seconds)
 
 
 def test_simulated_clock_is_never_early() -> None:
-    with pytest.raises(ValueError, match="late or in time"):
+    with pytest.raises(ValueError, match="not be negative"):
         SimulatedClock(lateness=[-0.1]).wait_until(1.0)

@@ -1,4 +1,4 @@
-"""What lies behind the real ports of a testbed: a bridge, which lives outside the Diagram."""
+"""The bridge: what connects the real ports of a testbed with the machine."""
 
 from __future__ import annotations
 
@@ -12,31 +12,30 @@ from typing import TYPE_CHECKING, Any
 from vtbdrake.control.kernels import ReceivedSignal
 
 if TYPE_CHECKING:
-    # A link to a bus needs nothing of Drake: whoever only listens is spared its weight.
+    # So that a process that only listens on a bus need not load Drake.
     from vtbdrake.testbed import Interface, Signal
 
 __all__ = ["Bridge", "BridgeError", "ReceivedSignal", "reported_signals"]
 
 
 class BridgeError(RuntimeError):
-    """A bridge that cannot be opened, or is used before it is."""
+    """A bridge that cannot be opened, or is used before it is open."""
 
 
 class Bridge(ABC):
-    """Carries what crosses the boundary between a testbed and the real machine.
+    """The connection between the real ports of a testbed and the machine; it lives outside the Diagram.
 
-    One thread uses it. No call of it waits longer than it is told to, and none raises because of what came in or
-    because the machine is gone: that is counted, and told by `connected`.
+    One thread uses it. No call waits longer than its ``timeout``, and none raises because of a received message or
+    because the machine is gone: messages are counted, and `connected` tells the state.
 
     Attributes:
-        interface: the DPS's signals.
-        sensed: reception of each sensor signal, by name.
-        commands: reception of each command u that comes from outside, by name.
-        channels: by sensor signal, the channel of its messages, for a bridge that has such.
-        reported: reception of the command that the machine says acts on an actuator signal, by the signal's name; of
-            those that it reports.
-        tap: called with channel and bytes of every message that comes or has left, by a bridge that has such; it must
-            not raise, and costs the loop's time.
+        interface: signals of the DPS.
+        sensed: the received sensor signals, by name.
+        commands: the received commands u that come from outside, by name.
+        channels: channel of the messages of each sensor signal, for a bridge that has channels.
+        reported: for the actuator signals that the machine reports: the received command that acts there, by name.
+        tap: called with channel and bytes of every message that was received or sent, by a bridge that has channels. It
+            must not raise, and costs the loop's time.
     """
 
     interface: Interface
@@ -48,20 +47,26 @@ class Bridge(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Connects.
+        """Connect.
 
         Raises:
-            BridgeError: it cannot; there is no private substitute.
+            BridgeError: the connection cannot be made. A bridge never falls back to a private bus.
         """
 
     @abstractmethod
     def poll(self, timeout: float = 0.0) -> int:
-        """Takes in what has arrived, waiting up to ``timeout`` seconds for the first; says how many messages came."""
+        """Receive what has arrived, and return the number of messages; wait up to ``timeout`` seconds for the first.
+
+        A bridge that has lost its connection tries to connect again here.
+        """
 
     @abstractmethod
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
-        """Send actuator signals, by name. A signal that is not named is not sent: there is no message for "no
-        command".
+        """Send actuator commands.
+
+        Args:
+            actuation: commands by actuator signal. A signal that is missing is not sent: there is no message for "no
+                command".
 
         Returns:
             The signals whose commands did not leave, as far as is known; mostly empty.
@@ -70,39 +75,39 @@ class Bridge(ABC):
     @property
     @abstractmethod
     def connected(self) -> bool:
-        """Whether messages can come and go at present. A bridge that lost its connection seeks a new one in `poll`."""
+        """Whether messages can be received and sent at present."""
 
     @property
     def blocked_reason(self) -> str | None:
-        """Why commands that leave do not reach the machine, as far as is known; None if nothing is."""
+        """Why commands that leave do not reach the machine, as far as is known; None if they do."""
         return None
 
     @property
     def foreign(self) -> int:
-        """How many commands of somebody else have been heard on the own command channels, by a bridge that listens, or
-        were refused there by a hub."""
+        """Number of other publishers' commands heard on the own channels, or rejected there by a hub."""
         return 0
 
     @property
     def competing_publisher(self) -> str | None:
-        """Who else commands the machine at present, as far as is heard; None if nobody does."""
+        """Which other publisher commands the machine at present, as one sentence; None if none is heard."""
         return None
 
     @abstractmethod
     def close(self) -> None:
-        """Gives the connection back; it may be opened again."""
+        """Disconnect; the bridge may be opened again."""
 
 
 def reported_signals(interface: Interface, reported: Mapping[str, str]) -> dict[str, Signal]:
-    """The signals that carry reported commands, by actuator signal.
+    """Return the signals that carry the commands that the machine reports as acting, by actuator signal.
 
-    They have no limits: what is reported is looked at, not obeyed.
+    They have no limits: they are only observed.
 
     Args:
-        reported: by actuator signal, the name of the signal in a message that tells what acts on it.
+        interface: signals of the DPS.
+        reported: actuator signal -> name, in a message, of the signal that reports what acts there.
 
     Raises:
-        ValueError: there is no such actuator signal, or the name is another signal's.
+        ValueError: there is no such actuator signal, or the name is that of another signal.
     """
     actuators = {signal.name: signal for signal in interface.act}
     taken = {signal.name for signal in interface.sense}

@@ -1,4 +1,4 @@
-"""What an actuator signal gets when the DPS cannot be relied on."""
+"""Fallbacks: what commands an actuator signal after a fault."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vtbdrake.testbed import Interface, Signal
 
 
 class Sample(NamedTuple):
-    """The newest sample of a sensor signal that was accepted as plausible.
+    """The newest plausible sample of a sensor signal.
 
     Attributes:
-        value: of the signal; an array of shape (size,), or an abstract value.
-        age: seconds since it arrived.
+        value: an array of shape (size,), or an abstract value.
+        age: time since it arrived, in seconds.
     """
 
     value: Any
@@ -32,52 +32,52 @@ class NoCommand:
 
 
 NO_COMMAND: Final = NoCommand()
-"""What a fallback returns to have nothing sent: the machine's own time-out then brakes it."""
+"""Returned by a fallback that wants nothing sent, so that the machine's own time-out brakes it."""
 
 
 class Fallback(ABC):
     """Commands one actuator signal from a fault on, until the guards are reset; its commands are limited like all.
 
     Attributes:
-        otherwise: takes over for the cycle if this one raises or commands what cannot be sent; the last command stays
-            if that is None, or fails too.
+        otherwise: the fallback for a cycle in which this one raises or returns an invalid command. If it is None or
+            fails, too, the last command stays.
     """
 
     otherwise: Fallback | None = None
 
     def check(self, signal: Signal, *, interface: Interface) -> None:  # noqa: B027 - most can command anything
-        """
+        """Check that this fallback can command a signal.
+
         Raises:
-            ValueError: it cannot command ``signal``.
+            ValueError: it cannot.
         """
 
     def take_over(self) -> None:  # noqa: B027 - most remember nothing
-        """Called before its first command after a fault: what it remembers of an earlier one is long over."""
+        """Forget earlier faults; called before the first command after a fault."""
 
     @abstractmethod
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
-        """Return what is to be sent, or `NO_COMMAND`.
+        """Return the command to be sent, shape (size,), or `NO_COMMAND`.
 
         Args:
-            last_sent: what was sent last, shape (size,).
-            sensed: values of the sensor signals that are fresh and plausible at present. The signal that caused the
-                fault is usually not in it.
-            known: the newest sample of every sensor signal that was accepted, however old it is. A signal of which no
-                sample was ever accepted is not in it.
-            dt: seconds since the cycle before.
+            last_sent: the last sent command, shape (size,).
+            sensed: values of the sensor signals that are fresh and plausible at present. Usually the signal that caused
+                the fault is missing.
+            known: the newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
+                accepted are missing.
+            dt: time since the cycle before, in seconds.
         """
 
 
 class Hold(Fallback):
-    """The last command stays, or what comes closest to it within the limits: a commanded position comes to rest, as
-    quickly as the limit of acceleration allows."""
+    """Repeats the last command within the limits: a commanded position comes to rest as quickly as they allow."""
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return last_sent
 
 
 class Zero(Fallback):
-    """No torque, no force, no speed; along the limits."""
+    """Commands zero torque, force or velocity, approached within the limits."""
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
         if not signal.is_vector:
@@ -88,7 +88,7 @@ class Zero(Fallback):
 
 
 class Silence(Fallback):
-    """Sends nothing, so that the machine's own time-out brakes it: for machines that have one."""
+    """Sends nothing, so that the machine's own time-out brakes it. Only for machines that have one."""
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return NO_COMMAND
@@ -97,14 +97,17 @@ class Silence(Fallback):
 class Brake(Fallback):
     """Brakes by torques or forces against the measured velocity v: -gain v.
 
-    Without a fresh velocity it is `Zero`: a torque that is held blindly accelerates. (A commanded position is braked by
-    `Hold`, a commanded velocity by `Zero`.)
+    Without a fresh velocity, `Zero` takes over: a torque that is held blindly accelerates. (For commanded positions use
+    `Hold`, for commanded velocities `Zero`.)
 
     Args:
-        velocity: the sensor signal that holds v.
+        velocity: name of the sensor signal that contains v.
         gain: viscous damping, in the actuator signal's unit by the sensor's; a scalar or one per entry of v. In a loop
-            of period T it is stable for gain T < 2 * inertia, less what delay takes.
-        entries: where v lies in the sensor signal; all of it by default.
+            of period T it is stable for gain T < 2 * inertia; delay reduces this bound.
+        entries: the entries of the sensor signal that are v; by default all.
+
+    Raises:
+        ValueError: a gain is negative.
     """
 
     otherwise = Zero()
@@ -113,7 +116,7 @@ class Brake(Fallback):
         self.velocity = velocity
         self.gain = np.array(gain, dtype=float)
         if not (self.gain >= 0.0).all():
-            raise ValueError(f"a brake has gains from 0 on; {self.gain.tolist()} would accelerate")
+            raise ValueError(f"the gains of a brake are not negative, unlike {self.gain.tolist()}")
         self.entries = entries
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
@@ -132,11 +135,11 @@ class Brake(Fallback):
 
 
 class FallbackController(Fallback):
-    """A controller of the user's own.
+    """Calls a function of the user.
 
     Args:
-        function: gets the arguments of `Fallback.command`, returns the command.
-        otherwise: takes over for the cycle if it raises or returns what cannot be sent.
+        function: gets the arguments of `Fallback.command` and returns the command.
+        otherwise: the fallback for a cycle in which the function raises or returns an invalid command.
     """
 
     def __init__(
@@ -156,10 +159,10 @@ _BY_UNIT: dict[str, type[Fallback]] = {
 
 
 def default_fallback(signal: Signal) -> Fallback:
-    """`Hold` for positions (rad, m); `Zero` for velocities, torques and forces, currents and voltages.
+    """Return `Hold` for positions (rad, m), `Zero` for velocities, torques, forces, currents and voltages.
 
     Raises:
-        ValueError: the unit does not tell what is safe.
+        ValueError: the signal's unit is none of these.
     """
     if signal.unit not in _BY_UNIT:
         raise ValueError(
@@ -171,7 +174,7 @@ def default_fallback(signal: Signal) -> Fallback:
 
 
 def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[Fallback]:
-    """``fallback``, what takes over if it fails, and so on.
+    """Return a fallback, the one that replaces it if it fails, and so on.
 
     Raises:
         ValueError: one of them cannot command ``signal``.

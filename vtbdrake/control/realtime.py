@@ -1,4 +1,4 @@
-"""Asks the operating system for what a punctual loop needs, and tells what it granted."""
+"""Real-time settings of the operating system for a punctual loop, and which of them were granted."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from vtbdrake.control import runaway
 
 
 class RealTimeError(RuntimeError):
-    """Something that was required was refused."""
+    """A required setting was refused."""
 
 
 class RunawayError(BaseException):
-    """A thread under SCHED_FIFO has computed for longer than it may without waiting once: it is in an endless loop.
+    """A thread under SCHED_FIFO has computed for longer than allowed without waiting once: it is in an endless loop.
 
-    It is no `Exception`, so that it ends the loop (which says farewell) and is not taken for a fault of one step, which
-    would be tried again.
+    It is not an `Exception`, so that it ends the loop, which sends the fallback commands, and does not count as a fault
+    of one step, which would be tried again.
     """
 
 
 @dataclass(frozen=True)
 class Grant:
-    """The answer to one request.
+    """The operating system's answer to one request.
 
     Attributes:
-        request: what was asked for.
-        granted: whether one got it.
-        reason: why not; empty if granted.
-        remedy: what to do about it; empty if granted.
+        request: the requested setting.
+        granted: whether it was granted.
+        reason: why it was refused; empty if granted.
+        remedy: what to do about a refusal; empty if granted.
     """
 
     request: str
@@ -56,7 +56,7 @@ class Grant:
 
 
 class RealTime:
-    """Makes the calling thread, and the process, fit for a punctual loop; afterwards all is as it was.
+    """Gives the calling thread and the process real-time settings, and restores the old ones afterwards.
 
     ::
 
@@ -64,27 +64,27 @@ class RealTime:
             print(real_time)
             runtime.run()
 
-    The thread gets SCHED_FIFO (threads and processes that it starts do not) and a timer slack of 1 ns, which is what
-    counts where SCHED_FIFO is refused. The process's memory is locked, Python's garbage collector rests, with all that
-    exists set aside from it, and threads hand over the GIL quickly. It is to be entered and left in one thread.
+    The thread gets SCHED_FIFO (threads and processes that it starts do not) and a timer slack of 1 ns, which matters if
+    SCHED_FIFO is refused. The process's memory is locked, Python's garbage collector is disabled, existing objects are
+    frozen, and threads hand over the GIL quickly. Enter and leave it in the same thread.
 
     Args:
-        priority: of SCHED_FIFO, 1 to 99; None leaves the scheduler alone.
-        lock_memory: whether to keep present and future memory from being paged out. Under a limit of locked memory (see
-            ``ulimit -l``), later allocations fail when it is reached.
-        cpus: the processors to run on; None leaves them alone.
-        awake: whether to keep all processors from sleeping when they have nothing to do: one that slept wakes up late.
-            It costs power.
-        collect_garbage: whether Python's garbage collector goes on. What refers to itself is not freed while it rests.
-        switch_interval: after how many seconds a thread that waits for the GIL asks for it; None leaves it alone.
+        priority: priority of SCHED_FIFO, 1 to 99; None keeps the scheduler.
+        lock_memory: whether to keep present and future memory from being paged out. If locked memory is limited (see
+            ``ulimit -l``), later allocations fail when the limit is reached.
+        cpus: processors to run on; None keeps them.
+        awake: whether to keep idle processors from sleeping, since a sleeping one wakes up late. It costs power.
+        collect_garbage: whether Python's garbage collector stays enabled. While it is disabled, cyclic garbage is not
+            freed.
+        switch_interval: time in seconds after which a waiting thread requests the GIL; None keeps it.
         longest_step: processor time in seconds that a thread under SCHED_FIFO may take without waiting; None sets no
             limit. Beyond it, the stacks of all threads are written to stderr, and `RunawayError` is raised in the main
-            thread. Where that does not help within a second, because the thread is stuck in C++, or at once where the
-            thread is not the main one, the process ends: else nothing else would run on its processor, for ever.
+            thread. If that does not help within a second, because the thread is stuck in C++, or at once if the thread
+            is not the main one, the process ends: otherwise nothing else would ever run on its processor.
         require: whether a refusal is an error.
 
     Attributes:
-        grants: the answers, in order, once entered.
+        grants: the answers, in order, after entering.
     """
 
     def __init__(
@@ -130,9 +130,10 @@ class RealTime:
         self._undo = ExitStack()
 
     def __enter__(self) -> Self:
-        """
+        """Apply the settings.
+
         Raises:
-            RealTimeError: something was refused, and is required; all is as before.
+            RealTimeError: a setting was refused and ``require`` is set; nothing has changed.
         """
         with ExitStack() as undo:
             self.grants = tuple(_ask(undo, *request) for request in self._requests)
@@ -148,7 +149,7 @@ class RealTime:
         self._undo.close()
 
     def __str__(self) -> str:
-        """One line per request."""
+        """Return one line per request."""
         return "\n".join(map(str, self.grants))
 
 
@@ -174,7 +175,7 @@ _SLACK = "use a kernel that has PR_SET_TIMERSLACK"
 
 
 def _ask(undo: ExitStack, request: str, setting: Callable[[], AbstractContextManager[None]], remedy: str) -> Grant:
-    """Applies a setting, to be taken back by ``undo``."""
+    """Apply a setting, which ``undo`` restores."""
     try:
         undo.enter_context(setting())
     except OSError as error:
@@ -186,7 +187,7 @@ def _ask(undo: ExitStack, request: str, setting: Callable[[], AbstractContextMan
 @contextmanager
 def _affinity(cpus: frozenset[int]) -> Iterator[None]:
     before = os.sched_getaffinity(0)
-    # The kernel takes what it can of a set; one that is not wholly there is not what was asked for.
+    # The kernel would silently drop processors that are not available.
     if not cpus <= before:
         raise OSError(errno.EINVAL, f"only {sorted(before)} may be used")
     os.sched_setaffinity(0, cpus)
@@ -232,7 +233,7 @@ def _no_collection() -> Iterator[None]:
     try:
         yield
     finally:
-        # Python thaws all or nothing: what somebody else froze stays so, and what was added with it.
+        # Python unfreezes all or nothing: objects that somebody else froze must stay frozen.
         if not was_frozen:
             gc.unfreeze()
         if was_enabled:
@@ -246,7 +247,7 @@ def _switch_interval(seconds: float) -> Iterator[None]:
     try:
         yield
     finally:
-        # Python cuts it to whole microseconds: 49.999999999999996 would become 49.
+        # Python truncates it to whole microseconds: 49.999999999999996 would become 49.
         sys.setswitchinterval(before + 0.5e-6)
 
 
@@ -260,20 +261,20 @@ def _timer_slack() -> Iterator[None]:
     try:
         yield
     finally:
-        # Under SCHED_FIFO a thread has none, and cannot be given any: the kernel answers 0.
+        # Under SCHED_FIFO a thread has no slack, and cannot be given any: the kernel reports 0.
         libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(before), 0, 0, 0)
 
 
 @contextmanager
 def _limited_steps(seconds: float) -> Iterator[None]:
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
-        raise OSError(errno.EINVAL, "without SCHED_FIFO there is nothing to limit")
+        raise OSError(errno.EINVAL, "only threads under SCHED_FIFO can be limited")
     before, most = resource.getrlimit(resource.RLIMIT_RTTIME)
     limit = round(1e6 * seconds)
     if most != resource.RLIM_INFINITY and limit > most:
         raise OSError(errno.EINVAL, f"only {1e-6 * most:g} s are allowed")
     main = threading.current_thread() is threading.main_thread()
-    # In another thread, Python could raise nothing that ends the step.
+    # Python can raise an error in the main thread only.
     handler = signal.signal(signal.SIGXCPU, partial(_raise_runaway, seconds)) if main else None
     runaway.install(1 if main else 0)
     faulthandler.register(signal.SIGXCPU, file=_STDERR, chain=True)
@@ -290,8 +291,8 @@ def _limited_steps(seconds: float) -> Iterator[None]:
 
 def _raise_runaway(seconds: float, number: int, frame: FrameType | None) -> NoReturn:
     raise RunawayError(
-        f"a real-time thread has computed for {seconds:g} s without waiting once: its step does not end, or needs a "
-        "larger RealTime(longest_step=...)"
+        f"a real-time thread has computed for {seconds:g} s without waiting: its step does not end, or needs a larger "
+        "RealTime(longest_step=...)"
     )
 
 

@@ -1,6 +1,6 @@
-"""What SIGXCPU does to a process whose real-time thread computes without end: a handler in C, which needs no Python.
+"""A handler in C of SIGXCPU, which ends a process whose real-time thread computes without end.
 
-A handler in Python runs when the main thread comes back to Python's loop. A step that is stuck in C++ never does.
+A handler in Python would run only when the main thread returns to Python, which a step stuck in C++ never does.
 """
 
 from libc.signal cimport SIGXCPU
@@ -12,14 +12,14 @@ cdef extern from "Python.h":
 
 EXIT_CODE = 70
 cdef int _exit_code = EXIT_CODE
-cdef const char* _message = b"a real-time thread computes without end, and is ended with its process\n"
+cdef const char* _message = b"a real-time thread computes without end: the process is ended\n"
 cdef Py_ssize_t _length = len(_message)
 cdef int _left = 0
 cdef sigaction_t _before
 
 
 cdef void _handle(int number) noexcept nogil:
-    # Nothing here but what is safe in a signal handler.
+    # Only functions that are safe in a signal handler.
     global _left
     if _left > 0:
         _left -= 1
@@ -30,7 +30,7 @@ cdef void _handle(int number) noexcept nogil:
 
 
 def install(int tolerated):
-    """Hands the first ``tolerated`` signals on to Python's handler; the next one ends the process with `EXIT_CODE`."""
+    """Forward the first ``tolerated`` signals to Python's handler; the next one ends the process with `EXIT_CODE`."""
     global _left
     cdef sigaction_t action
     _left = tolerated
@@ -38,9 +38,9 @@ def install(int tolerated):
     action.sa_flags = SA_RESTART
     sigemptyset(&action.sa_mask)
     if sigaction(SIGXCPU, &action, &_before) != 0:
-        raise OSError("SIGXCPU cannot be handled")
+        raise OSError("sigaction failed for SIGXCPU")
 
 
 def uninstall():
-    """Puts back what handled the signal before `install`."""
+    """Restore the handler from before `install`."""
     sigaction(SIGXCPU, &_before, NULL)

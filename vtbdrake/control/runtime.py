@@ -1,4 +1,4 @@
-"""Runs a DPS against the machine: the testbed as the controller, cycle by cycle."""
+"""The real-time loop: a testbed, or the DPS alone, controls the machine cycle by cycle."""
 
 from __future__ import annotations
 
@@ -25,50 +25,51 @@ from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
 
-_TELL_EVERY = 1.0  # s, of what could be told in every cycle
+_LOG_PERIOD = 1.0  # s, for messages that could be logged in every cycle
 
 
 class Runtime(Stepped):
     """Steps a testbed, or the DPS alone, once per period, with the machine on the other side of a bridge.
 
-    A cycle takes in what has arrived, gives it to the DPS, steps it by one period, lets the guards look at its
-    commands and sends them. The DPS's time is the number of cycles times the period, exactly: a cycle that is missed
-    is left out and counted, it is never caught up with, so that no burst of old commands goes out.
+    A cycle receives the newest messages, feeds them to the DPS, steps it by one period, lets the guards check its
+    actuator commands and sends them. The DPS's time is exactly the number of its steps times the period: a missed
+    cycle is left out and counted, and never caught up with, so that no burst of old commands is sent.
 
-    A testbed begins with its switches as they stand in ``context``; the DPS alone begins idle: it is stepped, and
+    A testbed starts with its switches as they stand in ``context``. The DPS alone starts idle: it is stepped, and
     commands, from its switch to ``real`` on.
 
-    The slow parts of the DPS work beside it, each in a process of its own, from the beginning until `close`, or the end
-    of a ``with`` block.
+    The slow parts of the DPS run beside it, each in a process of its own, until `close` or the end of a ``with`` block.
+
+    If another publisher commands the same machine, that is an alarm: it is logged and counted in the statistics. No
+    signal is switched to real while another publisher is heard. Guards cannot stop him; a hub can, by protected
+    channels.
 
     Args:
-        target: what is stepped.
-        bridge: open; it is polled and publishes in the thread that runs the cycles.
-        period: of a cycle, in seconds.
-        context: where the target begins; by default its defaults. It is the runtime's own from here on.
+        target: the testbed or the DPS alone.
+        bridge: an open bridge; the thread that runs the cycles polls it and publishes by it.
+        period: period of a cycle, in seconds.
+        context: where the target starts; its default context if None. It belongs to the runtime from then on.
         clock: by default the wall clock, which wakes up 0.1 ms early; a `SimulatedClock` makes tests deterministic.
-        guards: limits, watchdogs and fallbacks, made for the same period and signals; by default those that follow from
-            the interface.
-        pace: by default the clock; the name of a sensor signal lets every message of it begin a cycle (lock-step with
-            the machine), or the clock, where none comes for ``patience`` periods. Where the machine tells a cycle in
-            several messages, name a signal of the last one: a cycle begins with the first message that has the signal,
-            and steps with the values that the later ones had a cycle ago.
-        patience: in periods, see ``pace``. It has to cover the machine's jitter, and be shorter than the sensor
-            signals' largest ages, so that a silent machine is noticed by a cycle. A paced loop that is held up for
-            longer has missed cycles.
+        guards: guards made for the same period and signals; by default those that follow from the interface.
+        pace: by default the clock starts the cycles. With the name of a sensor signal, every message of it starts one
+            (lock-step with the machine), or the clock, if none comes for ``patience`` periods. If the machine's cycle
+            takes several messages, name a signal of the last one: the first message that contains the signal starts
+            the cycle, which gets the values of later messages from the cycle before.
+        patience: in periods, see ``pace``. It must cover the machine's jitter and be shorter than the sensor signals'
+            maximum ages, so that a cycle notices a silent machine. A paced loop that is delayed by more has missed
+            cycles.
         continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more. Commands depart from that sensor signal, also after a time in which none left.
-        ready: says why the machine is not ready to be commanded, or None.
-        statistics: of the loop's timing.
-        watchers: called with every `Cycle`; one that raises is left out from then on, and the loop goes on.
-
-    Somebody else who commands the same machine as this loop is an alarm: it is logged and counted in the statistics. No
-    signal is switched to real while somebody else is heard to command. Guards cannot keep him from it; a hub can, by
-    protected channels.
+        ready: returns why the machine is not ready to be commanded, or None.
+        statistics: statistics of the loop's timing, made for the same period.
+        watchers: called with every `Cycle`. One that raises is removed, and the loop goes on.
 
     Attributes:
-        cycles: how many there were.
-        slow_parts: of the DPS, with their statistics.
+        cycles: number of cycles so far.
+        slow_parts: the slow parts of the DPS, with their statistics.
+
+    Raises:
+        ValueError: an argument does not fit the target or the period.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class Runtime(Stepped):
         self.clock = clock or WallClock(spin=1e-4)
         self.guards = guards or Guards(target.interface, period)
         self.statistics = statistics or LoopStatistics(period)
-        _check_made_for(self.guards, self.statistics, target.interface, period)
+        _check_fit(self.guards, self.statistics, target.interface, period)
         self.guards.measured_by = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.ready = ready
         self.cycles = 0
@@ -109,13 +110,13 @@ class Runtime(Stepped):
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
         self._foreign = bridge.foreign
-        self._told_foreign = -inf
+        self._logged_foreign = -inf
         self.slow_parts = SlowParts(
             slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.note_change
         )
 
     def close(self) -> None:
-        """Ends the processes of slow parts; the last thing to do with it."""
+        """End the processes of the slow parts. Nothing can be done with the runtime afterwards."""
         self.slow_parts.close()
 
     def __enter__(self) -> Self:
@@ -123,11 +124,6 @@ class Runtime(Stepped):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def missed(self) -> int:
-        """How many cycles were left out."""
-        return self.statistics.misses
 
     # -- the loop
 
@@ -138,15 +134,15 @@ class Runtime(Stepped):
         seconds: float | None = None,
         until: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Runs cycles until there were enough, or `stop` is called. Ctrl-C sends the fallback commands once.
+        """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
 
         Args:
-            cycles: how many.
-            seconds: on the clock.
-            until: asked after every cycle.
+            cycles: number of cycles.
+            seconds: time on the clock.
+            until: called after every cycle; True ends the run.
 
         Raises:
-            ValueError: the seconds are no number, so that it would never end.
+            ValueError: ``seconds`` is not a number.
         """
         if seconds is not None and isnan(seconds):
             raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
@@ -160,7 +156,7 @@ class Runtime(Stepped):
                     if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                         return
                     due, lateness = self._await(deadline)
-                    # One that is paced by messages has just taken them in.
+                    # A loop that is paced by messages has just received them.
                     self.cycle(lateness=lateness, poll=self.pace is None)
                     interruptible.check()
                     done += 1
@@ -172,26 +168,26 @@ class Runtime(Stepped):
             raise
 
     def watch(self, watcher: Callable[[Cycle], None]) -> None:
-        """Has a watcher called with every cycle from the next one on."""
+        """Call a watcher with every `Cycle` from the next one on."""
         self._watchers.append(watcher)
 
     def unwatch(self, watcher: Callable[[Cycle], None]) -> None:
-        """Leaves a watcher out from now on; one that is not there is left out already."""
+        """Remove a watcher; one that was removed already (because it raised) is ignored."""
         if watcher in self._watchers:
             self._watchers.remove(watcher)
 
     def stop(self) -> None:
-        """Ends `run` after the present cycle; from any thread."""
+        """End `run` after the present cycle. May be called from any thread."""
         self._stop.set()
 
     def _await(self, deadline: float) -> tuple[float, float]:
-        """Waits for the next cycle; gives when it was due, and how late it is."""
+        """Wait for the next cycle; return when it was due and how late it is, in seconds."""
         if self.pace is None:
-            # What has come by shortly before need not be taken in, and fed, when the cycle is due.
-            return deadline, self.clock.wait_until(deadline, self._take_in) - deadline
-        reception = self.bridge.sensed[self.pace]
-        count, limit = reception.count, self.clock.now() + self._patience
-        while reception.count == count:
+            # Shortly before the deadline, what has arrived is received and fed already.
+            return deadline, self.clock.wait_until(deadline, self._receive_early) - deadline
+        paced = self.bridge.sensed[self.pace]
+        count, limit = paced.count, self.clock.now() + self._patience
+        while paced.count == count:
             left = limit - self.clock.now()
             if left <= 0.0:
                 break
@@ -199,28 +195,27 @@ class Runtime(Stepped):
         woke = self.clock.now()
         return woke, max(woke - limit, 0.0)
 
-    def _take_in(self) -> None:
+    def _receive_early(self) -> None:
         self.bridge.poll()
         self.feed()
 
     def _next(self, due: float, lateness: float) -> float:
-        """The next deadline; those that have passed already are left out and counted."""
+        """Return the next deadline; deadlines that have passed already are left out and counted."""
         now = self.clock.now()
         if self.pace is not None:
-            # It has waited for a message until now, late or not, and worked since.
-            self.statistics.miss(self._passed(lateness, now - due))
+            self.statistics.miss(self._overrun(lateness, now - due))
             return now
-        # The one that is due just now can still be kept.
+        # A deadline that is due just now can still be kept.
         behind = max(floor((now - due) / self.period), 0)
         self.statistics.miss(behind)
         return due + (behind + 1) * self.period
 
     def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
-        """One cycle, now.
+        """Run one cycle now and return its record.
 
         Args:
-            lateness: how many seconds after it was due.
-            poll: whether to take in first what has arrived.
+            lateness: time since the cycle was due, in seconds.
+            poll: whether to poll the bridge first.
         """
         begin = self.clock.now()
         if poll:
@@ -235,20 +230,19 @@ class Runtime(Stepped):
         error, actuation = self.step()
         stepped = self.clock.now()
         verdict = self.guards.check(
-            # As old as its samples are when it leaves, so old is a command: a long step makes them stale.
-            stepped,
+            stepped,  # After the step: a long one makes the samples, and with them the commands, stale.
             self.watched,
             actuation,
             active,
             error=error,
-            missed=self.statistics.run + self._passed(lateness, stepped - begin),
+            missed=self.statistics.run + self._overrun(lateness, stepped - begin),
             blocked=self.blocked_reason() if active else None,
             others=self.bridge.sensed,
         )
         self.guards.note_unsent(self.bridge.publish(verdict.actuation) if verdict.actuation else ())
         self.slow_parts.send()
         if self.bridge.foreign != self._foreign:
-            self._tell_foreign()
+            self._note_foreign()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
         changes, new = self.take_record()
         done = Cycle(self.cycles, self.time, now, changes, new, actuation, verdict)
@@ -257,52 +251,59 @@ class Runtime(Stepped):
             try:
                 watcher(done)
             except (Exception, SystemExit):  # A failed assertion inside Drake arrives as SystemExit.
-                _log.exception("a watcher of the loop raised, and is left out from now on")
+                _log.exception("a watcher of the loop raised, and is removed")
                 self._watchers.remove(watcher)
         return done
 
-    def _passed(self, lateness: float, worked: float) -> int:
-        """How many deadlines have passed before anything is sent: who slept for long wakes up to old messages, and who
-        worked for long answers old ones. A paced loop may work for as long as its patience."""
+    def _overrun(self, lateness: float, worked: float) -> int:
+        """Return how many deadlines have passed before anything is sent: after an overrun the inputs are stale.
+
+        A paced loop may work for as long as its patience.
+        """
         if self.pace is not None and worked <= self._patience:
             worked = 0.0
         return int((lateness + worked) / self.period)
 
-    def _tell_foreign(self) -> None:
-        """Counts commands of somebody else while this loop commands, and logs them once per second at most."""
+    def _note_foreign(self) -> None:
+        """Count other publishers' commands while this loop commands, and log them at most once per second."""
         foreign, now = self.bridge.foreign, self.clock.now()
         new, self._foreign = foreign - self._foreign, foreign
         if not self.active:
-            return  # Who only listens hears the one who commands.
+            return  # This loop only listens to the one that commands.
         self.statistics.foreign += new
-        if now - self._told_foreign >= _TELL_EVERY:
-            self._told_foreign = now
-            who = self.bridge.competing_publisher or "somebody else publishes commands"
-            _log.error("ALARM: %s (heard so far: %d)", who, self.statistics.foreign)
+        if now - self._logged_foreign >= _LOG_PERIOD:
+            self._logged_foreign = now
+            reason = self.bridge.competing_publisher or "another publisher commands the machine"
+            _log.error("ALARM: %s (heard so far: %d)", reason, self.statistics.foreign)
 
     def send_fallback(self, reason: str) -> None:
-        """Latches the guards and sends the fallback commands once: the farewell of who ends the loop."""
+        """Latch the guards and send the fallback commands once, as the last commands of a loop that ends."""
         verdict = self.guards.latch(reason, self.clock.now(), self.watched)
-        # The guards know what was on real in the last cycle, and give nothing for a signal that has not been commanded.
-        farewell = {name: command for name, command in verdict.actuation.items() if name in self.active}
-        if farewell:
-            self.bridge.publish(farewell)
+        # The verdict covers what was on real in the last cycle and has been commanded before.
+        last = {name: command for name, command in verdict.actuation.items() if name in self.active}
+        if last:
+            self.bridge.publish(last)
 
     def blocked_reason(self) -> str | None:
-        """Why the machine is not to be commanded at present: it is not ready, or somebody else commands it."""
+        """Return why the machine is not to be commanded now (not ready, commands do not reach it), or None."""
         return self.bridge.blocked_reason or self.ready()
 
     # -- switches
 
     def prepare(self, mode: str | None = None, **sides: Any) -> Preparation:
-        """First phase: whether switches (as of `VirtualTestbed.switch`) can be thrown; changes nothing."""
+        """Check whether switches can be thrown (first phase), without changing anything.
+
+        Args:
+            mode: as in `VirtualTestbed.switch`.
+            **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
+        """
         return prepare(self, mode, **sides)
 
     def perform(self, preparation: Preparation) -> None:
-        """Second phase: throws the switches of a preparation that has nothing against it, between the same two cycles.
+        """Throw the switches of a preparation (second phase), before another cycle has run.
 
         Raises:
-            SwitchRefusedError: it has, or there were cycles since: who knows what speaks against it now.
+            SwitchRefusedError: the preparation has reasons against it, or is outdated, as there were cycles since.
         """
         if preparation.cycle != self.cycles:
             age = self.cycles - preparation.cycle
@@ -312,10 +313,14 @@ class Runtime(Stepped):
         preparation.perform()
 
     def switch(self, mode: str | None = None, **sides: Any) -> None:
-        """Both phases at once, in the thread that runs the cycles, or between them.
+        """Prepare and perform a switch. Call it in the thread that runs the cycles, or between cycles.
+
+        Args:
+            mode: as in `VirtualTestbed.switch`.
+            **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
 
         Raises:
-            SwitchRefusedError: something speaks against it; nothing has changed.
+            SwitchRefusedError: there are reasons against the switch; nothing has changed.
         """
         self.perform(self.prepare(mode, **sides))
 
@@ -345,7 +350,7 @@ class Runtime(Stepped):
             waited = self.clock.now() - begin
             if waited >= timeout:
                 raise SwitchRefusedError(f"after {waited:.1f} s: {'; '.join(preparation.reasons)}")
-            if waited >= reported + _TELL_EVERY:
+            if waited >= reported + _LOG_PERIOD:
                 reported = waited
                 report("; ".join(preparation.reasons))
             return False
@@ -356,9 +361,9 @@ class Runtime(Stepped):
             self.cycle()
 
     def request(self, action: Callable[[], Any]) -> Future[Any]:
-        """Has ``action`` (a `switch`, a `write`) done at the beginning of the next cycle; from any thread.
+        """Call ``action`` (a `switch`, a `write`) at the beginning of the next cycle. May be called from any thread.
 
-        What changes the context by other means than the runtime's own is not recorded: a replay would lack it.
+        A change of the context by other means than the runtime's methods is not recorded: a replay would lack it.
         """
         future: Future[Any] = Future()
         self._requests.append((action, future))
@@ -378,11 +383,10 @@ class Runtime(Stepped):
         self.read_switches()
 
     def reset(self) -> None:
-        """Releases the latch of the guards; the DPS's commands go out again from the next cycle on.
+        """Release the latch of the guards: the DPS's commands are sent again from the next cycle on.
 
         Raises:
-            SwitchRefusedError: what they latched for is still there, or a command would not continue what is measured,
-                as at a switch to real.
+            SwitchRefusedError: a cause of the latch persists, or a command would not continue what is measured.
         """
         against = discontinuities(self, self.guards.driven)
         reasons = self.guards.reset(self.clock.now(), self.watched, against)
@@ -391,19 +395,15 @@ class Runtime(Stepped):
         self.note_change(RESET, {})
 
 
-def _check_made_for(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:
-    """
-    Raises:
-        ValueError: they are those of a loop with another period, or of another DPS.
-    """
+def _check_fit(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:
     for what, its in (("guards", guards.period), ("statistics", statistics.period)):
         if its != period:
-            raise ValueError(f"the {what} of this loop are made for a period of {its} s, and it has {period} s")
+            raise ValueError(f"the {what} of this loop are made for a period of {its} s, not for {period} s")
     sides = (("actuator", guards.limiters, interface.act), ("sensor", guards.monitors, interface.sense))
     for side, guarded, signals in sides:
         names = [signal.name for signal in signals]
         if set(guarded) != set(names):
             raise ValueError(
-                f"the guards of this loop are made for the {side} signals {', '.join(guarded) or 'none'}, and its DPS "
+                f"the guards of this loop are made for the {side} signals {', '.join(guarded) or 'none'}, but the DPS "
                 f"has {', '.join(names) or 'none'}"
             )

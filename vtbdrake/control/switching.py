@@ -1,4 +1,4 @@
-"""Switching between simulation and reality in two phases: prepare may refuse and changes nothing, perform is quick."""
+"""Switching between simulation and reality in two phases: prepare checks and changes nothing, perform is quick."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _log = logging.getLogger(__name__)
 
 
 class SwitchRefusedError(RuntimeError):
-    """A switch that was not thrown, with all that speaks against it."""
+    """A switch that was not thrown; the message lists all reasons against it."""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """What speaks against a switch, and how it is thrown if nothing does.
+    """The first phase of a switch: the reasons against it, and the function that throws it.
 
     Attributes:
-        reasons: empty if nothing speaks against it.
-        cycle: of the runtime, to which they belong.
-        perform: throws it.
+        reasons: the reasons against the switch; empty if there are none.
+        cycle: number of the runtime's cycles when they were collected.
+        perform: throws the switch.
     """
 
     reasons: tuple[str, ...]
@@ -47,11 +47,17 @@ def prepare(
     sense: str | Mapping[str, str] | None = None,
     act: str | Mapping[str, str] | None = None,
 ) -> Preparation:
-    """See `Runtime.prepare`.
+    """Collect the reasons against a switch; `Runtime.prepare` calls this.
 
-    A sensor signal that becomes real has to be fresh and plausible; if an actuator signal is to be on real, all sensor
-    signals on real have to be, and what its command departs from. One that becomes real has to continue what is
-    measured, and the machine has to be ready and within reach, and nobody else may command it.
+    A sensor signal that becomes real must be fresh and plausible. If an actuator signal is to be on real, so must all
+    sensor signals on real, and the one that its command departs from. The command of an actuator signal that becomes
+    real must continue what is measured. The machine must be ready and connected, and commanded by nobody else.
+
+    Args:
+        runtime: the loop.
+        mode: as in `VirtualTestbed.switch`.
+        sense: as in `VirtualTestbed.switch`.
+        act: as in `VirtualTestbed.switch`.
 
     Raises:
         ValueError: the mode, a signal or a position is unknown, or there are a mode and positions.
@@ -110,12 +116,10 @@ def _positions(
 
 
 def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, float]]) -> None:
-    """
-    Args:
-        continuity: as of `Runtime`.
+    """Check the ``continuity`` argument of `Runtime`.
 
     Raises:
-        ValueError: it names a signal that is not there, or two of different sizes, or a difference that is none.
+        ValueError: a signal does not exist, two signals have different sizes, or a largest difference is negative.
     """
     acted = {signal.name: signal for signal in interface.act}
     sensed = {signal.name: signal for signal in interface.sense}
@@ -126,35 +130,35 @@ def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, f
                 f"{name!r} to {sensor!r}; there are {', '.join(acted)} and {', '.join(sensed)}"
             )
         if not limit >= 0.0:
-            raise ValueError(f"the largest difference of {name} from {sensor} is a number from 0 on, not {limit}")
+            raise ValueError(f"the largest difference of {name} from {sensor} must not be negative, unlike {limit}")
 
 
 def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
-    """Return what speaks against commanding actuator signals: commands that would not continue what is measured."""
+    """Return the reasons why commands of actuator signals would not continue what is measured."""
     found = []
     for name in names:
         if name not in runtime.continuity:
             if runtime.guards.limiters[name].needs_start:
                 found.append(
-                    f"the command {name} has a limit of its rate or acceleration, and nothing measured that it could "
-                    f"depart from: give continuity={{{name!r}: (sensor signal, largest difference)}}"
+                    f"the actuator command {name} is limited in rate or acceleration and needs a measurement to depart "
+                    f"from: give continuity={{{name!r}: (sensor signal, largest difference)}}"
                 )
             continue
         sensor, limit = runtime.continuity[name]
         measured = runtime.bridge.sensed[sensor].value
         if measured is None:
-            found.append(f"nothing is measured of {sensor}, from which the command {name} departs")
+            found.append(f"the actuator command {name} departs from {sensor}, which has never been measured")
             continue
         try:
             command = runtime.actuator_command(name)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            found.append(f"the command {name} cannot be computed: {type(error).__name__}: {error}")
+            found.append(f"the actuator command {name} cannot be computed: {type(error).__name__}: {error}")
             continue
         if command is None:
-            continue  # A DPS that has not begun has no command.
+            continue  # A DPS that has not started has no command.
         gap = float(np.abs(command - measured).max())
         if not gap <= limit:
-            found.append(f"the command {name} is {gap:.3g} away from the measured {sensor}; {limit:g} is allowed")
+            found.append(f"the actuator command {name} is {gap:.3g} away from {sensor}; {limit:g} is allowed")
     return found
 
 
@@ -162,7 +166,7 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
     target, context = runtime.target, runtime.context
     for name, position in acts.items():
         if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
-            # Within its limits, the command departs from what is measured; one that goes out goes on.
+            # The commands depart from what is measured; a signal that is commanded already goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
     runtime.note_change(
         SWITCH,
@@ -178,8 +182,16 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
 
 
 def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
-    """Throws switches of a testbed that runs; where a signal goes back to sim, the simulated world goes on from where
-    the DPS believes the machine to be, if it can."""
+    """Throw switches of a running testbed.
+
+    If a signal goes back to sim, the simulated world continues from the DPS's belief of the machine, if it can.
+
+    Args:
+        target: the testbed.
+        context: its context.
+        senses: new positions by sensor signal.
+        acts: new positions by actuator signal.
+    """
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)
     back = any(
@@ -191,5 +203,5 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
         try:
             target.start_from_belief(context)
         except Exception:
-            # The way back from the machine is always open, even for a DPS that has lost its senses.
-            _log.exception("the simulated world goes on from where it was: it cannot be where the DPS believes")
+            # A switch back to sim must always work, even if the DPS's belief is invalid.
+            _log.exception("the belief cannot be set; the simulated world continues from where it was")
