@@ -115,10 +115,10 @@ class ClientProcess:
         assert self.process.stdout is not None
         assert self.process.stdout.readline().strip() == word
 
-    def freeze(self) -> None:
+    def stop(self) -> None:
         self.process.send_signal(signal.SIGSTOP)
 
-    def thaw(self) -> None:
+    def resume(self) -> None:
         self.process.send_signal(signal.SIGCONT)
 
     def __enter__(self) -> "ClientProcess":

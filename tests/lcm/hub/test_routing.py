@@ -224,7 +224,7 @@ def test_stopped_owner_is_replaced_on_request_only(short_lease) -> None:
     robot, successor = Client(short_lease.url, "COMMAND"), Client(short_lease.url)
     with ClientProcess(short_lease.url) as owner:
         owner.publish(("COMMAND", "owner"))
-        owner.freeze()
+        owner.stop()
         wait_until(lambda: state(short_lease).lease_over)
         successor.publish("COMMAND", b"without request")
         successor.sync()
@@ -240,7 +240,7 @@ def test_stopped_owner_is_replaced_on_request_only(short_lease) -> None:
         )
 
         owner.begin(("COMMAND", "stale"))
-        owner.thaw()
+        owner.resume()
         owner.end()
         wait_until(lambda: state(short_lease).refused == 2)
     robot.sync()

@@ -506,12 +506,12 @@ def test_incomplete_rejection_is_no_hub(answer: bytes) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"protect": "COMMAND"}, "must be a sequence of channels, such as ['COMMAND']"),
+        ({"protect": "COMMAND"}, "protect must be a sequence, such as ['COMMAND']"),
         ({"protect": ["VTB_HUB"]}, "cannot protect 'VTB_HUB', one of the hub's own channels"),
         ({"protect": ["VTB_HUB_TAKE/A"]}, "one of the hub's own channels"),
         ({"protect": [""]}, "must have 1 to 242 bytes"),
         ({"protect": ["Ä" * 122]}, "must have 1 to 242 bytes"),
-        ({"users": "nobody"}, "must be a sequence of users"),
+        ({"users": "nobody"}, "users must be a sequence"),
         ({"users": ["no such user"]}, "no user 'no such user'"),
         ({"lease": 0.0}, "lease must be a positive time in seconds, not 0.0"),
         ({"patience": float("nan")}, "patience must be a positive time"),

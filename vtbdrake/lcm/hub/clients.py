@@ -54,12 +54,12 @@ class ClientConnection:
 
     @property
     def idle(self) -> bool:
-        """Whether the client has never published and has no subscriptions."""
+        """Return whether the client has never published and has no subscriptions."""
         return not self.published and not self.subscriptions
 
     @property
     def memory(self) -> int:
-        """Number of bytes that the hub keeps for the client: its backlog and its incomplete message."""
+        """Return how many bytes the hub keeps for the client: its backlog and its incomplete message."""
         return self.queued + self.reader.held
 
     def acknowledge(self) -> None:

@@ -76,7 +76,7 @@ class Hub:
 
     @property
     def url(self) -> str:
-        """URL for clients, ``tcpq://host:port``.
+        """Return the URL for clients, ``tcpq://host:port``.
 
         Raises:
             HubError: The hub is not running.
@@ -86,7 +86,7 @@ class Hub:
 
     @property
     def pid(self) -> int:
-        """Process id of the hub.
+        """Return the process id of the hub.
 
         Raises:
             HubError: The hub is not running.
@@ -101,14 +101,12 @@ class Hub:
         """
         connection = self._running().connection
         connection.settimeout(_ANSWER_TIMEOUT)
-        answer = b""
         try:
             connection.sendall(b"?")
-            while not answer.endswith(b"\n"):
-                part = connection.recv(65536)
-                if not part:
-                    raise ConnectionResetError("its process has ended")
-                answer += part
+            with connection.makefile("rb") as lines:
+                answer = lines.readline()
+            if not answer:
+                raise ConnectionResetError("its process has ended")
         except OSError as error:
             raise HubError(f"the hub at {self._url} does not answer: {error}") from error
         return HubStatistics.from_json(answer)

@@ -62,12 +62,12 @@ cdef class TcpqReader(Stream):
 
     @property
     def partial(self):
-        """Whether a record, complete or not, is in the buffer."""
+        """Return whether the buffer contains a record, complete or not."""
         return self.large is not None or self.end > self.begin
 
     @property
     def held(self):
-        """Number of bytes in the buffer."""
+        """Return the number of bytes in the buffer."""
         return self.end - self.begin + (self.filled if self.large is not None else 0)
 
     def next_record(self):

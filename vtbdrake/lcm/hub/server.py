@@ -88,10 +88,10 @@ class HubConfig:
     cpus: Sequence[int] = ()  # processors to run on, if the system grants them; empty: any
 
     def __post_init__(self) -> None:
-        for name, example in (("protect", "channels"), ("users", "users"), ("cpus", "processors")):
+        for name in ("protect", "users", "cpus"):
             value = getattr(self, name)
             if isinstance(value, str):
-                raise ValueError(f"{name} must be a sequence of {example}, such as [{value!r}], not a string")
+                raise ValueError(f"{name} must be a sequence, such as [{value!r}], not a string")
             object.__setattr__(self, name, tuple(map(_user_id, value)) if name == "users" else tuple(value))
         longest = MAX_CHANNEL - len(TAKE_PREFIX)
         for channel in self.protect:
@@ -173,7 +173,6 @@ class HubServer:
             statistics as a line of JSON; when the other end closes, the hub stops.
 
     Attributes:
-        config: as above.
         url: URL for clients, ``tcpq://host:port``.
 
     Raises:
@@ -322,8 +321,8 @@ class HubServer:
         if sock.family == socket.AF_UNIX or self._on_loopback:
             user = tcpq.peer_user(sock)
             if not config.all_users and user not in {*self._own_users, *config.users}:
-                who = "unknown user" if user is None else f"user {user}"
-                raise TcpqError("user", f"{who} may not connect; start the hub with --user or --all-users")
+                name = "unknown user" if user is None else f"user {user}"
+                raise TcpqError("user", f"{name} may not connect; start the hub with --user or --all-users")
             if user not in self._own_users:
                 per_user, all_others = max(1, config.max_clients // 4), max(1, 3 * config.max_clients // 4)
                 others = [client.user for client in clients if client.user not in self._own_users]

@@ -12,11 +12,8 @@ from vtbdrake.lcm.hub.tcpq import TcpqError
 
 _log = logging.getLogger(__package__)
 
-MAX_SUBSCRIPTIONS = 1024
-"""Maximum number of subscriptions of a client at a time."""
-
-MAX_COST = 512
-"""Maximum sum of `Pattern.cost` over the patterns of a client; a client with more receives all messages."""
+MAX_SUBSCRIPTIONS = 1024  # of a client at a time
+MAX_COST = 512  # sum of `Pattern.cost` over the patterns of a client; beyond it, the client receives all messages
 
 # Patterns that are matched here: characters, classes, repetitions of these, alternatives, at most one unrepeated group.
 _ATOM = r"(?:\\[^A-Za-z0-9]|\\[dDsSwW]|[^\\()\[\]{}*+?|]|\[\^?[^\\\[\]]+\])"
