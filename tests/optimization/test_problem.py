@@ -238,3 +238,22 @@ def test_a_start_that_does_not_fit_is_refused_at_once():
     other = AcrobotScenario().build()
     with pytest.raises(SnapshotError, match="the snapshot is of another scenario"):
         _problem(start=other.snapshot(other.default_context()))
+
+
+def test_problem_sweep_boundary_and_rollout_show_themselves():
+    problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 0.1}])
+    assert repr(problem) == f"Problem(PendulumScenario: _angle over {OMEGA} in [0, 8], horizon 3 s)"
+    parts = problem._repr_html_()
+    for shown in (OMEGA, "[0, 8] rad/s", "_angle of " + THETA, "threshold", "2 (Worst())"):
+        assert shown in parts
+    sweep = problem.sweep(points=3, executor="serial", progress=False)
+    assert repr(sweep) == f"Sweep(6 rollouts over {OMEGA} in [0, 8])"
+    point, h = sweep.best()
+    assert f"{h:g} at {OMEGA} = {point[OMEGA]:g}" in sweep._repr_html_()
+    boundary = sweep.boundary()
+    assert repr(boundary) == f"Boundary({boundary})" and str(boundary) in boundary._repr_html_()
+    rollout = problem.rollout([8.0])
+    assert repr(rollout).startswith(f"ProblemRollout({{{DAMPING}=0.0, {OMEGA}=8.0}}: threshold after")
+    for shown in (sweep, boundary, rollout):
+        assert shown._repr_html_().count('<img src="data:image/png;base64,') == 1
+        assert len(repr(shown)) < 300

@@ -182,6 +182,20 @@ def test_a_solver_may_ask_for_more_points_where_racing_drops_some():
     assert 396 < len(raced) <= 400, "what was not taken is not left"
 
 
+@pytest.mark.parametrize(
+    ("solver", "rollouts", "run", "reason"), [("CMA-ES", 40, 37, "budget"), ("sobol", 42, 41, "solver")]
+)
+def test_a_rest_smaller_than_a_point_is_left_and_named(solver, rollouts, run, reason):
+    def f(values):
+        return values[DAMPING] + max(0.0, 1.0 - abs(values[THETA] - 0.5)), ()
+
+    study = problem(4, "worst", quality=QUALITIES["maximized"]).study(solver=solver)
+    study.run(rollouts=rollouts, executor=StatedExecutor(f), progress=False)
+    assert (len(study), study.reason) == (run, reason)
+    spent = f"the budget of {rollouts} rollouts is spent but for {rollouts - run}, fewer than the 4 that a point takes"
+    assert study.message.endswith(spent)
+
+
 def test_auto_comes_to_its_local_search_under_racing():
     def f(values):
         return 1.0 / (1.0 + (values[THETA] - 0.321) ** 2 + values[DAMPING]), ()

@@ -298,6 +298,16 @@ def test_a_study_can_be_read_while_it_runs(tmp_path):
         process.wait()
 
 
+def test_a_study_shows_itself_in_one_line_and_as_html(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db", solver="sobol")
+    assert repr(study) == f"Study({tmp_path / 'a.db'}: 0 rollouts, solver sobol)"
+    assert "no point has a quality" in study._repr_html_() and "<img" not in study._repr_html_()
+    study.run(rollouts=4, executor="serial", progress=False)
+    html = study._repr_html_()
+    assert "4 points, 4 rollouts" in html and f"{study.best.value:g}" in html
+    assert html.count('<img src="data:image/png;base64,') == 1
+
+
 # -- budgets
 
 
@@ -314,8 +324,10 @@ def test_a_budget_of_rollouts_is_kept_to_the_rollout():
 def test_a_small_budget_under_many_conditions_has_a_best_point():
     conditions = [{DAMPING: d} for d in (0.0, 0.1, 0.2, 0.3)]
     study = pendulum_problem(conditions=conditions).study().run(rollouts=40, executor="serial", progress=False)
-    # What is left is not enough for another point under all conditions.
-    assert 40 - len(conditions) < len(study) <= 40 and study.best.exact
+    left = 40 - len(study)
+    rest = f" but for {left}, fewer than the 4 that a point takes" if left else ""
+    assert study.best.exact and left < len(conditions)
+    assert (study.reason, study.message) == ("budget", f"the budget of 40 rollouts is spent{rest}")
 
 
 def test_a_target_ends_a_study():

@@ -1,9 +1,8 @@
 """Section 4: problem (18), stated in five steps and solved."""
 
 from vtbdrake.optimization.boundary import Boundary
-from vtbdrake.optimization.motion import Motion, ProblemRollout
 from vtbdrake.optimization.parameter import Choice, Parameter
-from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.problem import Motion, Problem, ProblemRollout
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
 from vtbdrake.optimization.study import Study
 from vtbdrake.optimization.study_file import Outcome, StudyError, Trial

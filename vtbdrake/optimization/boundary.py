@@ -1,25 +1,32 @@
-"""How far may a parameter go? The largest value below which no rollout is unsafe, and how sure that is."""
+"""Boundaries: the largest value of a parameter below which no rollout is unsafe, and how sure that is."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import exp, inf, isinf, log
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.study_file import RolloutKey
+from vtbdrake.optimization.sweep import Sweep, borrowed, make_sweep, numeric, roll_out
+from vtbdrake.rollout import Executor, RolloutResult
 from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.task import TERMINATED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vtbdrake.optimization.sweep import Sweep
+    from vtbdrake.optimization.problem import Problem
 
 # (index of a value of the fine grid, number of the condition)
 Candidate = tuple[int, int]
+
+# The default number of rollouts with jitter of each value close to a boundary, under each condition.
+_REPEATS = 5
 
 
 @dataclass(frozen=True)
@@ -29,8 +36,8 @@ class Chance:
     Attributes:
         value: the parameter's value.
         condition: number of the condition.
-        rollouts: how many there were at this value, the one without jitter included.
-        unsafe: how many of them were unsafe.
+        rollouts: the number of rollouts at this value, the one without jitter included.
+        unsafe: the number of unsafe ones.
     """
 
     value: float
@@ -56,7 +63,7 @@ class Chance:
         return f"unsafe in {self.unsafe} of {self.rollouts} rollouts (a chance of {low:.0%} to {high:.0%})"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Boundary:
     """The interval in which the parameter's boundary lies: safe up to its lower end, unsafe at its upper end.
 
@@ -64,24 +71,24 @@ class Boundary:
 
     Attributes:
         address: the address of the parameter.
-        unit: its unit.
+        unit: the unit of the parameter.
         lower: the largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
         upper: the smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
-            none). There is one rollout per value and condition; close to the boundary there are repeats.
+            none). There is one rollout per value and condition, and repeats close to the boundary.
         by_condition: the same interval for each condition alone, shape (conditions, 2).
         examined: the smallest and the largest value examined.
-        gap: width of the widest range below ``lower`` in which nothing was examined, over all conditions: an unsafe
-            range that is narrower may have been missed.
+        gap: width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have
+            been missed.
         step: the smallest distance of two values examined.
         chances: one for each value and condition that was repeated, by value and condition.
-        safe_beyond: values above a condition's first unsafe one that were safe all the same: where there are any, the
-            outcome is not monotonic, and a bisection could have ended there.
+        safe_beyond: values above a condition's first unsafe one that were safe nevertheless: the outcome is not
+            monotonic, and a bisection could have ended there.
         ended_at: values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
-            so up to there.
+            safe up to there.
         failed_at: values at which a simulation failed.
-        failure: the reason of the first of them.
-        sweep: the rollouts without jitter that it rests on.
-        repeated: the rollouts with jitter; None without them.
+        failure: the reason of the first failure.
+        sweep: the rollouts without jitter.
+        repeated: the rollouts with jitter; None if there are none.
     """
 
     address: str
@@ -97,12 +104,12 @@ class Boundary:
     ended_at: tuple[float, ...] = ()
     failed_at: tuple[float, ...] = ()
     failure: str = ""
-    sweep: Sweep | None = field(default=None, repr=False, compare=False)
-    repeated: Sweep | None = field(default=None, repr=False, compare=False)
+    sweep: Sweep | None = field(default=None, compare=False)
+    repeated: Sweep | None = field(default=None, compare=False)
 
     @property
     def worst_chances(self) -> tuple[Chance, ...]:
-        """For each value that was repeated, the chance under the condition where it is largest; by value."""
+        """The chance of each repeated value under its worst condition, in the order of the values."""
         worst: dict[float, Chance] = {}
         for chance in self.chances:
             if chance.value not in worst or chance.share > worst[chance.value].share:
@@ -110,20 +117,30 @@ class Boundary:
         return tuple(worst[value] for value in sorted(worst))
 
     def plot(self) -> Figure:
-        """h over the parameter, with the interval shaded, beside the rollouts over time; see `Sweep.plot`.
+        """Plot h over the parameter, with the interval shaded, beside the rollouts over time; see `Sweep.plot`.
 
         Raises:
-            ValueError: it rests on no sweep.
+            ValueError: the boundary has no sweep.
         """
         from vtbdrake.visualization import plot_sweep
 
         if self.sweep is None:
-            raise ValueError("the boundary comes without the sweep that it rests on, so that there is nothing to draw")
+            raise ValueError("the boundary has no sweep to draw: take one of Problem.boundary or Sweep.boundary")
         return plot_sweep(self.sweep, boundary=self)
+
+    def __repr__(self) -> str:
+        return f"Boundary({self})"
+
+    def _repr_html_(self) -> str:
+        """Show the interval, the chances in between and a plot in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        rows = {f"{chance.value:g} {self.unit}": str(chance) for chance in self.worst_chances}
+        return summary_html(str(self), rows, None if self.sweep is None else self.plot())
 
     def __str__(self) -> str:
         missed = ""
-        # Where all steps are alike, the interval itself says how fine they are.
+        # If all steps are alike, the interval itself shows how fine they are.
         if self.gap > (0.0 if isinf(self.upper) else self.step * (1.0 + 1e-9)):
             missed = f"; an unsafe range below that is narrower than {self.gap:.3g} {self.unit} may have been missed"
         again = [v for v in self.safe_beyond if v > self.upper]
@@ -134,7 +151,7 @@ class Boundary:
         return f"{self.address}: {interval}{self._undecided()}{missed}{beyond}{ended}{failed}"
 
     def interval_text(self, lower: float, upper: float) -> str:
-        """An interval of this boundary, in words."""
+        """Return an interval of this boundary in words."""
         least, most = self.examined
         if lower == most:
             return f"safe up to {lower:g} {self.unit}, the largest value examined"
@@ -158,36 +175,36 @@ def _listed(values: Sequence[float], unit: str) -> str:
 
 
 def why_no_boundary(sweep: Sweep) -> str:
-    """Why the rollouts of a sweep show no boundary; empty if they do."""
+    """Return why the rollouts of a sweep show no boundary; empty if they do."""
     if len(sweep.parameters) != 1:
         return f"a boundary is that of one parameter, but the sweep has {len(sweep.parameters)}"
     if not sweep.complete:
         return "the sweep was interrupted: its boundary could lie where nothing was examined"
     missing = set(range(len(sweep.conditions))) - set(sweep.condition.tolist())
     if missing:
-        return f"condition {min(missing)} has no rollouts, so that nothing is known of its boundary"
+        return f"condition {min(missing)} has no rollouts: its boundary is unknown"
     finite = bool(np.isfinite([rollout.threshold for rollout in sweep.rollouts]).any())
     return why_never_unsafe(finite_threshold=finite, minimize=sweep.minimize, constraints=len(sweep.constraints))
 
 
 def why_never_unsafe(*, finite_threshold: bool, minimize: Sequence[bool], constraints: int) -> str:
-    """Why no rollout of a problem could be unsafe; empty if one could."""
+    """Return why no rollout of a problem could be unsafe; empty if one could."""
     if finite_threshold and minimize[0]:
         return (
             "a rollout is unsafe where the quality exceeds its threshold, but that of a cost is a goal to be reached: "
             "state what must not happen as a quality with a threshold, or as a constraint"
         )
     if not finite_threshold and not constraints:
-        return "no rollout is unsafe: a boundary takes a finite threshold or a constraint, but the problem has neither"
+        return "no rollout is unsafe: a boundary needs a finite threshold or a constraint, but the problem has neither"
     return ""
 
 
 def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | None = None) -> Boundary:
-    """The boundary that the rollouts of a sweep over one parameter show.
+    """Return the boundary that the rollouts of a sweep over one parameter show.
 
     Args:
-        sweep: one rollout for each value and condition; `why_no_boundary` has nothing against it.
-        chances: of the values that were repeated.
+        sweep: one rollout for each value and condition; `why_no_boundary` of it is empty.
+        chances: of the repeated values.
         repeated: the rollouts with jitter that ``chances`` count.
     """
     values = sweep.points[:, 0]
@@ -201,7 +218,7 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
     }
     sweeps = [sweep] if repeated is None else [sweep, repeated]
     rows = [(float(v), r) for each in sweeps for v, r in zip(each.points[:, 0], each.rollouts, strict=True)]
-    # Between two conditions' examined values lies nothing that is known of both: the least of each end holds.
+    # The least of each end over the conditions holds for all of them.
     lower, upper = float(by_condition[:, 0].min()), float(by_condition[:, 1].min())
     return Boundary(
         address=sweep.parameters[0].address,
@@ -223,7 +240,7 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
 
 
 def _interval(outcomes: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """(largest value up to which none was unsafe, smallest at which all were) of ascending (value, unsafe share)."""
+    """Return the largest value up to which none was unsafe and the smallest at which all were, of (value, share)."""
     lower = -inf
     for value, share in outcomes:
         if share > 0.0:
@@ -241,20 +258,20 @@ def _widest_gap(values: Sequence[float]) -> float:
 
 
 class Refinement:
-    """Which values to examine: a coarse grid, then every fine value around each condition's first failure.
+    """The values to examine: a coarse grid, then every fine value around each condition's first failure.
 
-    Near the boundary the outcome is not monotonic in the parameter, so that bisection can be fooled. Here every value
-    of the fine grid is examined in the coarse cell that ends in the first failure or contains it, and in the cell
-    below; a failure found there moves both down with it, until there is none.
+    Near the boundary the outcome is not monotonic in the parameter, so that bisection can fail. Here every value of the
+    fine grid is examined in the coarse cell that ends in the first failure or contains it, and in the cell below; a
+    failure found there moves both cells down, until there is none.
 
     Args:
-        parameter: whose range is searched.
+        parameter: its range is searched.
         resolution: step of the fine grid, in the parameter's unit; with a logarithmic range, the ratio of two
             neighbouring values, above 1.
-        coarse: the same of the coarse grid; it is rounded to whole steps of the fine one.
+        coarse: step of the coarse grid, likewise; it is rounded to whole steps of the fine one.
 
     Raises:
-        ValueError: the steps do not fit the range, or would give an integer values that are not whole.
+        ValueError: the steps do not fit the range, or are not whole for an integer.
     """
 
     def __init__(self, parameter: Parameter, *, resolution: float, coarse: float) -> None:
@@ -283,28 +300,24 @@ class Refinement:
             if parameter.integer:
                 as_whole(f"the resolution of {parameter.address}, an integer,", resolution)
         self.parameter = parameter
-        self._count = int(np.ceil(width / fine - 1e-9))
+        # The index of the fine grid's last value, the end of the range.
+        self.last = int(np.ceil(width / fine - 1e-9))
         self._fine = fine
         self._coarse = max(1, round(ratio))
 
-    @property
-    def last(self) -> int:
-        """The index of the fine grid's last value, the end of the range."""
-        return self._count
-
     def value(self, index: int) -> float:
-        """The fine grid's value ``index``; its last is the end of the range."""
-        if index >= self._count:
+        """Return a value of the fine grid."""
+        if index >= self.last:
             return self.parameter.upper
         lower = self.parameter.lower
         return lower * exp(index * self._fine) if self.parameter.log else lower + index * self._fine
 
     def start(self) -> list[int]:
-        """The coarse grid, with both ends."""
-        return [*range(0, self._count, self._coarse), self._count]
+        """Return the indices of the coarse grid, with both ends."""
+        return [*range(0, self.last, self._coarse), self.last]
 
     def next(self, examined: Mapping[int, bool]) -> list[int]:
-        """What to examine further under one condition, of which ``examined`` says index -> unsafe."""
+        """Return the indices to examine next under one condition, whose outcomes so far are index -> unsafe."""
         failures = [index for index, failed in examined.items() if failed]
         if not failures:
             return []
@@ -316,9 +329,12 @@ class Refinement:
 def find_boundary(
     refinement: Refinement, conditions: int, examine: Callable[[Sequence[Candidate]], Sequence[bool]]
 ) -> list[dict[int, bool]]:
-    """Examines candidates, in as few rounds as possible, until the refinement asks for no more.
+    """Examine candidates, in as few rounds as possible, until the refinement asks for no more.
 
-    ``examine`` says of each whether it was unsafe.
+    Args:
+        refinement: which values to examine.
+        conditions: the number of conditions.
+        examine: returns for each candidate whether it was unsafe.
 
     Returns:
         index -> unsafe, for each condition.
@@ -333,12 +349,12 @@ def find_boundary(
 
 
 def repeat_around(first: int, last: int, count: Callable[[Sequence[int]], Mapping[int, Sequence[float]]]) -> None:
-    """Repeats the values around the boundary: downwards to one that is always safe, upwards to one that never is.
+    """Repeat the values around the boundary: downwards to one that is always safe, upwards to one that never is.
 
     Args:
         first: index of the first value that was unsafe under some condition; above ``last`` if none was.
         last: index of the last value.
-        count: repeats some values under all conditions; index -> the share of unsafe rollouts under each condition.
+        count: repeats values under all conditions; returns index -> the share of unsafe rollouts by condition.
     """
     down, up = min(first - 1, last), first
     wanted = [index for index in (down, up) if 0 <= index <= last]
@@ -348,3 +364,123 @@ def repeat_around(first: int, last: int, count: Callable[[Sequence[int]], Mappin
         above = up + 1 if up in shares and max(shares[up]) < 1.0 else last + 1
         down, up = below, above
         wanted = [index for index in (down, up) if 0 <= index <= last]
+
+
+def search_boundary(
+    problem: Problem,
+    *,
+    resolution: float,
+    coarse: float,
+    repeats: int | None,
+    jitter: float,
+    executor: str | Executor,
+    workers: int | None,
+    progress: bool,
+) -> Boundary:
+    """Search the boundary of a problem; see `Problem.boundary`."""
+    if len(problem.parameters) != 1:
+        raise ValueError(f"a boundary is that of one parameter, but the problem has {len(problem.parameters)}")
+    (parameter,) = numeric(problem)
+    reason = why_never_unsafe(
+        finite_threshold=problem.task.threshold is not None,
+        minimize=[quality.minimize for quality in problem.objectives],
+        constraints=len(problem.constraints),
+    )
+    if reason:
+        raise ValueError(reason)
+    refinement = Refinement(parameter, resolution=resolution, coarse=coarse)
+    repeats, jitter = _checked_jitter(parameter, repeats, jitter)
+    first = len(refinement.start()) * len(problem.conditions)
+    with borrowed(problem, executor, rollouts=first, workers=workers) as chosen:
+        search = _Search(problem, refinement, chosen, progress=progress)
+        outcomes = find_boundary(refinement, len(problem.conditions), search.examine)
+        if repeats:
+            unsafe = [index for found in outcomes for index, bad in found.items() if bad]
+            count = partial(search.repeat, repeats=repeats, jitter=jitter)
+            repeat_around(min(unsafe, default=refinement.last + 1), refinement.last, count)
+    return search.boundary()
+
+
+def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> tuple[int, float]:
+    if repeats is None:
+        repeats = 0 if parameter.integer or parameter.is_field else _REPEATS
+    repeats, jitter = as_whole("the number of repeats", repeats), as_number("the jitter", jitter)
+    if repeats < 0 or not 0.0 < jitter <= 0.5:
+        raise ValueError(f"it takes repeats >= 0 and 0 < jitter <= 0.5, not {repeats} and {jitter:g}")
+    if repeats and parameter.integer:
+        raise ValueError(f"{parameter.address} is an integer, which cannot be jittered: leave repeats out")
+    return repeats, jitter
+
+
+class _Search:
+    """The rollouts of a search for a boundary: one at each value, and repeats with jitter close to the boundary."""
+
+    def __init__(self, problem: Problem, refinement: Refinement, executor: Executor, *, progress: bool) -> None:
+        self._problem = problem
+        self._refinement = refinement
+        self._executor = executor
+        self._progress = progress
+        self._results: list[tuple[RolloutKey, RolloutResult]] = []
+        self._repeated: list[tuple[RolloutKey, RolloutResult]] = []
+        # Candidate -> (rollouts, unsafe ones).
+        self._counts: dict[Candidate, tuple[int, int]] = {}
+        self._chances: set[Candidate] = set()
+
+    def examine(self, wanted: Sequence[Candidate]) -> list[bool]:
+        """Run one rollout for each candidate; return whether it was unsafe."""
+        keys: list[RolloutKey] = [((self._refinement.value(index),), condition) for index, condition in wanted]
+        unsafe: list[bool] = self._roll(keys, self._results).tolist()
+        self._counts.update({candidate: (1, int(bad)) for candidate, bad in zip(wanted, unsafe, strict=True)})
+        return unsafe
+
+    def repeat(self, indices: Sequence[int], *, repeats: int, jitter: float) -> dict[int, list[float]]:
+        """Repeat values under all conditions; return index -> the share of unsafe rollouts under each condition."""
+        conditions = range(len(self._problem.conditions))
+        wanted = [(index, condition) for index in indices for condition in conditions]
+        new = [candidate for candidate in wanted if candidate not in self._counts]
+        if new:
+            self.examine(new)
+        keys: list[RolloutKey] = []
+        for candidate in wanted:
+            _, condition = candidate
+            keys += [((value,), condition) for value in self._jittered(candidate, repeats, jitter)]
+        unsafe = self._roll(keys, self._repeated).reshape(-1, repeats).sum(axis=1)
+        for candidate, more in zip(wanted, unsafe.tolist(), strict=True):
+            rollouts, bad = self._counts[candidate]
+            self._counts[candidate] = rollouts + repeats, bad + more
+        self._chances.update(wanted)
+        return {index: [self._share(index, condition) for condition in conditions] for index in indices}
+
+    def _share(self, index: int, condition: int) -> float:
+        rollouts, unsafe = self._counts[index, condition]
+        return unsafe / rollouts
+
+    def _jittered(self, candidate: Candidate, repeats: int, jitter: float) -> list[float]:
+        """Return values beside that of a candidate; the same ones in every search."""
+        parameter, (index, _) = self._refinement.parameter, candidate
+        u = parameter.to_unit(self._refinement.value(index))
+        moved = np.abs(u + np.random.default_rng(candidate).uniform(-jitter, jitter, repeats))
+        # Values beyond an end of the range are reflected at it.
+        return [float(parameter.from_unit(1.0 - abs(1.0 - v))) for v in moved.tolist()]
+
+    def _roll(self, keys: Sequence[RolloutKey], results: list[tuple[RolloutKey, RolloutResult]]) -> np.ndarray:
+        """Run rollouts and keep their results; return whether each was unsafe."""
+        task = self._problem.task
+        found = roll_out(self._problem, self._executor, task, keys, name="boundary", progress=self._progress)
+        finished = [result for result in found if result is not None]
+        if len(finished) < len(found):
+            raise KeyboardInterrupt
+        results += zip(keys, finished, strict=True)
+        return make_sweep(self._problem, keys, finished).unsafe
+
+    def boundary(self) -> Boundary:
+        """Return the boundary that the rollouts so far show."""
+        value = self._refinement.value
+        chances = [Chance(value(i), c, *self._counts[i, c]) for i, c in self._chances]
+        return boundary_of(
+            self._sorted(self._results), chances, self._sorted(self._repeated) if self._chances else None
+        )
+
+    def _sorted(self, results: list[tuple[RolloutKey, RolloutResult]]) -> Sweep:
+        ordered = sorted(results, key=lambda pair: pair[0])
+        return make_sweep(self._problem, [key for key, _ in ordered], [result for _, result in ordered])

@@ -1,4 +1,4 @@
-"""A study in Optuna's storage, for its dashboard, its plots and its importances; and points from there."""
+"""Studies in Optuna's storage, for its dashboard, its plots and its importances; and points from there."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.optimization.identity import differences
-from vtbdrake.optimization.optuna_trials import insert_trials
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
@@ -26,14 +25,15 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization.study import Study
 
-# What makes a study the one that it is, beside its problem: of the same ones it may be exported again.
+# What identifies a study beside its problem: the same one may be exported again.
 _IDENTITY = ("solver", "seed", "options")
 
+# Importances need at least so many points.
 _FEWEST = 10
 
 
 def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.Study:
-    """Writes a study into Optuna's storage. See `Study.to_optuna`.
+    """Write a study into Optuna's storage. See `Study.to_optuna`.
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
@@ -58,12 +58,12 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
                 frozen = _frozen(optuna, trial, params, distributions, rollouts, objectives=len(study.names))
                 _date(frozen, [(outcomes[row].wall_time, finished[row]) for row in rows if row in finished])
                 new.append(frozen)
-        insert_trials(exported, opened, new)
+        exported.add_trials(new)
     return exported
 
 
 def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> list[Point]:
-    """The points of a study in Optuna's storage that ``study`` has not judged, nor in its queue.
+    """Return the points of a study in Optuna's storage that ``study`` has neither evaluated nor in its queue.
 
     See `Study.import_optuna`.
 
@@ -82,16 +82,16 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
             raise StudyError(f"Optuna's storage has no study {name!r}; it has {names}") from error
         trials = found.get_trials(deepcopy=False)
     # By their text: 1 and True are equal as numbers.
-    judged = [trial.parameters for trial in study.trials]
-    known = {encode(tuple(parameters.values())) for parameters in (*judged, *study.queue.values())}
+    known = {encode(trial.point) for trial in study.trials}
+    known |= {encode(tuple(parameters.values())) for parameters in study.queue.values()}
     points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
     return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
 
 
 def importances(study: Study) -> tuple[dict[str, float], ...]:
-    """How much each parameter decides about whether a point is among the best tenth: for each quality, by address.
+    """Return how much each parameter decides about whether a point is among the best tenth: by quality and address.
 
-    The shares sum to 1, the largest comes first. They come from the points that have a value, by Optuna's PED-ANOVA:
+    The shares sum to 1, the largest comes first. They are computed from the points that have a value by PED-ANOVA:
     Watanabe, S., Bansal, A. and Hutter, F. (2023): PED-ANOVA. Efficiently quantifying hyperparameter importance in
     arbitrary subspaces. IJCAI.
 
@@ -105,14 +105,14 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
         raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
     found = []
     with quiet(), warnings.catch_warnings():
-        # It says so of every target, also of one whose sign is right.
+        # The warning comes with every target, also with one of the right sign.
         warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes the importances")
         exported = to_optuna(study, optuna.storages.InMemoryStorage(), name="importances")
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         for k, (name, direction) in enumerate(zip(study.names, study.directions, strict=True)):
             if len({value[k] for value in values}) == 1:
-                raise ValueError(f"{name} is {values[0][k]:g} at all points, so that no parameter is of importance")
-            # Of a target of ours it takes the small values for the good ones.
+                raise ValueError(f"{name} is {values[0][k]:g} at all points, so no parameter is important")
+            # Of a target it takes the small values as the good ones.
             sign = 1.0 if direction == "minimize" else -1.0
             found.append(
                 optuna.importance.get_param_importances(
@@ -144,7 +144,7 @@ def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseS
 
 
 def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> optuna.Study:
-    """The study in the storage, made if it is not there."""
+    """Return the study in the storage; create it if it is missing."""
     record = json.loads(json.dumps(study.record))
     if name in optuna.get_all_study_names(storage):
         found = optuna.load_study(study_name=name, storage=storage)
@@ -174,8 +174,7 @@ def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def _rows(trial: Trial, study: Study) -> Iterable[RolloutKey]:
-    point = tuple(trial.parameters.values())
-    return ((point, condition) for condition in range(len(study.record["problem"]["conditions"])))
+    return ((trial.point, condition) for condition in range(len(study.record["problem"]["conditions"])))
 
 
 def _frozen(
@@ -194,7 +193,7 @@ def _frozen(
         "batch": trial.batch,
         "origin": trial.origin,
         "method": trial.method,
-        # By condition, in the order in which the problem has them; those that racing did not come to are not there.
+        # By condition, in the order of the problem; without those that racing has left out.
         "values": [_plain((outcome.value, *outcome.measures[: objectives - 1])) for outcome in rollouts],
         "t_star": _plain(outcome.t_star for outcome in rollouts),
         "end": [outcome.end for outcome in rollouts],
@@ -213,15 +212,15 @@ def _frozen(
         params=dict(params),
         distributions=dict(distributions),
         user_attrs=attributes,
-        # As a list, which the dashboard reads; Optuna reads it as it does the newer form, one attribute each.
+        # The dashboard reads a list only; Optuna reads it as well as its newer form, one attribute each.
         system_attrs={} if failed or not trial.violations else {"constraints": list(trial.violations)},
     )
     return frozen
 
 
 def _date(frozen: FrozenTrial, rollouts: Sequence[tuple[float, datetime]]) -> None:
-    """Says when the rollouts, each (seconds that it took, when it was finished), were begun and finished."""
-    # Optuna's times are local, and say nothing of the zone.
+    """Set start and end of a trial by its rollouts, each (duration in seconds, time of its end)."""
+    # Optuna's times are local, without a zone.
     local = [(seconds, at.astimezone().replace(tzinfo=None)) for seconds, at in rollouts if math.isfinite(seconds)]
     if local:
         frozen.datetime_start = min(at - timedelta(seconds=seconds) for seconds, at in local)
@@ -229,7 +228,7 @@ def _date(frozen: FrozenTrial, rollouts: Sequence[tuple[float, datetime]]) -> No
 
 
 def _plain(numbers: Iterable[float]) -> list[float | None]:
-    """JSON of the web knows no NaN and no infinity."""
+    """Return numbers for strict JSON, which has neither NaN nor infinity."""
     return [number if math.isfinite(number) else None for number in numbers]
 
 
@@ -241,7 +240,7 @@ def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
 
 
 def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
-    """The point of a trial; None of one whose parameters are not all drawn yet."""
+    """Return the point of a trial; None if its parameters are not all drawn yet."""
     params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
     addresses = [parameter.address for parameter in study.parameters]
     foreign = [key for key in params if key not in addresses]

@@ -1,4 +1,4 @@
-"""The selection sigma_s, equation (8): which elements of s0 are varied, and where."""
+"""Parameters: the selection sigma_s, equation (8), of the elements of s0 that are varied, and their ranges."""
 
 from __future__ import annotations
 
@@ -16,12 +16,31 @@ from vtbdrake.rollout.runner import FIELD
 from vtbdrake.state import Variable, Variables
 
 
+class _Addressed:
+    address: str
+
+    @property
+    def is_field(self) -> bool:
+        """Whether it is a field of the scenario."""
+        return self.address.startswith(FIELD)
+
+    def _variable(self, variables: Variables) -> Variable:
+        variable = variables[self.address]
+        if variable.derived:
+            raise ValueError(f"{self.address} is derived from other variables and cannot be varied")
+        if variable.shape:
+            raise ValueError(
+                f"{self.address} has shape {variable.shape}; a parameter is one number: {self.address}[0], say"
+            )
+        return variable
+
+
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(_Addressed):
     """One varied number of s0: a scalar variable of the testbed, an entry of an array (``address[3]``), or a field.
 
     Attributes:
-        address: of the variable; or ``scenario.<field>``, for what needs another Diagram (gravity, geometry).
+        address: of the variable; or ``scenario.<field>`` for a field, which needs another Diagram (gravity, geometry).
         lower, upper: the range, in the variable's unit.
         integer: only whole numbers, both ends included.
         log: searched on a logarithmic scale.
@@ -57,13 +76,8 @@ class Parameter:
         object.__setattr__(self, "upper", kind(self.upper))
 
     @property
-    def is_field(self) -> bool:
-        """Whether it is a field of the scenario."""
-        return self.address.startswith(FIELD)
-
-    @property
     def is_continuous(self) -> bool:
-        """Whether values between two values have a meaning, as gradients need it."""
+        """Whether all numbers of the range are values, as gradients need it."""
         return not self.integer
 
     @property
@@ -73,11 +87,11 @@ class Parameter:
 
     @property
     def range_text(self) -> str:
-        """The range, to be read."""
+        """The range as text."""
         return f"[{self.lower:g}, {self.upper:g}]"
 
     def check(self, value: Any) -> float | int:
-        """``value`` as a number of the range.
+        """Check a value, and return it as a number of the range.
 
         Raises:
             ValueError: it is no number, lies outside the range, or is not whole for an integer.
@@ -93,7 +107,7 @@ class Parameter:
         return int(number) if self.integer else number
 
     def from_unit(self, u: float) -> float | int:
-        """The value at ``u`` in [0, 1] of the range; of an integer, each value has an equal share."""
+        """Return the value at ``u`` in [0, 1] of the range; each value of an integer has an equal share."""
         u = min(max(float(u), 0.0), 1.0)
         if self.integer and not self.log:
             count = int(self.upper) - int(self.lower) + 1
@@ -106,7 +120,7 @@ class Parameter:
         return round(value) if self.integer else value
 
     def to_unit(self, value: Any) -> float:
-        """The place of ``value`` in the range, in [0, 1]; the inverse of `from_unit`."""
+        """Return the place of a value in the range, in [0, 1]; the inverse of `from_unit`."""
         if self.log:
             return math.log(value / self.lower) / math.log(self.upper / self.lower)
         if self.integer:
@@ -114,12 +128,12 @@ class Parameter:
         return (float(value) - self.lower) / (self.upper - self.lower)
 
     def find(self, variables: Variables) -> Variable:
-        """The variable that it varies.
+        """Return the variable that is varied.
 
         Raises:
             ValueError: there is none, it is derived or an array, or the range exceeds its bounds.
         """
-        variable = _scalar(self.address, variables)
+        variable = self._variable(variables)
         lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
         if self.lower < lower or self.upper > upper:
             raise ValueError(
@@ -130,7 +144,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Choice(_Addressed):
     """One varied element of s0 that takes one of several values without an order: numbers, words, True or False.
 
     Attributes:
@@ -155,25 +169,20 @@ class Choice:
         if len(set(self.options)) < max(2, len(self.options)):
             raise ValueError(f"{address} needs at least two different options, not {list(self.options)}")
 
-    @property
-    def is_field(self) -> bool:
-        """Whether it is a field of the scenario."""
-        return self.address.startswith(FIELD)
-
     is_continuous = False
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All options."""
+        """The options."""
         return self.options
 
     @property
     def range_text(self) -> str:
-        """The options, to be read."""
+        """The options as text."""
         return "{" + ", ".join(repr(option) for option in self.options) + "}"
 
     def check(self, value: Any) -> Any:
-        """The option that equals ``value``.
+        """Return the option that equals a value.
 
         Raises:
             ValueError: there is none.
@@ -184,21 +193,21 @@ class Choice:
         raise ValueError(f"{self.address} is one of {self.range_text}, not {value!r}")
 
     def from_unit(self, u: float) -> Any:
-        """The option at ``u`` in [0, 1]; each has an equal share."""
+        """Return the option at ``u`` in [0, 1]; each has an equal share."""
         count = len(self.options)
         return self.options[min(int(min(max(float(u), 0.0), 1.0) * count), count - 1)]
 
     def to_unit(self, value: Any) -> float:
-        """A place of ``value`` in [0, 1]; `from_unit` leads back."""
+        """Return the place of a value in [0, 1], the middle of its share."""
         return (self.options.index(self.check(value)) + 0.5) / len(self.options)
 
     def find(self, variables: Variables) -> Variable:
-        """The variable that it varies.
+        """Return the variable that is varied.
 
         Raises:
             ValueError: there is none, it is derived or an array, or it refuses an option.
         """
-        variable = _scalar(self.address, variables)
+        variable = self._variable(variables)
         for option in self.options:
             variable.check(option)
         return variable
@@ -208,10 +217,10 @@ Dimension = Parameter | Choice
 
 
 def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[str, Any]) -> tuple[Any, ...]:
-    """A point s^0, given as values in the order of the parameters or by address.
+    """Check a point s^0, given as values in the order of the parameters or by address, and return its values.
 
     Raises:
-        ValueError: it has another number of entries, sets what is not varied, or one lies outside its range.
+        ValueError: the point has another number of entries, sets what is not varied, or one lies outside its range.
     """
     addresses = [parameter.address for parameter in parameters]
     if isinstance(point, Mapping):
@@ -228,13 +237,4 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
 
 def _check_address(address: Any) -> None:
     if not isinstance(address, str):
-        raise ValueError(f"what is varied is named by its address, a text, not by {address!r}")
-
-
-def _scalar(address: str, variables: Variables) -> Variable:
-    variable = variables[address]
-    if variable.derived:
-        raise ValueError(f"{address} is derived from other variables and cannot be varied")
-    if variable.shape:
-        raise ValueError(f"{address} has shape {variable.shape}; a parameter is one number: {address}[0], say")
-    return variable
+        raise ValueError(f"a parameter is named by its address, a text, not by {address!r}")

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.optimization.boundary import Boundary
-from vtbdrake.optimization.motion import Motion, ProblemRollout
+from vtbdrake.optimization.boundary import Boundary, search_boundary
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.sweep import Sweep, as_points, grid
-from vtbdrake.rollout import Constraint, Executor, Quality, RolloutRunner, RolloutTask
+from vtbdrake.optimization.sweep import Sweep, as_points, borrowed, grid, make_sweep, numeric, roll_out
+from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.rollout.arguments import all_of, as_number, as_whole
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
@@ -25,11 +25,58 @@ from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pydrake.geometry import Meshcat
+
     from vtbdrake.optimization.casadi_function import ProblemFunction
     from vtbdrake.optimization.study import Study
     from vtbdrake.rollout.check import Check
+    from vtbdrake.visualization import Scene
 
 Condition = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of the simulated world: the plant's states [q; v] at ``times``, shape (n, nq + nv)."""
+
+    scenario: Scenario
+    times: np.ndarray
+    states: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ProblemRollout(RolloutResult):
+    """A rollout that knows its problem, so that it can be shown.
+
+    Attributes:
+        problem: the problem of which it is a rollout.
+        condition: address -> value of its condition.
+    """
+
+    problem: Problem
+    condition: Mapping[str, Any] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Show the result with the quality trajectory in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        rows = {**{address: np.asarray(value).tolist() for address, value in self.parameters.items()}, "end": self.end}
+        rows |= {"message": self.message} if self.message else {}
+        drawn = self.quality.size > 0 and not self.failed
+        return summary_html(repr(self), rows, self.plot() if drawn else None)
+
+    def show(self, meshcat: Meshcat, *, prefix: str = "rollout") -> Scene:
+        """Record the motion in ``meshcat`` under ``prefix``; the returned scene shows itself in a notebook."""
+        from vtbdrake.visualization import show_motion
+
+        return show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
+
+    def plot(self) -> Figure:
+        """Plot the quality trajectory with t* marked (Figure 5)."""
+        from vtbdrake.visualization import plot_quality
+
+        return plot_quality([self])
 
 
 class Problem:
@@ -39,23 +86,23 @@ class Problem:
         scenario: builds the testbed; its defaults are s0.
         parameters: s^0, equation (8): the elements of s0, and the fields of the scenario (``scenario.gravity``), to be
             varied. All else is held constant (9).
-        quality: f and its quality variables, equations (11) and (12); or a cost. Several ask for their Pareto front.
+        quality: f and its quality variables, equations (11) and (12); or a cost. Several have a Pareto front.
         horizon: t_m in seconds.
-        threshold: f_m; a rollout whose f exceeds it, strictly, ends there. Of a cost: below which it ends. None: never.
+        threshold: f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None: never.
         sample_period: of f, in seconds; part of the problem, see `RolloutTask`.
         conditions: further elements of s0 (address -> value) that a decision must cope with, such as start phases,
-            frictions or the seeds of sensors; every point is tried under each, so that all points meet the same noise
+            frictions or the seeds of sensors; every point runs under each, so that all points have the same noise
             (common random numbers).
         risk: how the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
-        constraints: what every rollout has to keep, under every condition.
-        start: s0 from a snapshot instead of the defaults. Of a running simulation with error control take it by
-            ``testbed.fork(simulator)``: after a plain ``testbed.snapshot(context)``, the forecast differs a little from
-            what follows, as the integrator's memory of its last step is no part of s.
+        constraints: what every rollout must keep, under every condition.
+        start: s0 from a snapshot instead of the defaults. Take that of a running simulation with error control by
+            ``testbed.fork(simulator)``: a plain ``testbed.snapshot(context)`` lacks the integrator's memory of its last
+            step, so that the forecast differs a little from what follows.
 
     Raises:
-        ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets what is varied,
-            the horizon, threshold or sample period makes no sense, the start is of another scenario or of a DPS alone,
-            or an argument is of another kind than it says.
+        ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets a parameter, the
+            horizon, threshold or sample period is invalid, the start is of another scenario or of a DPS alone, or an
+            argument is of another type.
     """
 
     def __init__(
@@ -103,6 +150,25 @@ class Problem:
         self._testbeds = Testbeds(self.testbed)
         self._check()
 
+    def __repr__(self) -> str:
+        varied = ", ".join(f"{p.address} in {p.range_text}" for p in self.parameters)
+        qualities = ", ".join(quality.name for quality in self.objectives)
+        return f"Problem({type(self.scenario).__name__}: {qualities} over {varied}, horizon {self.task.horizon:g} s)"
+
+    def _repr_html_(self) -> str:
+        """Show the parts of the problem in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        parts = zip(self.parameters, self.units, strict=True)
+        rows: dict[str, object] = {p.address: f"{p.range_text} {unit}".strip() for p, unit in parts}
+        for quality in self.objectives:
+            rows["minimize" if quality.minimize else "maximize"] = f"{quality.name} of {', '.join(quality.of)}"
+        rows |= {"horizon": f"{self.task.horizon:g} s", "sample period": f"{self.task.sample_period:g} s"}
+        rows |= {"threshold": self.task.threshold} if self.task.threshold is not None else {}
+        rows |= {"constraints": ", ".join(c.name for c in self.constraints)} if self.constraints else {}
+        rows |= {"conditions": f"{len(self.conditions)} ({self.risk!r})"} if len(self.conditions) > 1 else {}
+        return summary_html(f"Problem of {type(self.scenario).__name__}", rows)
+
     def _check(self) -> None:
         if not self.conditions:
             raise ValueError("a problem has at least one condition; {} is the scenario as it is")
@@ -137,23 +203,23 @@ class Problem:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the parameters; those of scenario fields are not known."""
+        """The units of the parameters; empty for fields of the scenario."""
         variables = self.testbed.variables()
         return tuple("" if p.is_field else variables[p.address].unit for p in self.parameters)
 
     def point(self, point: ArrayLike | Mapping[str, Any]) -> Point:
-        """A point s^0, given as values in the order of the parameters or by address, checked.
+        """Check a point s^0, given as values in the order of the parameters or by address, and return its values.
 
         Raises:
-            ValueError: it has another number of entries, or one lies outside its range.
+            ValueError: the point has another number of entries, or one lies outside its range.
         """
         return checked_point(self.parameters, point)
 
     def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
-        """What `point` sets in s0, as address -> value; and what the condition sets, if one is named.
+        """Return what a point sets in s0, address -> value, and what a condition sets if its number is given.
 
         Raises:
-            ValueError: as `point`, or there is no such condition.
+            ValueError: as in `point`, or there is no such condition.
         """
         chosen = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
         return chosen if condition is None else {**self._condition(condition), **chosen}
@@ -172,10 +238,11 @@ class Problem:
         record: Sequence[str] = (),
         run_on: bool = False,
     ) -> ProblemRollout:
-        """One rollout at ``point``, with s(t*).
+        """Run one rollout, with s(t*).
 
         Args:
-            condition: which of the problem's conditions.
+            point: s^0, as values in the order of the parameters or by address.
+            condition: the number of the condition.
             record: addresses and ports (``path.port``) to record at the sample times.
             run_on: simulate to t_m although the threshold was exceeded.
         """
@@ -185,12 +252,12 @@ class Problem:
         return ProblemRollout(**vars(result), problem=self, condition=self.conditions[condition])
 
     def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
-        """s(t) = Gamma'(s^0, t), equation (10), at a sample time, in seconds."""
+        """Return s(t) = Gamma'(s^0, t), equation (10), at a sample time t in seconds."""
         parameters = self.values(point, condition=condition)
         return self._runner(self.task, parameters).state(split(parameters)[1], as_number("the time t", t))
 
     def motion(self, parameters: Mapping[str, Any]) -> Motion:
-        """The motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0."""
+        """Return the motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0."""
         runner = self._runner(replace(self.task, record=("plant.state",)), parameters)
         result = runner.run(split(parameters)[1])
         return Motion(runner.task.scenario, result.times, result.record["plant.state"])
@@ -199,15 +266,15 @@ class Problem:
         return RolloutRunner(*self.placed(task, parameters))
 
     def placed(self, task: RolloutTask, values: Mapping[str, Any]) -> tuple[RolloutTask, VirtualTestbed]:
-        """The task and the testbed for ``values`` (address -> value), which may set fields of the scenario."""
+        """Return task and testbed for ``values`` (address -> value), which may set fields of the scenario."""
         scenario = self._scenario(values)
         return replace(task, scenario=scenario), self._testbeds.get(scenario)
 
     def check(self) -> Check:
-        """Look for what executors cannot cope with: memory outside the Context, values that do not travel to workers.
+        """Find what does not work in executors: memory outside the Context, values that do not travel to workers.
 
-        It takes about a second: the first part of a rollout is simulated four times, which must agree: twice in a row,
-        beside another rollout on the same Diagram, and in another process. Print what it returns.
+        It takes about a second: the first part of a rollout is simulated four times, with equal results: twice in a
+        row, beside another rollout on the same Diagram, and in another process. Print what it returns.
 
         Raises:
             QualityError: f raises, is negative or NaN.
@@ -237,34 +304,35 @@ class Problem:
         run_on: bool = False,
         progress: bool = True,
     ) -> Sweep:
-        """A rollout at every point, under every condition. Ctrl-C keeps what is finished.
+        """Run a rollout at every point, under every condition. Ctrl-C keeps what is finished.
 
         Args:
-            points: of an equally spaced grid over one or two parameters, for all of them or one by one.
+            points: the numbers of points of an equally spaced grid over one or two parameters: one for all or each.
             values: the points themselves instead, shape (n,) for one parameter or (n, p).
             executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask``, an Executor, any
                 ``concurrent.futures`` executor, or a client of Dask; see `make_executor`.
-            workers: threads or processes; the number of cores if left out.
+            workers: the number of threads or processes; by default the number of cores.
             record: addresses and ports to record at the sample times.
-            run_on: simulate to t_m although the threshold was exceeded, so that all of G1 is known.
+            run_on: simulate to t_m although the threshold was exceeded; gives all of G1.
             progress: show a progress bar.
 
         Raises:
             ValueError: a point lies outside the range of a parameter, or the executor is unknown.
             QualityError: f raises, is negative or NaN.
         """
-        from vtbdrake.optimization import examine
-
         if (points is None) == (values is None):
             raise ValueError("a sweep takes either the number of points of a grid, or values")
-        numeric = examine.numeric(self)
+        parameters = numeric(self)
         if values is None:
             assert points is not None
-            table = grid(numeric, points)
+            table = grid(parameters, points)
         else:
-            table = as_points(numeric, values)
+            table = as_points(parameters, values)
+        checked = [self.point(point.tolist()) for point in table]
+        keys = [(point, condition) for point in checked for condition in range(len(self.conditions))]
         task = replace(self.task, record=record, run_on=run_on)
-        return examine.sweep(self, task, table, executor=executor, workers=workers, progress=progress)
+        with borrowed(self, executor, rollouts=len(keys), workers=workers) as chosen:
+            return make_sweep(self, keys, roll_out(self, chosen, task, keys, name="sweep", progress=progress))
 
     def boundary(
         self,
@@ -277,34 +345,35 @@ class Problem:
         workers: int | None = None,
         progress: bool = True,
     ) -> Boundary:
-        """How far may the parameter go: the largest value below which every rollout examined is safe.
+        """Search the largest value of the parameter below which every rollout examined is safe.
 
         A rollout is safe if it does not exceed the threshold, keeps all constraints and does not fail. A coarse grid
-        over the range is refined below the first unsafe value under each condition; bisection alone could be fooled, as
-        the outcome need not be monotonic. An unsafe range narrower than the coarse step can be missed; the answer says
-        so (`Boundary.gap`).
+        over the range is refined below the first unsafe value under each condition; bisection alone could fail, as the
+        outcome need not be monotonic. An unsafe range narrower than the coarse step can be missed; the answer says so
+        (`Boundary.gap`).
 
         Close to the boundary, a contact-rich simulation is chaotic: the last digits of s0 decide. So values around the
         boundary are repeated, each time with the parameter moved a little: downwards until a value is safe each time,
-        upwards until one is unsafe each time. What lies between is undecided, and comes with the chance of an unsafe
-        rollout (`Boundary.chances`).
+        upwards until one is unsafe each time. The values between are undecided, with the chance of an unsafe rollout
+        (`Boundary.chances`).
 
         Args:
             resolution: step of the fine grid, in the parameter's unit; of a parameter with a logarithmic range, the
                 ratio of neighbouring values, above 1.
             coarse: step of the coarse grid, likewise.
-            repeats: rollouts with jitter for each value close to the boundary and each condition; 0 for none. By
-                default 5, and none for integers, and for fields of the scenario, where each takes another Diagram.
+            repeats: the number of rollouts with jitter for each value close to the boundary and each condition. By
+                default 5, and 0 for integers and for fields of the scenario, where each takes another Diagram.
             jitter: how far the parameter is moved at most in these, as a fraction of its range (on its own scale).
+            executor: see `sweep`.
+            workers: see `sweep`.
+            progress: show a progress bar.
 
         Raises:
             ValueError: there is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
                 (which is a goal, not a danger), or the steps do not fit the range.
-            KeyboardInterrupt: it was interrupted, so that nothing can be said.
+            KeyboardInterrupt: it was interrupted, before there is an answer.
         """
-        from vtbdrake.optimization import examine
-
-        return examine.boundary(
+        return search_boundary(
             self,
             resolution=resolution,
             coarse=coarse,
@@ -316,7 +385,7 @@ class Problem:
         )
 
     def casadi_function(self, **options: Any) -> ProblemFunction:
-        """h(s^0) as a ``casadi.Function`` with derivatives, for ``Opti`` and ``nlpsol``; see `ProblemFunction`."""
+        """Return h(s^0) as a ``casadi.Function`` with derivatives, for ``Opti`` and ``nlpsol``: a `ProblemFunction`."""
         from vtbdrake.optimization.casadi_function import ProblemFunction
 
         return ProblemFunction(self, **options)
@@ -330,7 +399,7 @@ class Problem:
         options: Mapping[str, Any] | None = None,
         allow_changed_code: bool = False,
     ) -> Study:
-        """A study of the problem: begins a new one, or resumes the one in the file.
+        """Begin a study of the problem, or resume the one in a file.
 
         Args:
             path: of the file; None keeps the study in memory.
@@ -338,9 +407,9 @@ class Problem:
                 or that of the file.
             seed: of the solver; 0 by default, or that of the file.
             options: of the solver.
-            allow_changed_code: go on although the functions of the problem, or the Python code of its testbed, are not
-                those that the study began with. The file notes what has changed (`Study.record`, ``changes``). Its
-                rollouts stay as they are, but those in which a quality function failed run again.
+            allow_changed_code: go on although the functions of the problem, or the Python code of its testbed, have
+                changed. The file notes the changes (`Study.record`, ``changes``). Its rollouts stay, but those in which
+                a quality function failed run again.
 
         Raises:
             StudyError: the file is no study, is damaged, of another version, problem, solver or seed, or of other code.

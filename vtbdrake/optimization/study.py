@@ -138,6 +138,19 @@ class Study:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        where = "in memory" if self.path is None else str(self.path)
+        return f"Study({where}: {len(self)} rollouts, solver {self._meta['solver']})"
+
+    def _repr_html_(self) -> str:
+        """Show the summary with the values so far in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        first, *lines = self.summary().split("\n")
+        rows = {name: text for name, _, text in (line.partition(": ") for line in lines)}
+        drawn = any(trial.counts for trial in self.trials)
+        return summary_html(first, rows, self.plot_history() if drawn else None)
+
     # -- running it
 
     def run(
@@ -489,7 +502,7 @@ class Study:
 
         Every point becomes a trial: complete; failed, if a simulation failed; or pruned, if racing dropped it. The
         values, t*, ends and times of its rollouts are its user attributes; `record` is in those of the study. Writing
-        it again adds the new points.
+        it again adds the new points. Optuna takes about 20 ms per point in an SQL database.
 
         Args:
             storage: a URL, such as ``sqlite:///study.db``, or a storage of Optuna's.

@@ -204,11 +204,13 @@ class StudyRun:
 
     def _end_of_solver(self) -> tuple[str, str]:
         left, point = self._limit - len(self._known), len(self._problem.conditions)
+        rest = f" but for {left:g}, fewer than the {point} that a point takes" if 0 < left < point else ""
+        spent = f"the budget of {self._limit:g} rollouts is spent{rest}"
         if self._solver.success is False and left < point:
-            rest = f"; {left:g} of them are left, fewer than the {point} that a point takes" if left > 0 else ""
-            return BUDGET, f"the budget of {self._limit:g} rollouts is spent{rest}"
+            return BUDGET, spent
         how = {True: "is finished", False: "has ended without success", None: "has ended"}[self._solver.success]
-        return SOLVER, f"{self._solver.name} {how}" + (f": {self._solver.message}" if self._solver.message else "")
+        parts = [f"{self._solver.name} {how}", self._solver.message, spent if rest else ""]
+        return SOLVER, ": ".join(part for part in parts if part)
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
         now = keys[: max(0, int(min(self._limit - len(self._known), len(keys))))]

@@ -1,9 +1,10 @@
-"""Rollouts over a set of points: h over the parameters, to be read, plotted, saved and asked for the boundary."""
+"""Sweeps: a rollout at every point, under every condition; to be read, plotted, saved and asked for the boundary."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from math import inf, nan, prod
 from typing import TYPE_CHECKING, Any
@@ -11,17 +12,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.optimization.boundary import Boundary, boundary_of, why_no_boundary
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
-from vtbdrake.rollout import RolloutResult
+from vtbdrake.optimization.study_file import RolloutKey
+from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.arguments import all_of, as_whole
+from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.state.archive import read_archive, write_archive
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from vtbdrake.optimization.boundary import Boundary
+    from vtbdrake.optimization.problem import Problem
 
 KIND = "vtbdrake sweep"
 VERSION = 3
@@ -30,7 +35,7 @@ VERSION = 3
 _RISKS: dict[str, type[Risk]] = {kind.__name__: kind for kind in (Mean, Worst, Quantile, CVaR)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sweep:
     """The rollouts of a problem at several points, one row per point and condition.
 
@@ -42,11 +47,11 @@ class Sweep:
         condition: number of the condition in each row, shape (n,).
         rollouts: n results, in the order in which the points were given.
         scenario: the scenario's name and fields.
-        complete: False if it was interrupted; what is here is finished.
-        minimize: of each of the problem's qualities, whether it is a cost.
+        complete: False if it was interrupted; it then holds the finished rollouts.
+        minimize: whether a quality is a cost, for each quality of the problem.
         constraints: the name of each of the problem's constraints.
-        risk: how a quality under several conditions becomes one; None after loading a sweep whose risk was of a class
-            that a file cannot hold.
+        risk: how a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's
+            class, which a file cannot hold.
     """
 
     parameters: tuple[Parameter, ...]
@@ -64,6 +69,28 @@ class Sweep:
     def __len__(self) -> int:
         return len(self.rollouts)
 
+    def __repr__(self) -> str:
+        ranges = ", ".join(f"{p.address} in {p.range_text}" for p in self.parameters)
+        interrupted = "" if self.complete else ", interrupted"
+        return f"Sweep({len(self)} rollouts over {ranges}{interrupted})"
+
+    def _repr_html_(self) -> str:
+        """Show a summary with a plot in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        try:
+            point, h = self.best()
+            best = f"{h:g} at {', '.join(f'{address} = {value:g}' for address, value in point.items())}"
+        except ValueError as error:
+            best = str(error)
+        rows: dict[str, object] = {p.address: p.range_text for p in self.parameters}
+        rows |= {"conditions": len(self.conditions), "best": best}
+        rows |= {
+            name: count for name in ("exceeded", "violated", "failed") if (count := int(getattr(self, name).sum()))
+        }
+        drawn = len(self) > 0 and len(self.parameters) <= 2
+        return summary_html(repr(self), rows, self.plot() if drawn else None)
+
     @property
     def h(self) -> np.ndarray:
         """h(s^0), equation (17), shape (n,); NaN where the rollout failed."""
@@ -76,7 +103,7 @@ class Sweep:
 
     @property
     def exceeded(self) -> np.ndarray:
-        """Whether G1, equation (14), has an element, shape (n,)."""
+        """Whether the threshold was exceeded (G1, equation (14), has an element), shape (n,)."""
         return np.array([rollout.exceedances.size > 0 for rollout in self.rollouts], dtype=bool)
 
     @property
@@ -97,7 +124,7 @@ class Sweep:
 
     @property
     def evaluations(self) -> tuple[Evaluation, ...]:
-        """How good each point is that has finished all its conditions, as a study judges it.
+        """The evaluation of each point that has finished all its conditions, as in a study.
 
         Raises:
             ValueError: the sweep was loaded from a file that could not hold its risk.
@@ -127,17 +154,16 @@ class Sweep:
         return Evaluation(point, values, violations)
 
     def best(self) -> tuple[dict[str, float], float]:
-        """(s^0*, h(s^0*)), equation (18), over the points examined: the best that keeps all constraints.
+        """Return (s^0*, h(s^0*)), equation (18), over the points examined: the best that keeps all constraints.
 
-        Several conditions count as the problem's risk says, as in `Study.best`. Of a cost, its value
-        stands in the place of h.
+        The problem's risk aggregates several conditions, as in `Study.best`. Of a cost, its value takes the place of h.
 
         Raises:
             ValueError: there are several qualities; no point has finished all its conditions and keeps the constraints;
                 or the sweep was loaded from a file that could not hold its risk.
         """
         if len(self.minimize) > 1:
-            raise ValueError("of several qualities there is no best point: use problem.study() and its pareto()")
+            raise ValueError("several qualities have no single best point: use problem.study() and its pareto()")
         found = [evaluation for evaluation in self.evaluations if evaluation.feasible]
         if not found:
             kept = " and keeps the constraints" if self.constraints else ""
@@ -148,7 +174,7 @@ class Sweep:
         return {p.address: v for p, v in zip(self.parameters, best.point, strict=True)}, value + 0.0
 
     def boundary(self) -> Boundary:
-        """The largest parameter value below which every rollout examined here was safe.
+        """Return the boundary: the largest parameter value below which every rollout examined here was safe.
 
         A rollout is safe if it did not exceed the threshold, kept all constraints and did not fail.
 
@@ -156,6 +182,8 @@ class Sweep:
             ValueError: the sweep has several parameters or no rollouts, was interrupted, or has nothing by which a
                 rollout could be unsafe.
         """
+        from vtbdrake.optimization.boundary import boundary_of, why_no_boundary
+
         reason = why_no_boundary(self)
         if reason:
             raise ValueError(reason)
@@ -166,11 +194,10 @@ class Sweep:
         return f"; the first failure: {messages[0]}" if messages else ""
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Columns by name, one entry per row.
+        """Return columns by name, one entry per row.
 
-        They are the parameters, the condition, h, t*, end, message and wall time; and, where the problem has them, its
-        further qualities (``quality 1``, ...) and the violations of its constraints (``violation 0``, ...), which are
-        NaN where the rollout failed.
+        The columns are the parameters, the condition, h, t*, end, message and wall time; further qualities
+        (``quality 1``, ...) and violations of constraints (``violation 0``, ...), NaN where the rollout failed.
         """
         columns: dict[str, list[Any]] = {
             parameter.address: self.points[:, i].tolist() for i, parameter in enumerate(self.parameters)
@@ -185,7 +212,7 @@ class Sweep:
         return columns
 
     def to_dataframe(self) -> DataFrame:
-        """`to_dict` as a pandas DataFrame."""
+        """Return `to_dict` as a pandas DataFrame."""
         try:
             import pandas
         except ModuleNotFoundError as error:
@@ -193,7 +220,7 @@ class Sweep:
         return pandas.DataFrame(self.to_dict())
 
     def plot(self) -> Figure:
-        """h over the parameters (Figure 6), and for one parameter the quality trajectories with t* marked (Figure 5).
+        """Plot h over the parameters (Figure 6); for one parameter also the quality trajectories with t* (Figure 5).
 
         Raises:
             ValueError: there are more than two parameters.
@@ -203,7 +230,7 @@ class Sweep:
         return plot_sweep(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one file; recordings of abstract ports cannot be saved.
+        """Write the sweep to a file; recordings of abstract ports cannot be saved.
 
         Raises:
             ValueError: a recording is not numeric.
@@ -235,7 +262,7 @@ class Sweep:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Sweep:
-        """Reads what `save` wrote.
+        """Read a sweep that `save` wrote.
 
         Raises:
             ArchiveError: the file is not a sweep, is damaged, or was written by another version.
@@ -287,7 +314,7 @@ def _risk_from_file(data: Mapping[str, Any] | None) -> Risk | None:
 
 
 def _plain(value: Any) -> Any:
-    # JSON has no inf and no nan.
+    # JSON has neither inf nor nan.
     return repr(value) if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -296,10 +323,9 @@ def _number(value: Any) -> Any:
 
 
 def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.ndarray:
-    """Every combination of equally spaced values of one or two parameters, ends included; shape (n, p).
+    """Return all combinations of equally spaced values of one or two parameters, ends included; shape (n, p).
 
-    The values of a parameter with a logarithmic range are equally spaced on that scale; those of an integer are rounded
-    to whole numbers.
+    Logarithmic ranges are spaced on that scale; values of integers are rounded to whole numbers.
 
     Raises:
         ValueError: there are more than two parameters, too few points for one of them, more than an integer has values,
@@ -332,7 +358,7 @@ def _axis(parameter: Parameter, count: int) -> np.ndarray:
 
 
 def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
-    """Points that are given, shape (n, p) or, of a single parameter, (n,); shape (n, p).
+    """Return given points, shape (n, p) or (n,) of a single parameter, as shape (n, p).
 
     Raises:
         ValueError: they have another shape, or are no numbers.
@@ -347,3 +373,54 @@ def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
     if table.ndim != 2 or table.shape[1] != count:
         raise ValueError(f"the values of {count} parameters have shape (n, {count}), not {table.shape}")
     return table
+
+
+def numeric(problem: Problem) -> tuple[Parameter, ...]:
+    """Return the parameters of a problem, all of which must be numbers.
+
+    Raises:
+        ValueError: one is a choice.
+    """
+    for parameter in problem.parameters:
+        if not isinstance(parameter, Parameter):
+            raise ValueError(
+                f"a sweep goes over numbers, but {parameter.address} is a choice: use problem.study(solver='grid')"
+            )
+    return tuple(parameter for parameter in problem.parameters if isinstance(parameter, Parameter))
+
+
+@contextmanager
+def borrowed(problem: Problem, executor: str | Executor, *, rollouts: int, workers: int | None) -> Iterator[Executor]:
+    """Provide an executor, and close it afterwards unless it is the user's."""
+    chosen = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, workers=workers)
+    try:
+        yield chosen
+    finally:
+        if chosen is not executor:
+            chosen.close()
+
+
+def roll_out(
+    problem: Problem, executor: Executor, task: RolloutTask, keys: Sequence[RolloutKey], *, name: str, progress: bool
+) -> list[RolloutResult | None]:
+    """Run the rollouts of some points and conditions; those that were interrupted are None."""
+    points = [problem.values(point, condition=condition) for point, condition in keys]
+    return run_rollouts(executor, task, points, progress=progress, description=name)
+
+
+def make_sweep(problem: Problem, keys: Sequence[RolloutKey], results: Sequence[RolloutResult | None]) -> Sweep:
+    """Return the sweep of the results that are finished."""
+    finished = [(*key, result) for key, result in zip(keys, results, strict=True) if result is not None]
+    return Sweep(
+        parameters=numeric(problem),
+        units=problem.units,
+        conditions=problem.conditions,
+        points=np.array([point for point, _, _ in finished], dtype=float).reshape(-1, len(problem.parameters)),
+        condition=np.array([condition for _, condition, _ in finished], dtype=int),
+        rollouts=tuple(result for _, _, result in finished),
+        scenario=problem.scenario.record(),
+        complete=len(finished) == len(keys),
+        minimize=tuple(quality.minimize for quality in problem.objectives),
+        constraints=tuple(constraint.name for constraint in problem.constraints),
+        risk=problem.risk,
+    )

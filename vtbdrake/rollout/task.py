@@ -67,10 +67,10 @@ class RolloutResult:
     def __repr__(self) -> str:
         values = ", ".join(f"{address}={np.asarray(v).tolist()}" for address, v in self.parameters.items())
         if self.failed:
-            return f"RolloutResult({{{values}}}: failed: {self.message})"
+            return f"{type(self).__name__}({{{values}}}: failed: {self.message})"
         end = float(self.times[-1]) if len(self.times) else nan
         best = "" if isnan(self.value) else f", value {self.value:g} at t* = {self.t_star:g} s"
-        return f"RolloutResult({{{values}}}: {self.end} after {end:g} s{best})"
+        return f"{type(self).__name__}({{{values}}}: {self.end} after {end:g} s{best})"
 
     @property
     def failed(self) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +41,17 @@ class Picture(Figure):
         buffer = BytesIO()
         self.savefig(buffer, format="png", dpi=100)
         return buffer.getvalue()
+
+
+def summary_html(title: str, rows: Mapping[str, object], figure: Figure | None = None) -> str:
+    """Return HTML for a notebook: a title, a table of names and values, and a figure beside it."""
+    cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows.items())
+    image = ""
+    if figure is not None:
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png", dpi=80)
+        image = f'<img src="data:image/png;base64,{b64encode(buffer.getvalue()).decode()}">'
+    return f"<div><b>{escape(title)}</b><table>{cells}</table>{image}</div>"
 
 
 def label(name: str, unit: str) -> str:
