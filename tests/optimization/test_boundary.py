@@ -249,7 +249,7 @@ def test_a_constraint_makes_a_rollout_unsafe_as_the_threshold_does():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"threshold": None}, "takes a finite threshold or a constraint, but the problem has neither"),
+        ({"threshold": None}, "needs a finite threshold or a constraint, but the problem has neither"),
         ({"quality": Quality(abs, THETA, minimize=True)}, "that of a cost is a goal to be reached"),
     ],
 )

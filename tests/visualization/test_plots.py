@@ -111,7 +111,7 @@ def test_a_boundary_is_drawn_with_its_own_interval() -> None:
     (span,) = [patch for patch in left.patches if patch.get_gid() == "boundary"]
     assert (span.get_x(), span.get_x() + span.get_width()) == (0.0, 60.0)
     assert left.get_title() == "Safe up to 0 kg, not at 60 kg"
-    with pytest.raises(ValueError, match="without the sweep that it rests on"):
+    with pytest.raises(ValueError, match="the boundary has no sweep to draw"):
         replace(boundary, sweep=None).plot()
 
 
