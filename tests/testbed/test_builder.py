@@ -37,7 +37,7 @@ def _world(builder, sensor=None, actuator=None):
     [
         (lambda: Interface([SENSE, SENSE], [ACT]), "these occur twice: y"),
         (lambda: Interface([SENSE], [ACT], [Signal("y", size=1)]), "these occur twice: y"),
-        (lambda: Interface([SENSE], [Signal("u", size=2)]), "u has no idle command"),
+        (lambda: Interface([SENSE], [Signal("u", size=2)]), "u has no idle value"),
         (lambda: Interface([SENSE], [ACT], [Signal("mode", model_value="walk")]), "command mode is abstract"),
         (lambda: Signal("y"), "either a vector .give size=. or abstract"),
         (lambda: Signal("y", size=2, model_value=1), "either a vector"),

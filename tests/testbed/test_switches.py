@@ -322,6 +322,6 @@ def test_what_does_not_fit_is_not_switched_to():
     testbed = AcrobotScenario().build()
     context = testbed.default_context()
     testbed.diagram.GetInputPort("real.sense.joint_state").FixValue(context, [0.0, 0.0, np.nan, 0.0])
-    with pytest.raises(ValueError, match="signal joint_state: entry 2 is NaN; what is not known is not fed"):
+    with pytest.raises(ValueError, match="signal joint_state: entry 2 is NaN: do not feed unknown values"):
         testbed.switch(context, "real")
     assert set(testbed.positions(context)["act"].values()) == {"sim"}
