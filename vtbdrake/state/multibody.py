@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from math import inf
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import GeometryId, ProximityProperties, RoleAssign, SceneGraph, SceneGraphInspector
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
@@ -32,6 +35,7 @@ Prefix = Callable[[str], str]
 _JOINT_UNITS = {"revolute": ("rad", "rad/s", "N m s/rad"), "prismatic": ("m", "m/s", "N s/m")}
 _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
 _POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+_FRICTION = ("material", "coulomb_friction")
 
 
 def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Variable]:
@@ -100,99 +104,87 @@ def _joint_variables(plant: MultibodyPlant, joint: Joint, address: str) -> Itera
     q = slice(joint.position_start(), joint.position_start() + nq)
     v = slice(joint.velocity_start(), joint.velocity_start() + nv)
     units = _JOINT_UNITS.get(joint.type_name(), _MIXED_UNITS)
+    shapes = [() if n == 1 else (n,) for n in (nq, nv)]
 
-    def read_position(root: Context) -> np.ndarray:
-        return plant.GetPositions(plant.GetMyContextFromRoot(root))[q]
-
-    def write_position(root: Context, value: np.ndarray) -> None:
-        context = plant.GetMyMutableContextFromRoot(root)
+    def set_positions(context: Context, value: np.ndarray) -> None:
         positions = plant.GetPositions(context)
         positions[q] = value.ravel()
         plant.SetPositions(context, positions)
 
-    def read_velocity(root: Context) -> np.ndarray:
-        return plant.GetVelocities(plant.GetMyContextFromRoot(root))[v]
-
-    def write_velocity(root: Context, value: np.ndarray) -> None:
-        context = plant.GetMyMutableContextFromRoot(root)
+    def set_velocities(context: Context, value: np.ndarray) -> None:
         velocities = plant.GetVelocities(context)
         velocities[v] = value.ravel()
         plant.SetVelocities(context, velocities)
 
-    def read_damping(root: Context) -> np.ndarray:
-        return np.asarray(joint.GetDampingVector(plant.GetMyContextFromRoot(root)))
+    def set_damping(context: Context, value: np.ndarray) -> None:
+        joint.SetDampingVector(context, np.atleast_1d(value))
 
-    def write_damping(root: Context, value: np.ndarray) -> None:
-        joint.SetDampingVector(plant.GetMyMutableContextFromRoot(root), np.atleast_1d(value))
-
-    position_bounds = (-inf, inf)
+    bounds = (-inf, inf)
     if nq == 1:
-        position_bounds = (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
-    yield Variable(f"{address}.position", X, _shape(nq), units[0], _scalar(read_position, nq), write_position,
-                   bounds=position_bounds)  # fmt: skip
-    yield Variable(f"{address}.velocity", X, _shape(nv), units[1], _scalar(read_velocity, nv), write_velocity)
-    yield Variable(f"{address}.damping", A, _shape(nv), units[2], _scalar(read_damping, nv), write_damping,
+        bounds = (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
+    variable = partial(_variable, plant)
+    yield variable(f"{address}.position", X, shapes[0], units[0], lambda context: plant.GetPositions(context)[q],
+                   set_positions, bounds=bounds)  # fmt: skip
+    yield variable(f"{address}.velocity", X, shapes[1], units[1], lambda context: plant.GetVelocities(context)[v],
+                   set_velocities)  # fmt: skip
+    yield variable(f"{address}.damping", A, shapes[1], units[2], joint.GetDampingVector, set_damping,
                    bounds=(0.0, inf))  # fmt: skip
     if plant.time_step() > 0.0:  # Every supported Drake version locks the joints of discrete plants.
-        yield _joint_lock(plant, joint, address)
+        yield _joint_lock(plant, joint, f"{address}.locked")
 
 
-def _shape(n: int) -> tuple[int, ...]:
-    return () if n == 1 else (n,)
+def _variable(
+    plant: MultibodyPlant,
+    address: str,
+    kind: str,
+    shape: tuple[int, ...],
+    unit: str,
+    read: Callable[[Context], ArrayLike],
+    write: Callable[[Context, np.ndarray], None],
+    **options: Any,
+) -> Variable:
+    """Return a variable that is read and written in the plant's own context."""
 
+    def read_root(root: Context) -> ArrayLike:
+        value = read(plant.GetMyContextFromRoot(root))
+        return value if shape else np.ravel(value)[0]
 
-def _scalar(read: Callable[[Context], np.ndarray], n: int) -> Callable[[Context], np.ndarray]:
-    return (lambda root: read(root)[0]) if n == 1 else read
+    def write_root(root: Context, value: np.ndarray) -> None:
+        write(plant.GetMyMutableContextFromRoot(root), value)
+
+    return Variable(address, kind, shape, unit, read_root, write_root, **options)
 
 
 def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
-    name = f"{address}.locked"
-
-    def read(root: Context) -> float:
-        return float(joint.is_locked(plant.GetMyContextFromRoot(root)))
-
-    def write(root: Context, value: np.ndarray) -> None:
+    def write(context: Context, value: np.ndarray) -> None:
         if float(value) not in (0.0, 1.0):
-            raise VariableError(f"{name} is 0 (free) or 1 (locked), but the value given is {float(value):g}")
-        context = plant.GetMyMutableContextFromRoot(root)
+            raise VariableError(f"{address} is 0 (free) or 1 (locked), but the value given is {float(value):g}")
         if value:
             joint.Lock(context)  # This sets the joint's velocity to zero, as Drake requires.
         else:
             joint.Unlock(context)
 
     # Written last: locking stops the joint, and a locked joint takes no velocity.
-    return Variable(name, A, (), "1", read, write, bounds=(0.0, 1.0), carried_by=name, order=1)
+    return _variable(plant, address, A, (), "1", joint.is_locked, write, bounds=(0.0, 1.0), carried_by=address, order=1)
 
 
 def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Iterator[Variable]:
-    def inertia_in_body(root: Context) -> SpatialInertia:
-        return body.CalcSpatialInertiaInBodyFrame(plant.GetMyContextFromRoot(root))
+    inertia = body.CalcSpatialInertiaInBodyFrame
 
-    def set_inertia(root: Context, M_BBo_B: SpatialInertia) -> None:
-        body.SetSpatialInertiaInBodyFrame(plant.GetMyMutableContextFromRoot(root), M_BBo_B)
-
-    def read_mass(root: Context) -> float:
-        return float(body.get_mass(plant.GetMyContextFromRoot(root)))
-
-    def write_mass(root: Context, value: np.ndarray) -> None:
-        body.SetMass(plant.GetMyMutableContextFromRoot(root), float(value))
-
-    def read_com(root: Context) -> np.ndarray:
-        return inertia_in_body(root).get_com()
-
-    def write_com(root: Context, value: np.ndarray) -> None:
-        # SpatialInertia keeps the inertia about the body's origin: without a shift, it would become unphysical.
-        M_BBo_B = inertia_in_body(root)
-        G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(M_BBo_B.get_com())
-        set_inertia(root, SpatialInertia(M_BBo_B.get_mass(), value, G_BBcm_B.ShiftFromCenterOfMass(value)))
-
-    def read_inertia(root: Context) -> np.ndarray:
-        M_BBo_B = inertia_in_body(root)
+    def read_inertia(context: Context) -> np.ndarray:
+        M_BBo_B = inertia(context)
         I_BBcm_B = M_BBo_B.Shift(M_BBo_B.get_com()).CalcRotationalInertia()
         return np.concatenate([I_BBcm_B.get_moments(), I_BBcm_B.get_products()])
 
-    def write_inertia(root: Context, value: np.ndarray) -> None:
-        M_BBo_B = inertia_in_body(root)
+    def write_com(context: Context, value: np.ndarray) -> None:
+        # SpatialInertia keeps the inertia about the body's origin: without a shift, it would become unphysical.
+        M_BBo_B = inertia(context)
+        G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(M_BBo_B.get_com())
+        M_new = SpatialInertia(M_BBo_B.get_mass(), value, G_BBcm_B.ShiftFromCenterOfMass(value))
+        body.SetSpatialInertiaInBodyFrame(context, M_new)
+
+    def write_inertia(context: Context, value: np.ndarray) -> None:
+        M_BBo_B = inertia(context)
         mass, com = M_BBo_B.get_mass(), M_BBo_B.get_com()
         if mass <= 0.0:
             raise VariableError(f"{address}.inertia cannot be set while {address}.mass is zero: set the mass first")
@@ -205,62 +197,62 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
                 f"{address}.inertia {value.tolist()} is not that of any rigid body: its principal moments must be "
                 f"positive and none larger than the sum of the others ({reason})"
             ) from None
-        set_inertia(root, M_new)
+        body.SetSpatialInertiaInBodyFrame(context, M_new)
 
-    yield Variable(f"{address}.mass", A, (), "kg", read_mass, write_mass, bounds=(0.0, inf), order=-3)
-    yield Variable(f"{address}.center_of_mass", A, (3,), "m", read_com, write_com, order=-2)
-    yield Variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1)
+    variable = partial(_variable, plant)
+    yield variable(f"{address}.mass", A, (), "kg", body.get_mass, lambda context, m: body.SetMass(context, float(m)),
+                   bounds=(0.0, inf), order=-3)  # fmt: skip
+    yield variable(f"{address}.center_of_mass", A, (3,), "m", lambda context: inertia(context).get_com(), write_com,
+                   order=-2)  # fmt: skip
+    yield variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1)
 
 
 def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:
-    def read(root: Context) -> np.ndarray:
-        return pose_to_array(plant.GetFreeBodyPose(plant.GetMyContextFromRoot(root), body))
-
-    def write(root: Context, value: np.ndarray) -> None:
-        plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(root), body, pose_from_array(value))
-
-    return Variable(f"{address}.pose", X, (6,), POSE_UNIT, read, write)
+    return _variable(
+        plant,
+        f"{address}.pose",
+        X,
+        (6,),
+        POSE_UNIT,
+        lambda context: pose_to_array(plant.GetFreeBodyPose(context, body)),
+        lambda context, value: plant.SetFreeBodyPose(context, body, pose_from_array(value)),
+    )
 
 
 def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str) -> Variable:
-    def translation(axis: int) -> Callable[[Context], float]:
-        return lambda root: body.EvalPoseInWorld(plant.GetMyContextFromRoot(root)).translation()[axis]
+    axis, unit = list(_POSE_ENTRIES).index(entry) % 3, _POSE_ENTRIES[entry]
 
-    def angle(axis: int) -> Callable[[Context], float]:
-        def read(root: Context) -> float:
-            X_WB = body.EvalPoseInWorld(plant.GetMyContextFromRoot(root))
-            return RollPitchYaw(X_WB.rotation()).vector()[axis]
+    def read(root: Context) -> float:
+        X_WB = body.EvalPoseInWorld(plant.GetMyContextFromRoot(root))
+        vector = X_WB.translation() if unit == "m" else RollPitchYaw(X_WB.rotation()).vector()
+        return float(vector[axis])
 
-        return read
-
-    names = list(_POSE_ENTRIES)
-    axis = names.index(entry) % 3
-    read = translation(axis) if _POSE_ENTRIES[entry] == "m" else angle(axis)
-    return Variable(f"{address}.{entry}", X, (), _POSE_ENTRIES[entry], read)
+    return Variable(f"{address}.{entry}", X, (), unit, read)
 
 
 def _frame_pose(plant: MultibodyPlant, frame: FixedOffsetFrame, address: str) -> Variable:
-    def read(root: Context) -> np.ndarray:
-        return pose_to_array(frame.GetPoseInParentFrame(plant.GetMyContextFromRoot(root)))
-
-    def write(root: Context, value: np.ndarray) -> None:
-        frame.SetPoseInParentFrame(plant.GetMyMutableContextFromRoot(root), pose_from_array(value))
-
-    return Variable(f"{address}.pose", A, (6,), POSE_UNIT, read, write)
+    return _variable(
+        plant,
+        f"{address}.pose",
+        A,
+        (6,),
+        POSE_UNIT,
+        lambda context: pose_to_array(frame.GetPoseInParentFrame(context)),
+        lambda context, value: frame.SetPoseInParentFrame(context, pose_from_array(value)),
+    )
 
 
 def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Variable:
-    def read(root: Context) -> float:
-        return float(actuator.rotor_inertia(plant.GetMyContextFromRoot(root)))
-
-    def write(root: Context, value: np.ndarray) -> None:
-        actuator.SetRotorInertia(plant.GetMyMutableContextFromRoot(root), float(value))
-
-    unit = "kg m^2" if actuator.joint().type_name() != "prismatic" else "kg"
-    return Variable(f"{address}.rotor_inertia", A, (), unit, read, write, bounds=(0.0, inf))
-
-
-_FRICTION = ("material", "coulomb_friction")
+    return _variable(
+        plant,
+        f"{address}.rotor_inertia",
+        A,
+        (),
+        "kg m^2" if actuator.joint().type_name() != "prismatic" else "kg",
+        actuator.rotor_inertia,
+        lambda context, value: actuator.SetRotorInertia(context, float(value)),
+        bounds=(0.0, inf),
+    )
 
 
 def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix: Prefix) -> Iterator[Variable]:
