@@ -1,15 +1,28 @@
-"""Gamma: the same s0 gives the same trajectory, to the last bit, and a physical one."""
+"""Rollouts repeat, stop at t*, and report failures as outcomes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import RandomSource
 from scipy.special import ellipk
 
+import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
-from vtbdrake.rollout import Quality, RolloutRunner, RolloutTask
+from vtbdrake.rollout import (
+    ProcessExecutor,
+    Quality,
+    RolloutResult,
+    RolloutRunner,
+    RolloutTask,
+    SerialExecutor,
+    ThreadExecutor,
+)
+from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.state import Snapshot
 
 THETA = "sim.sys.Pendulum.theta.position"
 DAMPING = "sim.sys.Pendulum.theta.damping"
@@ -261,3 +274,208 @@ def test_an_unknown_address_is_an_error_before_anything_runs():
         RolloutRunner(RolloutTask(AcrobotScenario(), 0.1, Quality(_angle, "sim.sys.Acrobot.sholder.position")))
     with pytest.raises(ValueError, match="did you mean dps.torque"):
         RolloutRunner(RolloutTask(AcrobotScenario(), 0.1, record=("dps.torqe",)))
+
+
+VELOCITY = "sim.sys.Acrobot.shoulder.velocity"
+FRICTION = "sim.sys.Acrobot.lower_link.friction"
+
+
+def test_initialization_events_do_not_touch_a_restored_s0():
+    scenario = SelfWilledScenario()
+    task = RolloutTask(scenario, 0.1, record=("dps.torque",))
+    fresh = RolloutRunner(task)
+    assert fresh.run({}).record["dps.torque"][0] == 7.0
+    start = fresh.state({SHOULDER: 0.3}, 0.05)
+    assert start["dps.torque"] != 7.0
+    result = RolloutRunner(replace(task, start=start)).run({})
+    assert result.record["dps.torque"][0] == start["dps.torque"]
+
+
+def test_what_is_set_in_a_restored_s0_is_not_initialized_away():
+    scenario = SelfWilledScenario()
+    task = RolloutTask(scenario, 0.1, record=("dps.torque",))
+    start = RolloutRunner(task).state({}, 0.05)
+    result = RolloutRunner(replace(task, start=start)).run({"dps.torque": 2.5})
+    assert result.record["dps.torque"][0] == 2.5
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.005])
+def test_hidden_variables_of_the_start_are_in_force_from_the_first_rollout(time_step):
+    scenario = AcrobotScenario(time_step=time_step)
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {FRICTION: 0.123})
+    task = RolloutTask(scenario, 0.1, record=(FRICTION,), start=testbed.snapshot(context))
+    runner = RolloutRunner(task)
+    assert runner.run({}).record[FRICTION].tolist() == [0.123] * 3
+    assert runner.run({FRICTION: 0.5}).record[FRICTION].tolist() == [0.5] * 3
+    assert runner.run({}).record[FRICTION].tolist() == [0.123] * 3
+
+
+def test_a_discrete_plant_that_is_no_longer_finite_is_a_failed_outcome():
+    # Neither the quality nor the recording would notice: they do not look at the plant.
+    task = RolloutTask(
+        AcrobotScenario(time_step=0.005), 0.015, Quality(lambda t: t, "time"), sample_period=0.005, record=("time",)
+    )
+    runner = RolloutRunner(task)
+    result = runner.run({VELOCITY: 1e200})
+    assert result.failed
+    assert "the state is not finite at t = 0.005 s" in result.message
+    assert result.times.tolist() == [0.0]
+    assert np.isnan(result.h)
+    # The next one is not touched by it.
+    assert runner.run({}).identical(RolloutRunner(task).run({}))
+
+
+def _snapshot(value=1.0):
+    return Snapshot(0.05, {"a": np.array(value)}, {"s/discrete_state/0": np.array([2.0])})
+
+
+RESULT = RolloutResult(
+    parameters={"a": 1.0, "b": np.array([1.0, 2.0])},
+    end="horizon",
+    message="",
+    times=np.array([0.0, 0.05]),
+    quality=np.array([0.5, np.nan]),
+    t_star=0.0,
+    h=0.5,
+    record={"x": np.array([[1.0], [np.nan]]), "port": ["up", "down"]},
+    state=_snapshot(),
+    wall_time=1.0,
+)
+
+
+def test_a_copy_is_identical_whatever_time_it_took():
+    copy = replace(
+        RESULT,
+        parameters={"b": np.array([1.0, 2.0]), "a": 1.0},
+        times=RESULT.times.copy(),
+        quality=RESULT.quality.copy(),
+        record={"x": RESULT.record["x"].copy(), "port": ["up", "down"]},
+        state=_snapshot(),
+        wall_time=2.0,
+    )
+    assert RESULT.identical(copy)
+    failed = replace(RESULT, t_star=np.nan, h=np.nan)
+    assert failed.identical(replace(failed, wall_time=np.nan))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"parameters": {"a": 1.0 + 1e-15, "b": np.array([1.0, 2.0])}},
+        {"parameters": {"a": 1.0, "b": np.array([1.0, 3.0])}},
+        {"parameters": {"a": 1.0}},
+        {"parameters": {**RESULT.parameters, "c": 1.0}},
+        {"end": "terminated"},
+        {"message": "had enough"},
+        {"times": np.array([0.0, 0.05 + 1e-15])},
+        {"times": np.array([0.0])},
+        {"quality": np.array([0.5, 0.5])},
+        {"quality": np.array([0.5 + 1e-15, np.nan])},
+        {"t_star": 0.05},
+        {"t_star": np.nan},
+        {"h": 0.5 + 1e-15},
+        {"h": np.nan},
+        {"record": {**RESULT.record, "x": np.array([[1.0 + 1e-15], [np.nan]])}},
+        {"record": {**RESULT.record, "x": np.array([[1.0], [1.0]])}},
+        {"record": {**RESULT.record, "port": ["up", "up"]}},
+        {"record": {"port": ["up", "down"]}},
+        {"record": {**RESULT.record, "y": np.array([1.0])}},
+        {"state": None},
+        {"state": _snapshot(1.0 + 1e-15)},
+    ],
+    ids=lambda change: "-".join(change),
+)
+def test_whatever_else_differs_is_not_identical(change):
+    other = replace(RESULT, **change)
+    assert not RESULT.identical(other)
+    assert not other.identical(RESULT)
+
+
+def _amplitude(scenario):
+    return RolloutTask(scenario, 1.0, Quality(abs, THETA))
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, ThreadExecutor])
+def test_an_executor_with_a_testbed_runs_the_scenario_of_its_task(make):
+    soft, stiff = PendulumScenario(stiffness=0.0), PendulumScenario(stiffness=50.0)
+    point = [{THETA: 0.5, "u.angle": 3.0}]
+    with make(testbed=soft.build()) as executor:
+        results = [run_rollouts(executor, _amplitude(s), point, progress=False)[0] for s in (soft, stiff)]
+    expected = [RolloutRunner(_amplitude(s)).run(point[0]) for s in (soft, stiff)]
+    assert all(a.identical(b) for a, b in zip(results, expected, strict=True))
+    assert results[0].h != results[1].h
+
+
+def test_a_runner_refuses_the_testbed_of_another_scenario():
+    with pytest.raises(ValueError, match="another scenario"):
+        RolloutRunner(_amplitude(PendulumScenario()), PendulumScenario(stiffness=1.0).build())
+
+
+def test_a_scenario_that_is_changed_afterwards_changes_nothing():
+    scenario = PendulumScenario(stiffness=0.0)
+    problem = vtb.Problem(
+        scenario=scenario,
+        parameters=[vtb.Parameter(THETA, 0, 1)],
+        quality=vtb.Quality(abs, THETA),
+        horizon=1.0,
+        conditions=[{"u.angle": 3.0}],
+    )
+    before = problem.rollout([0.5])
+    scenario.stiffness = 50.0
+    assert problem.rollout([0.5]).identical(before)
+    sweep = problem.sweep(values=[0.5], executor=ProcessExecutor(1), progress=False)
+    assert sweep.h[0] == before.h
+    assert sweep.scenario["stiffness"] == 0.0
+
+
+def test_integers_are_numbers():
+    problem = vtb.Problem(
+        scenario=PendulumScenario(),
+        parameters=[vtb.Parameter("sim.sys.Pendulum.theta.velocity", 0, 8)],
+        quality=vtb.Quality(abs, THETA),
+        horizon=1,
+        threshold=1,
+    )
+    boundary = problem.boundary(resolution=1, coarse=2, executor="serial", progress=False)
+    assert boundary.upper - boundary.lower == 1.0
+
+
+def test_a_snapshot_of_the_running_robot_is_simulated():
+    scenario = AcrobotScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.diagram.GetInputPort("real.sense.joint_state").FixValue(context, np.zeros(4))
+    testbed.switch(context, "real")
+    task = RolloutTask(scenario, 0.5, Quality(abs, SHOULDER), start=testbed.snapshot(context))
+    assert RolloutRunner(task).run({SHOULDER: 0.3}).end == "horizon"
+
+
+def test_state_at_t_star_is_right_although_the_simulation_failed_later():
+    task = RolloutTask(
+        BrokenScenario(kind="raises"), 2.0, Quality(lambda t: t, "time"), threshold=0.49, run_on=True, keep_state=True
+    )
+    result = RolloutRunner(task).run({})
+    assert result.state.time == result.t_star == pytest.approx(0.5)
+
+
+def test_a_terminated_rollout_ends_when_it_was_terminated():
+    task = RolloutTask(TerminatingScenario(), 2.0, Quality(lambda t: t, "time"), sample_period=0.2, keep_state=True)
+    runner = RolloutRunner(task)
+    result = runner.run({})
+    assert result.t_star == result.h == result.state.time == result.times[-1] == pytest.approx(0.55)
+    with pytest.raises(RuntimeError, match="had enough"):
+        runner.state({}, 1.0)
+
+
+@dataclass
+class WithGusts(AcrobotScenario):
+    def add_world(self, builder):
+        super().add_world(builder)
+        builder.add("env", "gusts", RandomSource(RandomDistribution.kGaussian, 1, 0.1))
+
+
+def test_what_no_copy_can_repeat_is_refused():
+    with pytest.raises(ValueError, match="no copy can continue"):
+        WithGusts().build()

@@ -1,4 +1,4 @@
-"""What is written is what Drake computes with."""
+"""Values that are written to a plant are those that Drake computes with."""
 
 import numpy as np
 import pytest
