@@ -24,6 +24,7 @@ package vtb_test_types;
 struct point_t { double x; double y; double z; }
 struct wind_t { int64_t utime; double speed; double direction; float gust[2]; int16_t level; point_t where; }
 struct mixed_t { int64_t utime; string name; int32_t n; int32_t m; double grid[n][m]; byte blob[m]; point_t points[n]; }
+struct tree_t { int32_t n; double x; tree_t branches[n]; }
 """
 
 

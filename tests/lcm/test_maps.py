@@ -99,10 +99,28 @@ def test_fields_of_a_user_type_travel_both_ways(user_types: ModuleType) -> None:
 
 
 def test_fields_beside_arrays_of_messages_travel_both_ways(user_types: ModuleType) -> None:
-    map = vector_map("MIXED", user_types.mixed_t, {"n": "n"})
-    sent, decoded = map.decoder(signals(n=1))(mixed(user_types).encode())
-    assert (sent, decoded["n"].tolist()) == (5 * 1e-6, [2.0])
-    assert user_types.mixed_t.decode(map.encoder(signals(n=1))({"n": [0.0]}, 6)).utime == 6
+    assert vector_map("MIXED", user_types.mixed_t, {"n": "n"}).decoder(signals(n=1))(mixed(user_types).encode()) == (
+        5 * 1e-6,
+        {"n": [2.0]},
+    )
+    map = vector_map("STATE", lcmt_robot_state, {"positions": "joint_position"})
+    message = lcmt_robot_state()
+    message.utime, message.num_joints, message.joint_name = 7, 2, ["shoulder", ""]
+    message.joint_position = [0.25, -0.5]
+    sent, decoded = map.decoder(signals(positions=2))(message.encode())
+    assert (sent, decoded["positions"].tolist()) == (7 * 1e-6, [0.25, -0.5])
+    message.joint_name = ["", ""]
+    assert map.encoder(signals(positions=2))(decoded, 7) == message.encode()
+
+
+def test_length_of_an_array_cannot_be_sent(user_types: ModuleType) -> None:
+    with pytest.raises(ValueError, match="length of an array follows from its signal"):
+        vector_map("MIXED", user_types.mixed_t, {"n": "n"}).encoder(signals(n=1))
+
+
+def test_type_that_contains_itself_is_refused(user_types: ModuleType) -> None:
+    with pytest.raises(ValueError, match="tree_t contains itself: write an LcmMap"):
+        vector_map("TREE", user_types.tree_t, {"x": "x"}, stamp="")
 
 
 def test_other_arrays_of_the_same_length_are_zero() -> None:

@@ -25,7 +25,7 @@ cdef class Stream:
 
     @property
     def partial(self):
-        """True while there are unprocessed bytes."""
+        """Return whether there are unprocessed bytes."""
         return self.end > self.begin
 
     cdef char* _space(self, Py_ssize_t size) except NULL:

@@ -330,27 +330,27 @@ class LcmLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether it has a bus or searches for it."""
+        """Return whether the link has a bus or searches for one."""
         return self._connection is not None or self._search is not None
 
     @property
     def connected(self) -> bool:
-        """Whether it has a bus at present."""
+        """Return whether the link has a bus at present."""
         return self._current() is not None
 
     @property
     def name(self) -> str | None:
-        """The client's name at the hub; None without a connection or a hub."""
+        """Return the client's name at the hub; None without a connection or a hub."""
         return None if self._connection is None else self._connection.name
 
     @property
     def arrived(self) -> float | None:
-        """When the last received message arrived; see `Connection`."""
+        """Return when the last received message arrived; see `Connection`."""
         return None if self._connection is None else self._connection.arrived
 
     @property
     def sources(self) -> list[Connection]:
-        """What becomes readable when messages arrive, for `select`; empty while there is no bus."""
+        """Return what becomes readable when messages arrive, for `select`; empty while there is no bus."""
         connection = self._current()
         return [] if connection is None else [connection]
 

@@ -175,17 +175,17 @@ class Field(NamedTuple):
 
     @property
     def code(self) -> str:
-        """The type as `struct` calls it; ``s`` for a string, ``{`` for a message."""
+        """Return the type as `struct` calls it; ``s`` for a string, ``{`` for a message."""
         return _CODES.get(self.typename, "{")
 
     @property
     def length(self) -> str:
-        """The path of the field that holds a size of this one; empty if its dimensions are fixed."""
+        """Return the path of the field that holds a size of this one; empty if its dimensions are fixed."""
         return next((size for size in self.dimensions if isinstance(size, str)), "")
 
     @property
     def size(self) -> int:
-        """How many numbers it has if its dimensions are fixed."""
+        """Return how many numbers the field has if its dimensions are fixed."""
         return prod(size for size in self.dimensions if isinstance(size, int))
 
 
@@ -234,13 +234,17 @@ class VectorMap(LcmMap):
     def encoder(self, signals: Sequence[Signal]) -> Encoder:
         self._check(signals)
         sizes = {signal.name: signal.size or 0 for signal in signals}
-        encoders: dict[tuple[str, ...], MessageEncoder] = {}  # by the signals in the message
+
+        def encoder_of(names: tuple[str, ...]) -> MessageEncoder:
+            example = self._example({name: sizes[name] for name in names})
+            return MessageEncoder(*self._layout(names), example=example)
+
+        encoders = {tuple(sizes): encoder_of(tuple(sizes))}  # by the signals in the message
 
         def encode(values: Mapping[str, Any], utime: int) -> bytes:
             names = tuple(values)
             if names not in encoders:
-                example = self._example({name: sizes[name] for name in names})
-                encoders[names] = MessageEncoder(*self._layout(names), example=example)
+                encoders[names] = encoder_of(names)
             return encoders[names].encode(values, utime)
 
         return encode

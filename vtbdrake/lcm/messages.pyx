@@ -65,6 +65,7 @@ cdef class MessageLayout:
     cdef bytes fingerprint
     cdef Py_ssize_t field_count
     cdef Field* fields
+    cdef Py_ssize_t dimension_count
     cdef Dimension* dimensions
     cdef Py_ssize_t stamp  # field; -1 if there is none
     cdef list names  # of the signals
@@ -96,6 +97,7 @@ cdef class MessageLayout:
                     self.dimensions[k].size = dimension
                 k += 1
             self.fields[i].dimension_end = k
+        self.dimension_count = k
         self.stamp = single[stamp] if stamp else -1
         self.names = list(signals)
         paths = [path for parts in signals.values() for path in parts]
@@ -227,6 +229,11 @@ cdef class MessageEncoder(MessageLayout):
     cdef bytes example
 
     def __cinit__(self, *_, bytes example not None, **__):
+        cdef Py_ssize_t i, k
+        for i in range(self.dimension_count):
+            for k in range(self.part_ends[len(self.names) - 1] if self.names else 0):
+                if self.parts[k] == self.dimensions[i].field:
+                    raise ValueError("the length of an array follows from its signal: it cannot be sent as a signal")
         # In __cinit__, as it runs once: the fields stay where they are in this example.
         self.locate(example)
         self.example = example
