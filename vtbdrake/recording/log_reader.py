@@ -283,11 +283,11 @@ def _read_start(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         where = f"; {events.damages[0][1]} at byte {events.damages[0][0]}" if events.damages else ""
         raise LogError(f"{path} is not a log of a control loop: it has no event on {LOG}{where}")
     try:
-        told = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
-        if zlib.crc32(told.header.encode()) != told.crc & 0xFFFFFFFF:
+        first = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
+        if zlib.crc32(first.header.encode()) != first.crc & 0xFFFFFFFF:
             raise LogError(f"{path} cannot be used: its header is damaged")
         # The header comes first: another version may have another state, too.
-        header = LogHeader.from_json(told.header)
+        header = LogHeader.from_json(first.header)
         if not events.on(STATE):
             raise LogError(f"{path} cannot be used: the state before the first cycle is missing")
         state = decode(lcmt_vtb_state, events.data(*events.on(STATE)[0][2:]))

@@ -264,7 +264,7 @@ class _Replay:
                     values[i] = value
                 commanded[i] = True
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            # The loop may have had the same exception and gone on without actuator commands: the comparison tells.
+            # The loop may have had the same exception and gone on without actuator commands: the comparison shows.
             self.errors[int(self._log.numbers[i])] = f"{type(error).__name__}: {error}"
             for _, values, commanded in self._outputs:
                 commanded[i] = False

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -422,7 +424,7 @@ def test_killed_worker_process_is_harmless(hub: Hub) -> None:
     with served(hub.url, **AMPLE) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks"], timeout=PATIENCE) as live:
             rig.during(live.wait, 5, timeout=PATIENCE)
-            service._worker.kill()
+            os.kill(service.pid, signal.SIGKILL)
             rig.until(lambda: service.watches == 0)
         before = len(rig.bridge.sent)
         rig.until(lambda: len(rig.bridge.sent) > before + 10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -137,8 +138,8 @@ def test_prediction_begins_anew_after_gap() -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
-def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
-    """Return a comparison of a twin, and the rows of a heavier machine."""
+def rows_of(cycles: int) -> tuple[Comparison, RowLayout, np.ndarray]:
+    """Return a comparison of a twin, and layout and rows of a heavier machine."""
     scenario = DrivenPendulum()
     runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
     predictor = Predictor(scenario, period=PERIOD, values={})
@@ -147,19 +148,19 @@ def rows_of(cycles: int) -> tuple[Comparison, np.ndarray]:
     rows = layout.empty(cycles)
     for row in rows:
         assert sampler.fill(row[None], runtime.cycle()) == 1
-    return Comparison(predictor, layout, CONFIG, mode="twin"), rows
+    return Comparison(predictor, layout, CONFIG, mode="twin"), layout, rows
 
 
 def test_rows_arrive_in_any_portions() -> None:
-    comparison, rows = rows_of(102)
+    comparison, layout, rows = rows_of(102)
     expected = np.array([window.residual for window in comparison.take(rows)])
     assert np.abs(expected).max() > 1e-2
-    again, _ = rows_of(1)
+    again, *_ = rows_of(1)
     found = []
     for row in rows:
         # The velocity comes by itself, and then both again.
-        early, late = row.copy(), again._where.empty(1)[0]
-        velocity = again._where.sense["velocity"]
+        early, late = row.copy(), layout.empty(1)[0]
+        velocity = layout.sense["velocity"]
         late[:2], late[velocity] = row[:2], row[velocity]
         early[velocity] = np.nan
         found += again.take(early[None]) + again.take(np.array([late, row]))
@@ -168,24 +169,28 @@ def test_rows_arrive_in_any_portions() -> None:
 
 
 def test_last_actuation_of_a_period_acts() -> None:
-    comparison, rows = rows_of(102)
+    comparison, layout, rows = rows_of(102)
     expected = np.array([window.residual for window in comparison.take(rows)])
-    again, _ = rows_of(1)
+    again, *_ = rows_of(1)
     first = rows.copy()
-    first[:, again._where.actuation["torque"]] += 5.0
+    first[:, layout.actuation["torque"]] += 5.0
     found = again.take(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
 
-def test_failed_prediction_is_reported() -> None:
+def test_failed_prediction_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    step, steps = Predictor.step, count()
+
+    def fail_once(predictor: Predictor, actuation: np.ndarray | None) -> np.ndarray:
+        if next(steps) == 35:
+            raise RuntimeError("the step size is too small")
+        return step(predictor, actuation)
+
+    monkeypatch.setattr(Predictor, "step", fail_once)
     scenario = DrivenPendulum()
     together = Together(scenario, machine(scenario))
     monitor = monitored(together.driver, "twin")
-    together.run(50)
-    assert monitor._comparison is not None
-    predictor = monitor._comparison._predictor
-    predictor._now -= 100  # Drake does not go back in time.
-    together.run(60)
+    together.run(110)
     np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)
-    assert monitor.failed == 1
-    assert monitor.error
+    assert (monitor.failed, len(monitor.history)) == (1, 9)
+    assert monitor.error == "RuntimeError: the step size is too small"

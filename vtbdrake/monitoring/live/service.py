@@ -64,6 +64,11 @@ class LiveService:
         runtime.watch(self)
 
     @property
+    def pid(self) -> int:
+        """Return the process id of the worker process."""
+        return self._worker.pid
+
+    @property
     def watches(self) -> int:
         """Return the number of active watches."""
         return len(self._readings)

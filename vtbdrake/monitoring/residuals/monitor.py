@@ -192,6 +192,11 @@ class ResidualMonitor:
         return self._open and (self._worker is None or self._worker.alive)
 
     @property
+    def pid(self) -> int | None:
+        """Return the process id of the worker process; None if there is none."""
+        return self._worker.pid if self._worker is not None else None
+
+    @property
     def dropped(self) -> int:
         """Return the number of windows that the worker process did not take, because it is gone or far too slow."""
         return self._worker.dropped if self._worker is not None else 0
