@@ -70,6 +70,19 @@ def test_child_gets_its_arguments_and_answers():
     assert not child.alive and has_ended(child.pid)
 
 
+def test_requests_are_answered_line_by_line():
+    child = ChildProcess(echo, name="the echo")
+    child.wait_until_ready()
+    assert child.request(b"a\n", timeout=60.0) == b"()a\n"
+    assert child.request(b"b\n", timeout=60.0) == b"b\n"
+    with pytest.raises(TimeoutError):
+        child.request(b"no line", timeout=0.1)
+    child.kill()
+    with pytest.raises(OSError):
+        child.request(b"c\n", timeout=60.0)
+    child.close()
+
+
 def test_large_arguments_do_not_block_the_start():
     child = ChildProcess(sleep, bytes(50_000_000), name="the sleeper")
     child.kill()

@@ -104,7 +104,7 @@ class ChildProcess:
         return self.exit_code is None
 
     def wait_until_ready(self, timeout: float | None = 60.0) -> None:
-        """Wait until the child has called `report_ready`.
+        """Wait until the child has called `report_ready`. If that fails, or is interrupted, the child is killed.
 
         Args:
             timeout: time in seconds; None to wait forever.
@@ -112,23 +112,42 @@ class ChildProcess:
         Raises:
             StartError: the child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
         """
-        line = b""
-        self.connection.settimeout(timeout)
         try:
-            while not line.endswith(b"\n"):
-                part = self.connection.recv(1)  # No more: what follows the line belongs to `function`.
-                if not part:
-                    raise ConnectionResetError("the child has closed its end")
-                line += part
-        except TimeoutError as error:
-            raise StartError(f"{self.name} (process {self.pid}) was not ready within {timeout:g} s") from error
-        except OSError as error:
-            raise StartError(
-                f"{self.name} did not start (exit code {self._process.wait()}): see its output above"
-            ) from error
+            reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: what follows is for others to read.
+        except BaseException as error:
+            self.kill()
+            self.connection.close()
+            if isinstance(error, TimeoutError):
+                raise StartError(f"{self.name} (process {self.pid}) was not ready within {timeout:g} s") from error
+            if isinstance(error, OSError):
+                raise StartError(
+                    f"{self.name} did not start (exit code {self.exit_code}): see its output above"
+                ) from error
+            raise
+        if reason:
+            self.close()
+            raise StartError(reason)
+
+    def request(self, line: bytes, *, timeout: float) -> bytes:
+        """Send a line to the child, and return the line that it answers.
+
+        Raises:
+            OSError: the child has ended, or does not answer within ``timeout`` seconds.
+        """
+        self.connection.settimeout(timeout)
+        self.connection.sendall(line)
+        return self._read_line(timeout, 65536)
+
+    def _read_line(self, timeout: float | None, size: int) -> bytes:
+        self.connection.settimeout(timeout)
+        line = b""
+        while not line.endswith(b"\n"):
+            part = self.connection.recv(size)
+            if not part:
+                raise ConnectionResetError("its process has ended")
+            line += part
         self.connection.settimeout(None)
-        if line != b"\n":
-            raise StartError(line.decode().strip())
+        return line
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait until the child has ended, and return its exit code.

@@ -23,7 +23,6 @@ from vtbdrake.machine.loop import MachineLoop, epoch, serve
 from vtbdrake.machine.machine import Machine, MachineConfig, MachineStatus
 from vtbdrake.testbed import Scenario
 
-_START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 10.0
 
 
@@ -91,14 +90,12 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        self._child = ChildProcess(_serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
+        child = ChildProcess(_serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
         try:
-            self._child.wait_until_ready(_START_TIMEOUT)
-        except BaseException as error:
-            self.close()
-            if isinstance(error, StartError):
-                raise MachineError(str(error)) from error
-            raise
+            child.wait_until_ready()
+        except StartError as error:
+            raise MachineError(str(error)) from error
+        self._child = child
 
     def _running(self) -> ChildProcess:
         if self._child is None:
@@ -175,7 +172,7 @@ class MachineProcess:
 
     def die(self) -> int:
         """Let the machine end at once, without closing its connections, and return its exit code."""
-        self._send({"request": "die"})
+        self._running().connection.sendall(_to_line({"request": "die"}))
         return self.wait()
 
     def kill(self) -> int:
@@ -225,27 +222,19 @@ class MachineProcess:
         answer = self._ask(request)
         return MachineStatus(**{item.name: answer[item.name] for item in fields(MachineStatus)})
 
-    def _send(self, request: dict[str, Any]) -> socket.socket:
-        connection = self._running().connection
-        connection.sendall(json.dumps(request).encode() + b"\n")
-        return connection
-
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        answer = b""
         try:
-            control = self._send(request)
-            control.settimeout(_ANSWER_TIMEOUT)
-            while not answer.endswith(b"\n"):
-                part = control.recv(65536)
-                if not part:
-                    raise ConnectionResetError("its process has ended")
-                answer += part
+            line = self._running().request(_to_line(request), timeout=_ANSWER_TIMEOUT)
         except OSError as error:
             raise MachineError(f"the machine does not answer: {error}") from error
-        told: dict[str, Any] = json.loads(answer)
-        if "error" in told:
-            raise MachineError(told["error"])
-        return told
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise MachineError(answer["error"])
+        return answer
+
+
+def _to_line(request: dict[str, Any]) -> bytes:
+    return json.dumps(request).encode() + b"\n"
 
 
 def _serve_child(

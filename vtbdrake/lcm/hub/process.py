@@ -20,7 +20,6 @@ from vtbdrake.lcm.hub.tcpq import address_name
 
 _log = logging.getLogger(__name__)
 
-_START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 5.0
 _MAX_LOG = 1000
 
@@ -60,14 +59,12 @@ class Hub:
         with contextlib.ExitStack() as stack:
             listeners = [stack.enter_context(listener) for listener in listen(self.config)]
             self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
-            self._child = ChildProcess(_serve_child, self.config, name="the hub", sockets=listeners)
+            child = ChildProcess(_serve_child, self.config, name="the hub", sockets=listeners)
         try:
-            self._child.wait_until_ready(_START_TIMEOUT)
-        except BaseException as error:
-            self.close()
-            if isinstance(error, StartError):
-                raise HubError(str(error)) from error
-            raise
+            child.wait_until_ready()
+        except StartError as error:
+            raise HubError(str(error)) from error
+        self._child = child
 
     def _running(self) -> ChildProcess:
         if self._child is None:
@@ -99,17 +96,10 @@ class Hub:
         Raises:
             HubError: The hub does not answer.
         """
-        connection = self._running().connection
-        connection.settimeout(_ANSWER_TIMEOUT)
         try:
-            connection.sendall(b"?")
-            with connection.makefile("rb") as lines:
-                answer = lines.readline()
-            if not answer:
-                raise ConnectionResetError("its process has ended")
+            return HubStatistics.from_json(self._running().request(b"?", timeout=_ANSWER_TIMEOUT))
         except OSError as error:
             raise HubError(f"the hub at {self._url} does not answer: {error}") from error
-        return HubStatistics.from_json(answer)
 
     def close(self) -> None:
         """End the hub; it can be started again."""
