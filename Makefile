@@ -39,10 +39,10 @@ python:
 setup: $(STAMP)
 
 demo: $(STAMP)
-	$(RUN) -m diagrams.space_climber.demo
+	$(RUN) -m vtbdrake_diagrams.space_climber.demo
 
 demo-control: $(STAMP)
-	$(RUN) -m diagrams.manipulator.demo
+	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
 test: $(STAMP)
 	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
@@ -53,7 +53,7 @@ check: $(STAMP)
 	$(RUN) -m mypy
 
 answers: $(STAMP)
-	$(RUN) -m diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)
+	$(RUN) -m vtbdrake_diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)
 
 bench: $(STAMP)
 	$(RUN) -m benchmarks $(ONLY)

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from benchmarks.report import BENCHMARKS, benchmark_all, results_table, write_results
-from diagrams.tables import Crash
+from vtbdrake_diagrams.tables import Crash
 
 FILE = Path(__file__).with_name("results.json")
 

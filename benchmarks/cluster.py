@@ -10,11 +10,11 @@ import numpy as np
 from benchmarks.dask_cluster import DaskCluster, dask_cluster
 from benchmarks.measure import HIGHER, Benchmark, spread
 from benchmarks.parallel import climber_task
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.payload import HORIZON, MASS
 from vtbdrake.rollout import RolloutTask
 from vtbdrake.rollout.cluster import DaskExecutor
 from vtbdrake.rollout.pickled_task import TaskPickler
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.payload import HORIZON, MASS
 
 WORKERS = 2
 SIZES = (100, 10, 1000)

@@ -13,12 +13,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, TrajectorySource, VectorLogSink
 from pydrake.trajectories import PiecewisePolynomial
 
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.gait import GAITS
-from diagrams.space_climber.morphology import JOINT_NAMES, Morphology
-from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
-from diagrams.space_climber.walking import make_walking
 from vtbdrake.testbed import Interface, VirtualTestbedBuilder
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.gait import GAITS
+from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, Morphology
+from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
+from vtbdrake_diagrams.space_climber.walking import make_walking
 
 JOINTS = len(JOINT_NAMES)
 

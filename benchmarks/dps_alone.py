@@ -16,12 +16,12 @@ import numpy as np
 
 from benchmarks.loop_rig import FRICTION
 from benchmarks.measure import LOWER, Benchmark, ratio, spread
-from diagrams.manipulator import ManipulatorScenario
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
 ROOT = Path(__file__).resolve().parents[1]
-SCENARIO = "diagrams.manipulator:ManipulatorScenario"
+SCENARIO = "vtbdrake_diagrams.manipulator:ManipulatorScenario"
 COMMAND = "IIWA_COMMAND"
 PATIENCE = 120.0  # s
 AGAINST = "the whole testbed, run on the same machine from the same snapshot"

@@ -15,9 +15,9 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from diagrams.manipulator.arm import JOINTS
-from diagrams.manipulator.motions import HOME
 from vtbdrake.testbed import Scenario
+from vtbdrake_diagrams.manipulator.arm import JOINTS
+from vtbdrake_diagrams.manipulator.motions import HOME
 
 FIRST_MESSAGE = 5.0  # s to wait for
 

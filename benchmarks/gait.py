@@ -12,8 +12,8 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 
 import vtbdrake as vtb
 from benchmarks.measure import HIGHER, Benchmark, spread
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.payload import MASS, PITCH
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.payload import MASS, PITCH
 
 PERIOD, STROKE, RAMP_TIME = (f"dps.impl.gait.{name}" for name in ("period", "stroke", "ramp_time"))
 X, ROLL = "sim.sys.climber.base.x", "sim.sys.climber.base.roll"

@@ -16,10 +16,10 @@ from benchmarks.bare_loop import bare_loop
 from benchmarks.drake_loop import DrakeLoop
 from benchmarks.loop_rig import PERIOD, PRIORITY, WARM_UP, loop_rig
 from benchmarks.measure import HIGHER, LOWER, Benchmark
-from diagrams.manipulator.arm import JOINTS
 from vtbdrake.control.clock import WallClock
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.manipulator.arm import JOINTS
 
 PACE = "joint_position"  # comes with the first of the machine's messages
 PER = 10_000  # cycles, for which misses are counted

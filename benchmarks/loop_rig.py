@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.arm import JOINTS
-from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime
@@ -22,6 +19,9 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import JOINTS
+from vtbdrake_diagrams.manipulator.safety import CONTINUITY
 
 HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 72, 75, 70
 """Of SCHED_FIFO; the second is the controller's, the bare C loop's and the echo's."""

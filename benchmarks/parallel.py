@@ -13,8 +13,6 @@ import numpy as np
 from benchmarks.cpp_climber import CppClimberScenario
 from benchmarks.dask_cluster import dask_cluster
 from benchmarks.measure import HIGHER, Benchmark, seconds, spread
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.payload import MASS, PITCH, SAMPLE_PERIOD
 from vtbdrake.rollout import (
     Executor,
     FuturesExecutor,
@@ -26,6 +24,8 @@ from vtbdrake.rollout import (
     ThreadExecutor,
 )
 from vtbdrake.rollout.cluster import DaskExecutor
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.payload import MASS, PITCH, SAMPLE_PERIOD
 
 CORES = 2
 HORIZON = 5.0

@@ -12,11 +12,11 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.dps import make_dps
-from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES
-from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, connect_to_plant
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES
+from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import Benchmark
-from diagrams.tables import Crash, Registry, chosen, run, write_json
 from vtbdrake.cli.output import number, table
+from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
 
 # Name -> function () -> Benchmark or list of them; the first bears the name, the others are printed beside it.
 BENCHMARKS: Registry = {

@@ -13,10 +13,6 @@ from math import inf
 
 from benchmarks.loop_rig import PERIOD
 from benchmarks.measure import LOWER, Benchmark, seconds
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.arm import Arm
-from diagrams.manipulator.motions import CIRCLE
-from diagrams.manipulator.safety import CONTINUITY
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.hub import Hub
@@ -24,6 +20,10 @@ from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
 from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.safety import CONTINUITY
 
 # Of the machine's sensors, in their units.
 NOISE = {"joint_position": 1e-5, "joint_velocity": 1e-3, "joint_torque_measured": 0.1, "wrench": 0.1}

@@ -11,9 +11,9 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from benchmarks.loop import PER, histogram, percentiles
 from benchmarks.loop_rig import PERIOD, loop_rig
 from benchmarks.measure import LOWER, Benchmark
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.arm import JOINTS
 from vtbdrake.testbed import DpsAlone, SlowPart
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import JOINTS
 
 TAKES = 0.05  # s of a processor
 SAMPLE_PERIOD, LATENCY = 0.1, 0.2  # s

@@ -14,14 +14,14 @@ import numpy as np
 
 import vtbdrake as vtb
 from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio, seconds, spread
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.payload import PHASE
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import CVaR, Mean, Risk, Study, Worst
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers import make_solver
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutRunner, ThreadExecutor
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.payload import PHASE
 
 ANGLE, RATE = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
 X = "sim.sys.climber.base.x"

@@ -1,1 +1,1 @@
-"""The library of testbeds, one folder each. Imported from the checkout, not part of the wheel."""
+"""The example testbeds, one folder each, imported as `vtbdrake_diagrams`: PyPI has another package `diagrams`."""

@@ -1,6 +1,7 @@
-"""Every application's question and our answer, beside the paper's: ``python -m diagrams.answers [ONLY...] [--full]``.
+"""Print every application's question and our answer beside the paper's.
 
-Prints one row each and writes ``answers.json``, which holds what this run has answered, and nothing older.
+``python -m vtbdrake_diagrams.answers [ONLY...] [--full]`` prints one row each, and writes the answers of this run to
+``answers.json``.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from typing import Any
 
 import click
 
-from diagrams.tables import Crash, Registry, chosen, run, write_json
 from vtbdrake.cli.output import number, table
+from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
 
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
-    "O4": "diagrams.space_climber.answers:payload",
-    "C1": "diagrams.manipulator.answers:control",
+    "O4": "vtbdrake_diagrams.space_climber.answers:payload",
+    "C1": "vtbdrake_diagrams.manipulator.answers:control",
 }
 
 FILE = "answers.json"
@@ -145,6 +146,6 @@ def main(only: tuple[str, ...], full: bool) -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that there is one class Answer.
-    from diagrams.answers import main as program
+    from vtbdrake_diagrams.answers import main as program
 
-    program(prog_name="python -m diagrams.answers")
+    program(prog_name="python -m vtbdrake_diagrams.answers")

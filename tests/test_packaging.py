@@ -1,4 +1,4 @@
-"""The sdist holds all that the wheel is built from; the wheel holds the package, typed, compiled and licensed."""
+"""The sdist holds all that the wheel is built from; the wheel holds the package, compiled, and the example testbeds."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ import zipfile
 from email.message import Message
 from email.parser import Parser
 from pathlib import Path
-from sysconfig import get_config_var
+from sysconfig import get_config_var, get_path
 
 import pytest
 
@@ -30,7 +30,9 @@ def run(*arguments: str, cwd: Path, **environment: str) -> str:
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy, modules compiled in place included: a build leaves its folders where it runs."""
     folder = tmp_path_factory.mktemp("build") / "checkout"
-    shutil.copytree(ROOT / "vtbdrake", folder / "vtbdrake", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("vtbdrake", "diagrams"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "vtbdrake_diagrams").symlink_to((ROOT / "vtbdrake_diagrams").readlink())
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     return folder
@@ -38,8 +40,9 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def files(checkout: Path) -> set[str]:
-    """The package's own files, as they are kept in the repository."""
-    paths = [path for path in (checkout / "vtbdrake").rglob("*") if path.is_file() and path.suffix != ".so"]
+    """The files of both packages, as they are kept in the repository."""
+    folders = (checkout / "vtbdrake", checkout / "vtbdrake_diagrams")
+    paths = [path for folder in folders for path in folder.rglob("*") if path.is_file() and path.suffix != ".so"]
     return {path.relative_to(checkout).as_posix() for path in paths}
 
 
@@ -105,6 +108,32 @@ def test_compiled_modules_of_the_wheel_import(wheel: Path, tmp_path: Path) -> No
         name = ".".join(source.with_suffix("").parts)
         found = run("-c", f"import {name} as module; print(module.__file__)", cwd=tmp_path, PYTHONPATH=str(tmp_path))
         assert Path(found.strip()) == tmp_path / source.with_suffix(EXT_SUFFIX)
+
+
+def test_first_program_of_the_readme_runs_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
+    environment = tmp_path / "venv"
+    run("-m", "venv", "--without-pip", str(environment), cwd=tmp_path)
+    (packages,) = environment.glob("lib/python*/site-packages")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(packages)
+    # What vtbdrake depends on, without what else is installed in an editable way.
+    (packages / "dependencies.pth").write_text(get_path("purelib"))
+    program = (ROOT / "README.md").read_text("utf-8").split("```python\n")[1].partition("```")[0]
+    # The same program with a shorter horizon: what it answers is the business of other tests.
+    program = program.replace("horizon=15.0", "horizon=0.5").replace("coarse=5.0", "coarse=30.0")
+    program += "import vtbdrake_diagrams\nprint(vtb.__file__, vtbdrake_diagrams.__file__, sep='\\n')\n"
+    program += "problem.sweep(2, executor='processes', workers=1, progress=False)\n"
+    (tmp_path / "program.py").write_text(program)
+    done = subprocess.run(
+        [environment / "bin" / "python", "-I", "program.py"],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert [Path(line).parents[1] for line in done.stdout.splitlines()[-2:]] == [packages, packages]
+    assert (tmp_path / "payload.png").stat().st_size > 1000
 
 
 def test_metadata(metadata: Message) -> None:

@@ -12,8 +12,8 @@ import pytest
 from benchmarks.import_time import import_time
 from benchmarks.measure import Benchmark, interleaved, interleaved_values, ratio
 from benchmarks.report import BENCHMARKS, benchmark_all, results_table, write_results
-from diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
-from diagrams.tables import Crash, write_json
+from vtbdrake_diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
+from vtbdrake_diagrams.tables import Crash, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -198,7 +198,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(("module", "known"), [("diagrams.answers", APPLICATIONS), ("benchmarks", BENCHMARKS)])
+@pytest.mark.parametrize(("module", "known"), [("vtbdrake_diagrams.answers", APPLICATIONS), ("benchmarks", BENCHMARKS)])
 def test_unknown_names_list_the_known_ones(module: str, known: dict[str, str], tmp_path: Path) -> None:
     command = [sys.executable, "-m", module, "nonsense"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

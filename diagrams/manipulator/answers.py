@@ -9,9 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from diagrams.answers import Answer
-from diagrams.manipulator.scenario import ManipulatorScenario
-from diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
@@ -20,6 +17,9 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
 

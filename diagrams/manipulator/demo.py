@@ -12,9 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
-from diagrams.manipulator.safety import CARRY
-from diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 from vtbdrake.cli.output import table
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.realtime import RealTime
@@ -27,6 +24,9 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
+from vtbdrake_diagrams.manipulator.safety import CARRY
+from vtbdrake_diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 
 LAWS = ("cartesian_impedance", "admittance")
 

@@ -9,12 +9,12 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
 
-from diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
-from diagrams.manipulator.dynamics import ArmDynamics, Expression, function
-from diagrams.manipulator.laws import LAWS, Declared
-from diagrams.manipulator.motions import HOME, parameters, reference
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.state import discrete_state
+from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
+from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
+from vtbdrake_diagrams.manipulator.motions import HOME, parameters, reference
 
 # Name -> (initial value, unit). The first of a system is what others need of it.
 States = dict[str, tuple[object, str]]

@@ -11,7 +11,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
+from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 
 Expression = Any  # casadi.SX or casadi.DM
 

@@ -32,8 +32,8 @@ from dataclasses import dataclass, field
 
 import casadi
 
-from diagrams.manipulator.dynamics import ArmDynamics, Expression, TipMotion
-from diagrams.manipulator.motions import Reference
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, TipMotion
+from vtbdrake_diagrams.manipulator.motions import Reference
 
 # Name -> (value, unit, bounds).
 Declared = dict[str, tuple[object, str, tuple[float, float]]]

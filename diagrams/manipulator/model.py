@@ -1,6 +1,6 @@
 """Writes the SDF model of the arm.
 
-``python -m diagrams.manipulator.model`` rewrites the file in ``models/``.
+``python -m vtbdrake_diagrams.manipulator.model`` rewrites the file in ``models/``.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from math import pi
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, LINK_NAMES, Arm
-from diagrams.sdf import (
+from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, LINK_NAMES, Arm
+from vtbdrake_diagrams.sdf import (
     add_frame,
     add_geometry,
     add_joint,

@@ -21,8 +21,8 @@ from math import pi
 
 import casadi
 
-from diagrams.manipulator.arm import Arm
-from diagrams.manipulator.dynamics import Expression
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.dynamics import Expression
 
 MOTIONS = ("follow", "home", "swing", "press", "circle")
 FOLLOW, HOME, SWING, PRESS, CIRCLE = range(len(MOTIONS))

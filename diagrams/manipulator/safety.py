@@ -9,11 +9,11 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from diagrams.manipulator.arm import JOINTS, Arm
-from diagrams.manipulator.dynamics import ArmDynamics, function
-from diagrams.manipulator.laws import LAWS
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, NoCommand, Sample, Silence
 from vtbdrake.testbed import Interface, Signal
+from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, function
+from vtbdrake_diagrams.manipulator.laws import LAWS
 
 # The switch to real is refused where the command is further than this from the measured torque (N m).
 CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}

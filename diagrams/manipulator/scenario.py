@@ -10,12 +10,6 @@ from drake import lcmt_force_torque, lcmt_scope
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 
-from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
-from diagrams.manipulator.dps import gravity_torque, make_dps
-from diagrams.manipulator.dynamics import ArmDynamics
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import HOME, MOTIONS
-from diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm_fallback
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import (
     ErrorModel,
@@ -36,6 +30,12 @@ from vtbdrake.testbed import (
     Signal,
     VirtualTestbedBuilder,
 )
+from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dps import gravity_torque, make_dps
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import HOME, MOTIONS
+from vtbdrake_diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm_fallback
 
 LARGEST_DELAY = 50
 """Of the drives' commands, in periods."""
@@ -175,7 +175,7 @@ class ManipulatorScenario(Scenario):
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # The plant's modules, which the DPS on the robot does without.
-        from diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
+        from vtbdrake_diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
 
         arm = Arm()
         plant, scene_graph = builder.add_plant(self.plant_config)

@@ -10,12 +10,12 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from diagrams.manipulator.arm import JOINTS, Arm
-from diagrams.manipulator.dynamics import ArmDynamics, Expression, function
-from diagrams.manipulator.motions import CIRCLE, HOME, MOTIONS, PRESS, SWING, parameters, reference
-from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME, MOTIONS, PRESS, SWING, parameters, reference
+from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 # How the arm in a trial is: the wall is where the press meets it, and the swing does not.
 WALL_DISTANCE = 0.835

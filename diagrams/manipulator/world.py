@@ -12,10 +12,10 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericParameterIndex
 
-from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
-from diagrams.manipulator.model import ARM_SDF
 from vtbdrake.state import parameter
 from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
+from vtbdrake_diagrams.manipulator.model import ARM_SDF
 
 BALL_STIFFNESS = 1e8
 """Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""

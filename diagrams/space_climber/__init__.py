@@ -1,5 +1,5 @@
 """A six-legged robot in the style of DFKI's SpaceClimber, walking on the moon with an attachment at its front."""
 
-from diagrams.space_climber.scenario import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
 
 __all__ = ["SpaceClimberScenario"]

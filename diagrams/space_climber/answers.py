@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from math import isfinite
 
-from diagrams.answers import Answer
-from diagrams.space_climber.payload import (
+from vtbdrake.optimization import Boundary
+from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.space_climber.payload import (
     EARTH,
     ENVIRONMENTS,
     MOON,
@@ -16,7 +17,6 @@ from diagrams.space_climber.payload import (
     static_limit,
     statics,
 )
-from vtbdrake.optimization import Boundary
 
 # How far simulated and static limit of the locked robot may be apart, in kg: the step at which masses were tried.
 LOCKED_STEP = 1.0

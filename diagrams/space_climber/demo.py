@@ -6,8 +6,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
 from vtbdrake.visualization import make_meshcat, show_motions
+from vtbdrake_diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
 
 OUT = Path("out")
 

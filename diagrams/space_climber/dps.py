@@ -8,13 +8,13 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import Multiplexer
 
-from diagrams.space_climber.estimation import PerceivedEnvironment
-from diagrams.space_climber.gait import GAITS
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
-from diagrams.space_climber.walking import make_walking
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.space_climber.estimation import PerceivedEnvironment
+from vtbdrake_diagrams.space_climber.gait import GAITS
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
+from vtbdrake_diagrams.space_climber.walking import make_walking
 
 SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": len(LEGS)}
 

@@ -7,10 +7,10 @@ from math import asin, atan2, copysign, cos, exp, hypot, pi, sin
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 
 
 def wrap(angle: float) -> float:

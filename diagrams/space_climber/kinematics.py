@@ -18,7 +18,7 @@ from math import acos, atan2, copysign, cos, sin, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagrams.space_climber.morphology import LEGS, Morphology
+from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 
 Point = tuple[float, float, float]
 

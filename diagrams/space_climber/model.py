@@ -1,6 +1,6 @@
 """Writes the SDF models of the robot and its attachment from the morphology.
 
-``python -m diagrams.space_climber.model`` rewrites the files in ``models/``.
+``python -m vtbdrake_diagrams.space_climber.model`` rewrites the files in ``models/``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from pydrake.multibody.tree import SpatialInertia
 
-from diagrams.sdf import (
+from vtbdrake_diagrams.sdf import (
     add_frame,
     add_geometry,
     add_joint,
@@ -24,7 +24,7 @@ from diagrams.sdf import (
     start_model,
     text,
 )
-from diagrams.space_climber.morphology import LEGS, Morphology
+from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 
 MODELS = Path(__file__).parent / "models"
 CLIMBER_SDF = MODELS / "space_climber.sdf"

@@ -22,10 +22,10 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
-from diagrams.space_climber.gait import TRIPOD
-from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, LEGS
-from diagrams.space_climber.scenario import SpaceClimberScenario
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.space_climber.gait import TRIPOD
+from vtbdrake_diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, LEGS
+from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
 
 MASS = "sim.sys.payload.mass"
 PITCH = "sim.sys.climber.base.pitch"

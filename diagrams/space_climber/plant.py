@@ -9,9 +9,9 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.model import CLIMBER_SDF, PAYLOAD_SDF
-from diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, Morphology
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.model import CLIMBER_SDF, PAYLOAD_SDF
+from vtbdrake_diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES, Morphology
 
 
 def add_climber(

@@ -12,18 +12,6 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
-from diagrams.space_climber.dps import make_dps
-from diagrams.space_climber.gait import GAITS
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import (
-    DEFAULT_FRICTION,
-    FOOT_LINKS,
-    JOINT_NAMES,
-    LEGS,
-    LUNAR_GRAVITY,
-    Morphology,
-)
-from diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
 from vtbdrake.testbed import (
     Interface,
@@ -32,6 +20,18 @@ from vtbdrake.testbed import (
     Signal,
     VirtualTestbedBuilder,
 )
+from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.gait import GAITS
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import (
+    DEFAULT_FRICTION,
+    FOOT_LINKS,
+    JOINT_NAMES,
+    LEGS,
+    LUNAR_GRAVITY,
+    Morphology,
+)
+from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload, set_foot_friction
 
 JOINTS = len(JOINT_NAMES)
 

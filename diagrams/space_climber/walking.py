@@ -6,12 +6,12 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import Multiplexer
 
-from diagrams.space_climber.estimation import wrap
-from diagrams.space_climber.gait import Gait, advance, heights
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.space_climber.estimation import wrap
+from vtbdrake_diagrams.space_climber.gait import Gait, advance, heights
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 
 
 class GaitGenerator(LeafSystem):

@@ -17,7 +17,6 @@ import lcm
 import numpy as np
 import pytest
 
-from diagrams.manipulator import ManipulatorScenario
 from tests.cli.program import ROOT, error_of, run
 from tests.control.scripted import PERIOD
 from tests.control.servo_machine import COMMAND, PATIENCE, ServoMachineScenario
@@ -27,6 +26,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.state import Snapshot
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
 SERVO = "tests.control.servo_machine:ServoMachineScenario"
 CYCLES = 60
@@ -105,13 +105,18 @@ def test_it_commands_what_the_whole_testbed_would_and_carries_nothing_of_a_world
 
 def test_the_arm_is_run_without_its_plant() -> None:
     program = (
-        "import sys; from diagrams.manipulator import ManipulatorScenario as S; import vtbdrake.cli.run;"
+        "import sys; from vtbdrake_diagrams.manipulator import ManipulatorScenario as S; import vtbdrake.cli.run;"
         "from vtbdrake.testbed import DpsAlone; from vtbdrake.deployment import Deployment;"
         "Deployment.of(S()); DpsAlone(S()); print(*sys.modules)"
     )
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     # Its scenario has a MultibodyPlantConfig, and its DPS knows the inertias of the links: these import what they need.
-    useless = {"pydrake.multibody.parsing", "scipy.optimize", "diagrams.manipulator.world", "pydrake.visualization"}
+    useless = {
+        "pydrake.multibody.parsing",
+        "scipy.optimize",
+        "vtbdrake_diagrams.manipulator.world",
+        "pydrake.visualization",
+    }
     assert useless & set(found.stdout.split()) == set()
     assert Deployment.of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
 

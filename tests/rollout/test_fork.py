@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 
-from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import RolloutRunner, RolloutTask
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 # Name -> (scenario, an address of its state, seconds before the fork, seconds after it)
 CASES = {

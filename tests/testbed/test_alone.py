@@ -8,11 +8,11 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.primitives import ConstantValueSource, Gain
 
-from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario, PoseRelay
 from vtbdrake.state import Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal, SignalError, VirtualTestbedBuilder, WorldAlone
 from vtbdrake.testbed.signal import Feed
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 
 def closed_loop_then_alone(scenario, start, *, until, more, period):

@@ -8,11 +8,11 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
-from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import PoseRelay
 from vtbdrake.state import VariableError, discrete_state
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.signal import SignalError
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 SENSE = Signal("y", size=2)
 ACT = Signal("u", size=2, idle=0.0)

@@ -5,10 +5,10 @@ import pytest
 from IPython.core.completer import provisionalcompleter
 from IPython.core.interactiveshell import InteractiveShell
 
-from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario
 from vtbdrake.rollout import Constraint, Quality, RolloutRunner, RolloutTask
 from vtbdrake.testbed import DpsAlone, Interface, Signal
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 ELBOW = "sim.sys.Acrobot.elbow.position"
 

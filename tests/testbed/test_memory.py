@@ -8,14 +8,14 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import LeafSystem
 
-import diagrams
 import vtbdrake.components
 import vtbdrake.testbed
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.space_climber import SpaceClimberScenario
+import vtbdrake_diagrams
 from tests.testbeds import PendulumScenario
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
-for package in (vtbdrake.components, vtbdrake.testbed, diagrams):
+for package in (vtbdrake.components, vtbdrake.testbed, vtbdrake_diagrams):
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
@@ -29,7 +29,7 @@ def _derived(kind):
 
 def test_our_systems_have_no_dict_of_their_own():
     """With pybind11, the collector visits it twice and takes the system for one that is used from elsewhere."""
-    ours = [kind for kind in _derived(LeafSystem) if kind.__module__.split(".")[0] in ("vtbdrake", "diagrams")]
+    ours = [kind for kind in _derived(LeafSystem) if kind.__module__.split(".")[0] in ("vtbdrake", "vtbdrake_diagrams")]
     assert len(ours) > 10
     assert [kind for kind in ours if "__slots__" not in vars(kind)] == []
 

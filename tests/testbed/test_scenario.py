@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 
-from diagrams.space_climber import SpaceClimberScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError
 from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 NAME = "tests.testbeds:AcrobotScenario"
 # Ten lines that stand for ten thousand million entries.

@@ -110,7 +110,7 @@ def main(traceback: bool) -> None:
 
     \b
     Example:
-      vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match mass
+      vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match mass
     """
     logging.getLogger("drake").setLevel(logging.WARNING)
     # Last, so that a file in the current directory cannot take the place of an installed module.

@@ -95,7 +95,7 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
 
     \b
     Example:
-      vtbdrake hub diagrams.manipulator:ManipulatorScenario
+      vtbdrake hub vtbdrake_diagrams.manipulator:ManipulatorScenario
       vtbdrake hub --protect IIWA_COMMAND
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)

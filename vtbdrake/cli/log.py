@@ -52,7 +52,7 @@ def replay(
 
     \b
     Example:
-      vtbdrake replay run.lcm --scenario diagrams.manipulator:ManipulatorScenario
+      vtbdrake replay run.lcm --scenario vtbdrake_diagrams.manipulator:ManipulatorScenario
     """
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")

@@ -137,7 +137,7 @@ def machine(
 
     \b
     Example:
-      vtbdrake machine diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 \\
+      vtbdrake machine vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 \\
           --perturb 0.05 --seed 3
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)

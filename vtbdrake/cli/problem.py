@@ -220,7 +220,7 @@ def sweep(
 
     \b
     Example:
-      vtbdrake sweep diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake sweep vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
     """
     stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
@@ -282,7 +282,7 @@ def boundary(
 
     \b
     Example:
-      vtbdrake boundary diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake boundary vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """

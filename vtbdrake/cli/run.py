@@ -128,7 +128,7 @@ def run(
 
     \b
     Example:
-      vtbdrake run diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
+      vtbdrake run vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
     scenario = scenario.with_fields(settings(fields))
     changes = {"period": period, "pace": pace}

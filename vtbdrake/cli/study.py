@@ -44,7 +44,7 @@ def study() -> None:
 
     \b
     Example:
-      vtbdrake study run gait.db diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+      vtbdrake study run gait.db vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
           --vary dps.impl.gait.period=1:4 --vary dps.impl.gait.stroke=0.05:0.3 --quality sim.sys.climber.base.x
       vtbdrake study show gait.db
     """
@@ -150,7 +150,7 @@ def run(
 
     \b
     Example:
-      vtbdrake study run gait.db diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+      vtbdrake study run gait.db vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
           --vary dps.impl.gait.period=1:4:log --choose scenario.gravity=1.62,9.81 \\
           --quality sim.sys.climber.base.x --at-most sim.sys.climber.base.pitch=0.2
     """

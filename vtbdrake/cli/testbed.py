@@ -48,7 +48,7 @@ def variables(scenario: Scenario, match: str, as_json: bool) -> None:
 
     \b
     Example:
-      vtbdrake variables diagrams.space_climber:SpaceClimberScenario --match payload
+      vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match payload
     """
     testbed = scenario.build()
     listed = testbed.variables()
@@ -86,7 +86,7 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 
     \b
     Example:
-      vtbdrake diagram diagrams.space_climber:SpaceClimberScenario -o climber.svg
+      vtbdrake diagram vtbdrake_diagrams.space_climber:SpaceClimberScenario -o climber.svg
     """
     from vtbdrake.visualization import svg
 
@@ -124,7 +124,7 @@ def rollout(
 
     \b
     Example:
-      vtbdrake rollout diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake rollout vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --set sim.sys.payload.mass=40 --record sim.sys.climber.base.pitch --save pitch.csv
     """
     if save is not None and not record:

@@ -36,7 +36,7 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
               ``hardware_sim`` have them;
             * the YAML file alone, if the class that it names is imported already. It looks like ::
 
-                  diagrams.space_climber:SpaceClimberScenario:
+                  vtbdrake_diagrams.space_climber:SpaceClimberScenario:
                     gravity: 3.71
 
     Raises:

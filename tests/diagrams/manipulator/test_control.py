@@ -10,11 +10,11 @@ import pytest
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import CIRCLE, HOME, PRESS, SWING
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME, PRESS, SWING
 
 T = 0.001
 ARM = Arm()

@@ -9,12 +9,12 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from diagrams.manipulator.arm import GRAVITY, Arm
-from diagrams.manipulator.dps import SENSOR_SIGNALS, make_dps
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import CIRCLE
-from diagrams.manipulator.world import add_arm
 from vtbdrake.state import Variables, collect
+from vtbdrake_diagrams.manipulator.arm import GRAVITY, Arm
+from vtbdrake_diagrams.manipulator.dps import SENSOR_SIGNALS, make_dps
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.world import add_arm
 
 T = 0.001
 ARM = Arm()

@@ -10,9 +10,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context
 
-from diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
-from diagrams.manipulator.dynamics import ArmDynamics, function
-from diagrams.manipulator.model import ARM_SDF, arm_sdf
+from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, function
+from vtbdrake_diagrams.manipulator.model import ARM_SDF, arm_sdf
 
 ARM = Arm()
 RNG = np.random.default_rng(7)

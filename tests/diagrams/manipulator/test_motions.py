@@ -6,9 +6,9 @@ import casadi
 import numpy as np
 import pytest
 
-from diagrams.manipulator.arm import JOINTS, Arm
-from diagrams.manipulator.dynamics import function
-from diagrams.manipulator.motions import CIRCLE, FOLLOW, HOME, PRESS, SWING, parameters, reference
+from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
+from vtbdrake_diagrams.manipulator.dynamics import function
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, FOLLOW, HOME, PRESS, SWING, parameters, reference
 
 T = 0.005
 HOME_POSE = np.array(Arm().home)

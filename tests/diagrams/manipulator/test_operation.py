@@ -11,10 +11,6 @@ import numpy as np
 import pytest
 from drake import lcmt_force_torque, lcmt_iiwa_command, lcmt_iiwa_status, lcmt_scope
 
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.arm import Arm
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import CIRCLE, HOME
 from tests.control.scripted import ScriptedBridge
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
@@ -23,6 +19,10 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME
 
 PATIENCE = 30.0  # s
 

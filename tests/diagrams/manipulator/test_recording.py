@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import CIRCLE, SWING
-from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
@@ -18,6 +15,9 @@ from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import CIRCLE, SWING
+from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 PATIENCE = 60.0  # s
 CYCLES = 300

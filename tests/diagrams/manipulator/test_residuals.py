@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.motions import CIRCLE
 from tests.monitoring.residuals.line import Together
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.machine.machine import Machine, MachineConfig
 from vtbdrake.monitoring.residuals import ResidualMonitor
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.motions import CIRCLE
 
 TOOL = "sim.sys.arm.tool.mass"
 MASS = 0.4  # kg

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from diagrams.manipulator.arm import Arm
-from diagrams.manipulator.safety import CARRY, DISAGREEMENT, SLIP, FloatInPlace
-from diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, NoCommand, Sample
 from vtbdrake.control.guards import Guards, Verdict
 from vtbdrake.testbed import Interface, Signal, WorldAlone
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.safety import CARRY, DISAGREEMENT, SLIP, FloatInPlace
+from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 HOME = np.array(Arm().home)
 REST = np.zeros(7)

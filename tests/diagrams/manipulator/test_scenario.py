@@ -9,11 +9,11 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Context
 
-from diagrams.manipulator import ManipulatorScenario
-from diagrams.manipulator.laws import LAWS
-from diagrams.manipulator.motions import PRESS, SWING
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.laws import LAWS
+from vtbdrake_diagrams.manipulator.motions import PRESS, SWING
 
 T = 0.001
 SIGNALS = ("joint_position", "joint_velocity", "joint_torque_measured", "wrench")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagrams.manipulator.arm import Arm
-from diagrams.manipulator.motions import CIRCLE
-from diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 
 SCENARIO = trial_scenario("admittance")
 

@@ -7,10 +7,10 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, LeafSystem
 
-from diagrams.space_climber.dps import make_dps
-from diagrams.space_climber.estimation import complementary_filter, wrap
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import Morphology
+from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.estimation import complementary_filter, wrap
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 
 PERIOD = 0.02
 MORPHOLOGY = Morphology()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagrams.space_climber.gait import GAITS, Gait, advance, glide, heights, lift
-from diagrams.space_climber.morphology import Morphology
+from vtbdrake_diagrams.space_climber.gait import GAITS, Gait, advance, glide, heights, lift
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 
 NOMINAL = [(x, y) for x, y, _ in Morphology().stance.tolist()]
 STEPS = 60  # a cycle; every duty factor is a whole number of steps

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.morphology import LEGS, Morphology
-from diagrams.space_climber.plant import add_climber
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
+from vtbdrake_diagrams.space_climber.plant import add_climber
 
 MORPHOLOGY = Morphology()
 KINEMATICS = LegKinematics(MORPHOLOGY)

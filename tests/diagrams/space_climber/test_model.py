@@ -10,10 +10,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointActuatorIndex
 
-from diagrams.space_climber.kinematics import LegKinematics
-from diagrams.space_climber.model import CLIMBER_SDF, PAYLOAD_SDF, climber_sdf, payload_sdf
-from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
-from diagrams.space_climber.plant import add_climber, add_payload
+from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
+from vtbdrake_diagrams.space_climber.model import CLIMBER_SDF, PAYLOAD_SDF, climber_sdf, payload_sdf
+from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
+from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,17 @@ import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import linprog
 
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
-from diagrams.space_climber.payload import MASS, locked_problem, payload_problem, static_limit, statics, tipped_over
 from vtbdrake.testbed import ScenarioError, load_scenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
+from vtbdrake_diagrams.space_climber.payload import (
+    MASS,
+    locked_problem,
+    payload_problem,
+    static_limit,
+    statics,
+    tipped_over,
+)
 
 
 def test_f_is_that_of_the_paper() -> None:
@@ -115,5 +122,5 @@ def test_a_world_that_makes_no_sense_is_refused(fields, message) -> None:
 
 def test_the_scenario_loads_from_a_file(tmp_path) -> None:
     file = tmp_path / "mars.yaml"
-    file.write_text("diagrams.space_climber:SpaceClimberScenario:\n  gravity: 3.71\n  gait: ripple\n")
+    file.write_text("vtbdrake_diagrams.space_climber:SpaceClimberScenario:\n  gravity: 3.71\n  gait: ripple\n")
     assert load_scenario(file) == SpaceClimberScenario(gravity=3.71, gait="ripple")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
-from diagrams.space_climber import SpaceClimberScenario
-from diagrams.space_climber.gait import GAITS
-from diagrams.space_climber.morphology import LEGS, LUNAR_GRAVITY, Morphology
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.gait import GAITS
+from vtbdrake_diagrams.space_climber.morphology import LEGS, LUNAR_GRAVITY, Morphology
 
 
 @dataclass
