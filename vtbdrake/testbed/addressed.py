@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +10,13 @@ import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
-from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variables
+from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_python, leaves
-from vtbdrake.state.variables import check_address, suggestion
+from vtbdrake.state.variables import X, check_address, suggestion
 from vtbdrake.testbed.signal import Interface
-from vtbdrake.testbed.switch import BOARD
+from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -60,13 +60,22 @@ class AddressedDiagram:
         interface: Interface,
         simulator_config: SimulatorConfig,
         scenario: Scenario | None,
-        variables: Variables,
+        extra: Iterable[Variable],
+        plant_roles: Mapping[str, str] | None = None,
     ) -> None:
+        """Collect the variables of ``diagram``; ``plant_roles`` maps model instances to ``sys`` or ``env``."""
+        roles = plant_roles or {}
+        clock = Variable("time", X, (), "s", lambda context: context.get_time())
         self.diagram = diagram
         self.interface = interface
         self.simulator_config = simulator_config
         self.scenario = scenario
-        self._variables = variables
+        self._variables = collect(
+            diagram,
+            plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
+            skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
+            extra=[clock, *extra],
+        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"

@@ -10,14 +10,13 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
-from vtbdrake.state import Snapshot, Variable, collect
+from vtbdrake.state import Snapshot
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
-from vtbdrake.state.variables import X
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.signal import Feed, Interface, SignalError
-from vtbdrake.testbed.switch import BOARD, COMMAND, REAL, Switches
+from vtbdrake.testbed.switch import COMMAND, REAL, Switches
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -40,7 +39,7 @@ class DpsAlone(AddressedDiagram):
         parts = VirtualTestbedBuilder(interface)
         dps = parts.set_dps(scenario.make_dps())
         builder = parts.diagram_builder
-        u = {s.name: s.vector(0.0 if s.default is None else s.default) for s in interface.commands}
+        u = {s.name: s.default_vector() for s in interface.commands}
         board = Switches(builder, Interface((), ()), REAL, REAL, dps, u)
         for name, port in board.commands.items():
             builder.Connect(port, dps.GetInputPort(name))
@@ -52,17 +51,12 @@ class DpsAlone(AddressedDiagram):
             active = builder.AddNamedSystem("T_act.active", ConstantVectorSource(np.ones(len(interface.act))))
             builder.ExportOutput(active.get_output_port(), "real.act.active")
         diagram = parts.build_diagram("dps_alone")
-        clock = Variable("time", X, (), "s", lambda context: context.get_time())
         super().__init__(
             diagram=diagram,
             interface=interface,
             simulator_config=_without_plant(scenario.simulator_config),
             scenario=scenario,
-            variables=collect(
-                diagram,
-                skip=lambda path: path in (BOARD, "T_act.active"),
-                extra=[clock, *board.command_variables(interface.commands)],
-            ),
+            extra=board.command_variables(interface.commands),
         )
         self.dps = dps
         self._copiers: dict[int, StateCopier] = {}
@@ -137,18 +131,13 @@ class WorldAlone(AddressedDiagram):
         for signal in parts.interface.act:
             parts.diagram_builder.ExportInput(parts.actuators[signal.name], f"act.{signal.name}")
         diagram = parts.build_diagram("world_alone")
-        roles = parts.plant_roles()
-        clock = Variable("time", X, (), "s", lambda context: context.get_time())
         super().__init__(
             diagram=diagram,
             interface=parts.interface,
             simulator_config=own.simulator_config,
             scenario=own,
-            variables=collect(
-                diagram,
-                plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
-                extra=[clock, *parts.extra_variables],
-            ),
+            extra=parts.extra_variables,
+            plant_roles=parts.plant_roles(),
         )
         self.plant = parts.plant
         self.beliefs = tuple(parts.beliefs)

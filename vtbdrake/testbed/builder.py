@@ -235,8 +235,7 @@ class VirtualTestbedBuilder:
             raise SignalError("the testbed has no DPS: call set_dps")
         self.finish_world()
         sense_position, act_position = MODES[mode]
-        defaults = {s.name: s.vector(0.0 if s.default is None else s.default) for s in self.interface.commands}
-        u = {name: value for name, value in defaults.items() if name not in self._commands}
+        u = {s.name: s.default_vector() for s in self.interface.commands if s.name not in self._commands}
         switches = Switches(self.diagram_builder, self.interface, sense_position, act_position, self._dps, u)
         self._connect_switches(switches, self._dps)
         commands = tuple(switches.command_variables(self.interface.commands))
@@ -249,21 +248,9 @@ class VirtualTestbedBuilder:
 
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.diagram_builder, self.scene_graph, meshcat, parameters)
-        diagram = self.build_diagram("vtb")
+        self.extra_variables[:0] = commands
         return VirtualTestbed(
-            diagram=diagram,
-            interface=self.interface,
-            dps=self._dps,
-            plant=self.plant,
-            scene_graph=self.scene_graph,
-            sense=switches.sense,
-            act=switches.act,
-            simulator_config=self.simulator_config,
-            scenario=scenario,
-            beliefs=tuple(self.beliefs),
-            extra_variables=commands + tuple(self.extra_variables),
-            plant_roles=self.plant_roles(),
-            visualized=meshcat is not None,
+            self, self._dps, switches, self.build_diagram("vtb"), scenario=scenario, visualized=meshcat is not None
         )
 
     def build_diagram(self, name: str) -> Diagram:

@@ -118,6 +118,10 @@ class Signal:
         assert self.size is not None
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), (self.size,)))
 
+    def default_vector(self) -> np.ndarray:
+        """Return the default of a command as an array of shape (size,)."""
+        return self.vector(0.0 if self.default is None else self.default)
+
     def abstract_value(self) -> AbstractValue:
         """Return a new container of the signal's abstract type."""
         return Value(self.model_value)

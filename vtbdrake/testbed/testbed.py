@@ -9,21 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables, collect
+from vtbdrake.state import Snapshot, SnapshotError, Variables
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.state.variables import X
 from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.testbed.signal import Interface
-from vtbdrake.testbed.switch import ACT_POSITIONS, BOARD, REAL, SENSE_POSITIONS, SIM, T_ACT, T_SENSE, TWIN, Selector
+from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, T_SENSE, TWIN, Selector
 
 if TYPE_CHECKING:
-    from pydrake.geometry import SceneGraph
-    from pydrake.multibody.plant import MultibodyPlant
-
+    from vtbdrake.testbed.builder import VirtualTestbedBuilder
     from vtbdrake.testbed.scenario import Scenario
+    from vtbdrake.testbed.switch import Switches
 
 
 @dataclass(frozen=True)
@@ -101,46 +97,32 @@ class VirtualTestbed(AddressedDiagram):
 
     def __init__(
         self,
-        *,
-        diagram: Diagram,
-        interface: Interface,
+        parts: VirtualTestbedBuilder,
         dps: System,
-        plant: MultibodyPlant | None,
-        scene_graph: SceneGraph | None,
-        sense: Mapping[str, Selector],
-        act: Mapping[str, Selector],
-        simulator_config: SimulatorConfig,
+        switches: Switches,
+        diagram: Diagram,
+        *,
         scenario: Scenario | None,
-        beliefs: tuple[Belief, ...],
-        extra_variables: tuple[Variable, ...],
-        plant_roles: Mapping[str, str],
         visualized: bool,
     ) -> None:
+        """Take over what `VirtualTestbedBuilder.build` has made of its parts."""
+        self._sense, self._act = switches.sense, switches.act
+        selectors = [*self._sense.values(), *self._act.values()]
         super().__init__(
             diagram=diagram,
-            interface=interface,
-            simulator_config=simulator_config,
+            interface=parts.interface,
+            simulator_config=parts.simulator_config,
             scenario=scenario,
-            variables=collect(
-                diagram,
-                plant_prefix=lambda path, instance: f"sim.{plant_roles[instance]}" if path == "plant" else path,
-                skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
-                extra=[
-                    Variable("time", X, (), "s", lambda context: context.get_time()),
-                    *(selector.variable() for selector in [*sense.values(), *act.values()]),
-                    *extra_variables,
-                ],
-            ),
+            extra=[*(selector.variable() for selector in selectors), *parts.extra_variables],
+            plant_roles=parts.plant_roles(),
         )
         self.dps = dps
-        self.plant = plant
-        self.scene_graph = scene_graph
+        self.plant = parts.plant
+        self.scene_graph = parts.scene_graph
         self.visualized = visualized
-        self._signals = {signal.name: signal for signal in interface.sense}
-        self._sense = dict(sense)
-        self._act = dict(act)
-        self._beliefs = beliefs
-        for belief in beliefs:
+        self._signals = {signal.name: signal for signal in parts.interface.sense}
+        self._beliefs = tuple(parts.beliefs)
+        for belief in self._beliefs:
             belief.check(self._variables)
 
     def _repr_html_(self) -> str:
