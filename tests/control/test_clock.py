@@ -39,7 +39,7 @@ def test_wall_clock_sleeps_while_it_waits() -> None:
     assert time.thread_time() - used < 0.1
 
 
-def test_wall_clock_polls_for_the_rest_if_it_is_to_spin() -> None:
+def test_wall_clock_polls_while_it_spins() -> None:
     clock = WallClock(spin=0.2)
     used = time.thread_time()
     deadline = clock.now() + 0.2
@@ -48,7 +48,7 @@ def test_wall_clock_polls_for_the_rest_if_it_is_to_spin() -> None:
     assert polled > 1e-3
 
 
-def test_what_is_to_be_done_meanwhile_is_done_before_the_clock_is_polled() -> None:
+def test_meanwhile_is_called_before_polling() -> None:
     clock = WallClock(spin=0.1)
 
     def left() -> float:
@@ -66,11 +66,11 @@ def test_what_is_to_be_done_meanwhile_is_done_before_the_clock_is_polled() -> No
     ("clock", "time_left"),
     [(WallClock(), 0.01), (WallClock(spin=0.5), 0.1), (WallClock(), -1.0), (SimulatedClock(), 1.0)],
 )
-def test_nothing_is_done_meanwhile_where_there_is_no_time(clock: WallClock | SimulatedClock, time_left: float) -> None:
+def test_meanwhile_is_skipped_without_time(clock: WallClock | SimulatedClock, time_left: float) -> None:
     clock.wait_until(clock.now() + time_left, lambda: pytest.fail("it was done"))
 
 
-def test_deadline_that_has_passed_is_not_waited_for() -> None:
+def test_past_deadline_returns_at_once() -> None:
     clock = WallClock()
     assert clock.wait_until(clock.now() - 1e6) <= clock.now()
 
@@ -87,7 +87,7 @@ def test_other_threads_run_while_the_wall_clock_waits() -> None:
     assert done and done[0] < deadline
 
 
-def test_signal_handler_runs_and_the_wait_goes_on() -> None:
+def test_wait_continues_after_a_signal_handler() -> None:
     clock, handled = WallClock(), []
     before = signal.signal(signal.SIGALRM, lambda *_: handled.append(clock.now()))
     try:
@@ -125,18 +125,18 @@ def test_ctrl_c_ends_the_wait() -> None:
 
 @pytest.mark.parametrize("clock", [WallClock(), SimulatedClock()])
 @pytest.mark.parametrize("t", [nan, inf])
-def test_only_finite_times_can_be_waited_for(clock: Clock, t: float) -> None:
+def test_deadline_must_be_finite(clock: Clock, t: float) -> None:
     with pytest.raises(ValueError, match="finite"):
         clock.wait_until(t)
 
 
 @pytest.mark.parametrize("spin", [-1e-6, 1.0, nan])
-def test_spin_is_a_part_of_a_cycle(spin: float) -> None:
+def test_spin_must_be_below_one_second(spin: float) -> None:
     with pytest.raises(ValueError, match="spin"):
         WallClock(spin=spin)
 
 
-def test_simulated_clock_is_at_once_where_it_is_to_be() -> None:
+def test_simulated_clock_jumps_to_the_deadline() -> None:
     clock = SimulatedClock(start=2.0)
     assert clock.now() == 2.0
     assert clock.wait_until(3.5) == 3.5 == clock.now()
@@ -147,24 +147,24 @@ def test_simulated_clock_never_runs_backwards() -> None:
     assert clock.wait_until(1.0) == 2.0
 
 
-def test_simulated_clock_is_late_by_script() -> None:
+def test_simulated_clock_is_late_by_list() -> None:
     clock = SimulatedClock(lateness=[0.25, 0.0, 0.5])
     assert [clock.wait_until(float(t)) for t in (1, 2, 3, 4)] == [1.25, 2.0, 3.5, 4.0]
 
 
-def test_simulated_clock_is_late_by_a_function_of_the_call() -> None:
+def test_simulated_clock_is_late_by_function() -> None:
     clock = SimulatedClock(lateness=lambda call: 0.125 * call)
     assert [clock.wait_until(float(t)) for t in (1, 2, 3)] == [1.0, 2.125, 3.25]
 
 
-def test_work_takes_simulated_time() -> None:
+def test_advance_adds_simulated_time() -> None:
     clock = SimulatedClock()
     clock.advance(0.75)
     assert clock.wait_until(0.5) == 0.75
 
 
 @pytest.mark.parametrize("seconds", [-1.0, nan, inf])
-def test_simulated_time_runs_forwards(seconds: float) -> None:
+def test_simulated_time_cannot_run_backwards(seconds: float) -> None:
     with pytest.raises(ValueError, match="from 0 on"):
         SimulatedClock().advance(seconds)
 

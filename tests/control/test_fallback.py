@@ -59,22 +59,22 @@ def test_silence_commands_nothing() -> None:
 @pytest.mark.parametrize(
     ("unit", "fallback"), [("rad", Hold), ("m", Hold), ("rad/s", Zero), ("N m", Zero), ("N", Zero), ("A", Zero)]
 )
-def test_unit_tells_the_fallback(unit: str, fallback: type[Fallback]) -> None:
+def test_default_fallback_follows_from_the_unit(unit: str, fallback: type[Fallback]) -> None:
     assert type(default_fallback(Signal("a", size=1, unit=unit))) is fallback
 
 
-def test_unit_that_does_not_tell_asks_for_a_fallback() -> None:
+def test_unknown_unit_has_no_default_fallback() -> None:
     with pytest.raises(ValueError, match=r"'1' of actuator signal gripper .* fallback=\{'gripper': Hold\(\)\}"):
         default_fallback(Signal("gripper", size=1))
 
 
-def test_chain_is_what_takes_over_in_turn() -> None:
+def test_chain_contains_replacements_in_order() -> None:
     brake = Brake("joint_state", gain=1.0, entries=slice(2, 4))
     controller = FallbackController(lambda *_: None, otherwise=brake)
     assert [type(f) for f in chain(controller, TORQUE, interface=INTERFACE)] == [FallbackController, Brake, Zero]
 
 
-def test_chain_that_bites_its_tail_ends() -> None:
+def test_cyclic_chain_ends() -> None:
     controller = FallbackController(lambda *_: None, otherwise=Hold())
     controller.otherwise = controller
     assert chain(controller, TORQUE, interface=INTERFACE) == [controller]
@@ -89,17 +89,17 @@ def test_chain_that_bites_its_tail_ends() -> None:
         Brake("joint_state", gain=[1.0, 2.0, 3.0], entries=slice(2, 4)),
     ],
 )
-def test_brake_that_does_not_fit_is_refused(brake: Brake) -> None:
+def test_brake_that_does_not_fit_is_rejected(brake: Brake) -> None:
     with pytest.raises(ValueError, match="the brake of joint_torque"):
         chain(brake, TORQUE, interface=INTERFACE)
 
 
-def test_abstract_signal_has_no_zero_whoever_takes_over() -> None:
+def test_abstract_signal_has_no_zero() -> None:
     with pytest.raises(ValueError, match="no zero"):
         chain(FallbackController(lambda *_: "off", otherwise=Zero()), LAMP, interface=INTERFACE)
 
 
 @pytest.mark.parametrize("gain", [-1.0, [1.0, -2.0], float("nan")])
-def test_brake_that_would_accelerate_is_refused(gain: object) -> None:
+def test_brake_with_negative_gain_is_rejected(gain: object) -> None:
     with pytest.raises(ValueError, match="accelerate"):
         Brake("joint_state", gain=gain)

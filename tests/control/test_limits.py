@@ -59,7 +59,7 @@ entry = st.one_of(st.floats(-5.0, 5.0), st.floats(allow_nan=False, allow_infinit
     start=st.floats(-1.0, 1.0),
     commands=st.lists(st.tuples(entry, st.integers(1, 30)), min_size=1, max_size=20),
 )
-def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
+def test_sent_commands_keep_all_limits(
     rate: float,
     acceleration: float,
     lower: float,
@@ -89,7 +89,7 @@ def test_whatever_is_commanded_what_is_sent_keeps_all_limits(
     upper=st.floats(0.01, 0.5),
     waits=st.integers(0, 60),
 )
-def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int) -> None:
+def test_steps_are_the_longest_allowed(acceleration: float, upper: float, waits: int) -> None:
     a, rate = acceleration * T**2, 5.0
     one = limiter(rate=rate, acceleration=acceleration, upper=upper)
     position, step = 0.0, 0.0
@@ -102,9 +102,7 @@ def test_no_allowed_step_is_longer(acceleration: float, upper: float, waits: int
 
 @settings(max_examples=30)
 @given(acceleration=st.floats(100.0, 1e4), upper=st.floats(0.01, 0.2), excess=st.floats(1e-6, 0.02))
-def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
-    acceleration: float, upper: float, excess: float
-) -> None:
+def test_command_that_cannot_stop_is_reduced(acceleration: float, upper: float, excess: float) -> None:
     a, rate = acceleration * T**2, 5.0
     one = limiter(rate=rate, acceleration=acceleration, upper=upper)
     position, step = 0.0, 0.0
@@ -115,13 +113,13 @@ def test_command_that_could_hardly_not_stop_is_cut_to_one_that_can(
         position, step = sent, sent - position
 
 
-def test_command_at_the_last_place_to_stop_passes_without_rounding() -> None:
+def test_command_at_the_limit_passes_without_rounding() -> None:
     one = limiter(-1.0, acceleration=1.0 / T**2, upper=0.0)
     assert one.limit([-1e-300]).item() == -1e-300
 
 
 @given(st.lists(st.floats(-0.999, 0.999), min_size=1, max_size=60))
-def test_sequence_that_can_go_on_for_ever_passes_unchanged(shares: list[float]) -> None:
+def test_sequence_that_can_continue_passes_unchanged(shares: list[float]) -> None:
     rate, acceleration, bound = 0.5, 20.0, 0.002
     a = acceleration * T**2
     one = limiter(rate=rate, acceleration=acceleration, lower=-bound, upper=bound)
@@ -173,13 +171,13 @@ def test_hold_after_motion_brakes_at_the_limit_of_acceleration() -> None:
     assert steps == pytest.approx(expected, abs=1e-9)
 
 
-def test_entries_have_limits_of_their_own() -> None:
+def test_every_entry_has_its_own_limits() -> None:
     one = RateLimiter(signal(3, rate=[1.0, 2.0, inf], lower=-1.0, upper=[1.0, 1.0, 0.5]), period=T)
     one.start_from([0.0, 0.5, 0.0])
     assert one.limit([1.0, -1.0, 2.0]).tolist() == [1e-3, 0.5 - 2e-3, 0.5]
 
 
-def test_counts_tell_how_often_and_by_how_much_each_limit_acted() -> None:
+def test_counts_contain_number_and_size_of_changes() -> None:
     one = limiter(rate=1.0, upper=0.0015)
     one.limit([0.0005])
     one.limit([0.1])
@@ -189,14 +187,14 @@ def test_counts_tell_how_often_and_by_how_much_each_limit_acted() -> None:
     assert one.counts["range"].largest == pytest.approx(0.2 - 0.0015)
 
 
-def test_limit_of_acceleration_counts() -> None:
+def test_acceleration_limit_is_counted() -> None:
     one = limiter(acceleration=10.0)
     one.limit([1.0])
     assert one.counts["acceleration"].changed == 1
     assert one.counts["acceleration"].largest == pytest.approx(1.0 - 1e-5)
 
 
-def test_rounding_of_a_command_at_its_limit_does_not_count() -> None:
+def test_rounding_at_a_limit_is_not_counted() -> None:
     one = limiter(rate=0.7)
     for k in range(1, 1000):
         command = 0.7 * k * T
@@ -204,7 +202,7 @@ def test_rounding_of_a_command_at_its_limit_does_not_count() -> None:
     assert one.counts["rate"].changed == 0
 
 
-def test_start_is_left_at_rest_whatever_the_motion_before() -> None:
+def test_commands_depart_from_start_at_rest() -> None:
     one = limiter(acceleration=10.0)
     for _ in range(100):
         one.limit([1.0])
@@ -213,7 +211,7 @@ def test_start_is_left_at_rest_whatever_the_motion_before() -> None:
 
 
 @pytest.mark.parametrize(("limits"), [{"rate": 1.0}, {"acceleration": 1.0}])
-def test_limited_rate_without_a_start_is_a_fault(limits: dict[str, float]) -> None:
+def test_rate_limit_without_start_is_an_error(limits: dict[str, float]) -> None:
     one = limiter(None, **limits)
     assert one.needs_start and not one.has_start
     with pytest.raises(ActuationError, match="nothing to depart from") as caught:
@@ -226,14 +224,14 @@ def test_range_alone_needs_no_start() -> None:
     assert [one.limit([c]).item() for c in (3.0, -0.5, -2.0)] == [1.0, -0.5, -1.0]
 
 
-def test_released_guard_forgets_what_was_sent() -> None:
+def test_released_limiter_forgets_last_command() -> None:
     one = limiter(rate=1.0)
     one.release()
     assert one.last_sent is None and not one.has_start
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
-def test_entry_that_is_not_finite_is_a_fault_and_changes_nothing(bad: float) -> None:
+def test_non_finite_entry_is_an_error_and_changes_nothing(bad: float) -> None:
     one = RateLimiter(signal(2, rate=1.0), period=T)
     one.start_from([0.0, 0.0])
     with pytest.raises(ActuationError, match="not finite") as caught:
@@ -250,7 +248,7 @@ def test_large_finite_entries_are_finite() -> None:
 @pytest.mark.parametrize(
     "bad", [[0.0], [0.0, 0.0, 0.0], 0.0, [[0.0, 0.0]], None, "ab", [0.0, "x"], [[0.0], [1.0, 2.0]]]
 )
-def test_command_of_another_size_is_a_fault(bad: object) -> None:
+def test_command_of_another_size_is_an_error(bad: object) -> None:
     one = RateLimiter(signal(2), period=T)
     with pytest.raises(ActuationError) as caught:
         one.limit(bad)
@@ -263,12 +261,12 @@ def test_period_must_be_positive(period: float) -> None:
         RateLimiter(signal(), period=period)
 
 
-def test_limits_that_leave_no_step_are_refused() -> None:
+def test_limits_without_any_step_are_rejected() -> None:
     with pytest.raises(ValueError, match="leave no step"):
         RateLimiter(signal(acceleration=1e-300), period=T)
 
 
-def test_abstract_signal_has_no_limits_but_remembers() -> None:
+def test_abstract_signal_is_remembered_without_limits() -> None:
     picture = Signal("lamp", model_value="off", idle="off")
     with pytest.raises(ValueError, match="abstract"):
         RateLimiter(picture, period=T)
@@ -311,7 +309,7 @@ def test_bounds_agree_with_numpy(lower: list[float], entries: list[float], upper
         (None, "size"),
     ],
 )
-def test_values_that_are_not_plain_arrays_are_converted_first(value: Any, problem: str) -> None:
+def test_bounds_convert_other_arrays(value: Any, problem: str) -> None:
     assert Bounds(Signal("a", size=2, lower=-1.0, upper=1.0)).check(value) == problem
 
 

@@ -218,7 +218,7 @@ def commands_in_lock_step(hub: Hub, *faults: InjectedFault, cycles: int = 100) -
 # -- nothing is wrong
 
 
-def test_testbed_and_dps_alone_command_the_same(hub: Hub) -> None:
+def test_testbed_and_dps_alone_send_the_same_bytes(hub: Hub) -> None:
     commanded, _ = commands_in_lock_step(hub)
     with Loop(hub, lock_step=True, alone=False) as loop:
         loop.sense()
@@ -230,7 +230,7 @@ def test_testbed_and_dps_alone_command_the_same(hub: Hub) -> None:
     assert np.ptp(commanded) > 0.1
 
 
-def test_not_a_byte_is_commanded_while_the_actuator_is_on_sim(hub: Hub) -> None:
+def test_nothing_is_sent_while_actuator_is_on_sim(hub: Hub) -> None:
     with Loop(hub, alone=False) as loop:
         loop.sense()
         loop.runtime.run(cycles=100)
@@ -268,9 +268,7 @@ def test_duplicates_change_nothing(hub: Hub) -> None:
     ],
     ids=lambda value: value.name if isinstance(value, InjectedFault) else "",
 )
-def test_machine_that_tells_nothing_new_is_stopped_until_reset(
-    hub: Hub, fault: InjectedFault, rejection: str | None
-) -> None:
+def test_frozen_machine_is_stopped_until_reset(hub: Hub, fault: InjectedFault, rejection: str | None) -> None:
     with Loop(hub, max_age=SHORT) as loop:
         loop.begin()
         loop.machine.begin(fault)
@@ -285,7 +283,7 @@ def test_machine_that_tells_nothing_new_is_stopped_until_reset(
         loop.assert_within_limits()
 
 
-def test_delayed_messages_are_as_good_as_the_guards_say(hub: Hub) -> None:
+def test_delayed_messages_are_used_up_to_max_delay(hub: Hub) -> None:
     """Where signals may grow so old, the loop goes on."""
     with Loop(hub) as loop:
         loop.begin()
@@ -296,7 +294,7 @@ def test_delayed_messages_are_as_good_as_the_guards_say(hub: Hub) -> None:
         loop.assert_within_limits()
 
 
-def test_late_messages_are_left_out(hub: Hub) -> None:
+def test_late_messages_are_rejected(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
         loop.machine.begin(Reorder())
@@ -307,7 +305,7 @@ def test_late_messages_are_left_out(hub: Hub) -> None:
 
 
 @pytest.mark.parametrize("seconds", [3600.0, -3600.0])
-def test_new_time_of_the_sender_is_believed(hub: Hub, seconds: float) -> None:
+def test_new_time_of_the_sender_is_accepted(hub: Hub, seconds: float) -> None:
     with Loop(hub) as loop:
         loop.begin()
         position = loop.bridge.sensed["position"]
@@ -320,7 +318,7 @@ def test_new_time_of_the_sender_is_believed(hub: Hub, seconds: float) -> None:
         assert loop.bridge.clock_jumps["IIWA_STATUS"] == 1
 
 
-def test_damaged_messages_among_good_ones_do_not_matter(hub: Hub) -> None:
+def test_damaged_messages_are_rejected(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
         loop.machine.begin(Corrupt(kind="truncate", fraction=0.5))
@@ -333,7 +331,7 @@ def test_damaged_messages_among_good_ones_do_not_matter(hub: Hub) -> None:
 # -- processes that end
 
 
-def test_killed_machine_stops_the_dps_and_may_come_back(hub: Hub) -> None:
+def test_killed_machine_stops_the_dps_and_may_return(hub: Hub) -> None:
     with Loop(hub, max_age=SHORT) as loop:
         loop.begin()
         loop.machine.kill()
@@ -350,7 +348,7 @@ def test_killed_machine_stops_the_dps_and_may_come_back(hub: Hub) -> None:
         loop.assert_within_limits()
 
 
-def test_killed_hub_is_noticed_and_its_successor_found() -> None:
+def test_loop_reconnects_after_the_hub_was_killed() -> None:
     with Hub(port=0, protect=[COMMAND]) as first:
         port = int(first.url.rpartition(":")[2])
         with Loop(first, max_age=SHORT) as loop:
@@ -384,7 +382,7 @@ loop.runtime.run()
 
 
 @pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL])
-def test_machine_brakes_by_itself_when_the_controller_is_gone(hub: Hub, end: int) -> None:
+def test_machine_brakes_when_the_controller_is_gone(hub: Hub, end: int) -> None:
     with MachineProcess(LoopScenario(), hub.url) as machine:
         command = [sys.executable, "-c", CONTROLLER.format(url=hub.url)]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as controller:
@@ -402,7 +400,7 @@ def test_machine_brakes_by_itself_when_the_controller_is_gone(hub: Hub, end: int
                 controller.kill()
 
 
-def test_interrupted_controller_says_stop_before_it_goes(hub: Hub) -> None:
+def test_interrupted_controller_sends_the_fallback(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
         with pytest.raises(KeyboardInterrupt):
@@ -414,7 +412,7 @@ def test_interrupted_controller_says_stop_before_it_goes(hub: Hub) -> None:
 # -- others
 
 
-def test_second_publisher_is_refused_and_reported(hub: Hub) -> None:
+def test_second_publisher_is_rejected_and_reported(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
         before = hub.statistics().protected[COMMAND]
@@ -433,7 +431,7 @@ def test_second_publisher_is_refused_and_reported(hub: Hub) -> None:
 
 
 @pytest.mark.parametrize(("trouble", "reason"), [(1.0, "out of ideas"), (2.0, "not finite")])
-def test_dps_in_trouble_is_replaced_at_once(hub: Hub, trouble: float, reason: str) -> None:
+def test_failing_dps_is_replaced_at_once(hub: Hub, trouble: float, reason: str) -> None:
     with Loop(hub, lock_step=True) as loop:
         loop.sense()
         loop.runtime.switch("real")

@@ -72,7 +72,7 @@ as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give up ri
 
 
 @privileged
-def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
+def test_settings_hold_inside_and_are_restored() -> None:
     states = told(
         "before = state()\n"
         "with RealTime(priority=42, cpus={before['cpus'][0]}, awake=False) as r: inside = state()\n"
@@ -89,7 +89,7 @@ def test_all_that_is_granted_holds_inside_and_is_given_back() -> None:
 
 
 @pytest.mark.skipif(not os.access(LATENCY, os.W_OK), reason=f"needs {LATENCY}")
-def test_processors_are_kept_awake_inside_only() -> None:
+def test_processors_stay_awake_inside_only() -> None:
     # Others may keep them awake at the same time: what counts is who holds the file.
     seen = told(
         f"def held(): return any(os.path.realpath(fd.path) == '{LATENCY}' for fd in os.scandir('/proc/self/fd'))\n"
@@ -102,7 +102,7 @@ def test_processors_are_kept_awake_inside_only() -> None:
 
 
 @privileged
-def test_all_is_given_back_after_an_exception() -> None:
+def test_settings_are_restored_after_an_exception() -> None:
     states = told(
         "before = state()\n"
         "try:\n"
@@ -115,7 +115,7 @@ def test_all_is_given_back_after_an_exception() -> None:
 
 
 @privileged
-def test_threads_that_are_started_inside_do_not_inherit_the_priority() -> None:
+def test_threads_do_not_inherit_the_priority() -> None:
     policies = told(
         "import threading\n"
         "found = []\n"
@@ -128,7 +128,7 @@ def test_threads_that_are_started_inside_do_not_inherit_the_priority() -> None:
 
 
 @privileged
-def test_what_was_set_before_stays_set_after_an_inner_one() -> None:
+def test_nested_settings_restore_outer_ones() -> None:
     states = told(
         "with RealTime(priority=10):\n"
         "    before = state()\n"
@@ -169,7 +169,7 @@ runtime.switch("real")
 
 
 @privileged
-def test_step_in_python_that_never_ends_is_ended_and_the_fallback_goes_out() -> None:
+def test_endless_python_step_is_ended_and_fallback_sent() -> None:
     found = told(
         RUNAWAY.replace("END", "while True: pass") + "before = state()\n"
         "try:\n"
@@ -186,7 +186,7 @@ def test_step_in_python_that_never_ends_is_ended_and_the_fallback_goes_out() -> 
 
 @privileged
 @pytest.mark.parametrize("main", [True, False])
-def test_step_in_native_code_that_never_ends_is_told_and_ended_with_its_process(main: bool) -> None:
+def test_endless_native_step_ends_the_process(main: bool) -> None:
     run = "    with RealTime(longest_step=0.2, awake=False) as r: runtime.run(cycles=1000)\n"
     code = "import threading\ndef work():\n" + run + ("work()" if main else "threading.Thread(target=work).start()")
     native = RUNAWAY.replace("END", "collections.deque(itertools.repeat(0), maxlen=0)")
@@ -199,7 +199,7 @@ def test_step_in_native_code_that_never_ends_is_told_and_ended_with_its_process(
 
 
 @privileged
-def test_limit_that_is_there_already_is_refused_or_kept_and_others_come_back() -> None:
+def test_existing_rttime_limit_is_respected() -> None:
     states = told(
         "resource.setrlimit(resource.RLIMIT_RTTIME, (3_000_000, 4_000_000))\n"
         "before = state()\n"
@@ -213,7 +213,7 @@ def test_limit_that_is_there_already_is_refused_or_kept_and_others_come_back() -
 
 
 @as_root
-def test_without_rights_the_refusals_tell_reason_and_remedy_and_the_rest_is_granted() -> None:
+def test_refusals_contain_reason_and_remedy() -> None:
     states = told(
         "drop_rights()\n"
         "before = state()\n"
@@ -235,7 +235,7 @@ def test_without_rights_the_refusals_tell_reason_and_remedy_and_the_rest_is_gran
 
 
 @as_root
-def test_refusal_of_what_is_required_is_an_error_and_changes_nothing() -> None:
+def test_required_setting_that_is_refused_is_an_error() -> None:
     states = told(
         "drop_rights()\n"
         "before = state()\n"
@@ -249,7 +249,7 @@ def test_refusal_of_what_is_required_is_an_error_and_changes_nothing() -> None:
 
 
 @privileged
-def test_rights_that_were_given_up_inside_do_not_keep_it_from_being_left() -> None:
+def test_lost_privileges_do_not_prevent_exit() -> None:
     states = told(
         "before = state()\n"
         "with RealTime() as r:\n"
@@ -262,7 +262,7 @@ def test_rights_that_were_given_up_inside_do_not_keep_it_from_being_left() -> No
     assert states["after"] == {**states["before"], "policy": os.SCHED_OTHER | os.SCHED_RESET_ON_FORK}
 
 
-def test_processors_that_may_not_be_used_are_refused() -> None:
+def test_unavailable_processors_are_refused() -> None:
     there = sorted(os.sched_getaffinity(0))
     states = told(
         f"with RealTime(priority=None, lock_memory=False, cpus={{{there[0]}, 4095}}) as r: inside = state()\n"
@@ -272,7 +272,7 @@ def test_processors_that_may_not_be_used_are_refused() -> None:
     assert states["line"].startswith(f"processors [{there[0]}, 4095]: refused (EINVAL, only {there} may be used): ")
 
 
-def test_what_is_not_asked_for_is_left_alone() -> None:
+def test_unrequested_settings_stay_unchanged() -> None:
     states = told(
         "before = state()\n"
         "only = RealTime(priority=None, lock_memory=False, awake=False, collect_garbage=True, switch_interval=None)\n"
@@ -293,6 +293,6 @@ def test_what_is_not_asked_for_is_left_alone() -> None:
         ({"longest_step": 0.0}, "above 0 and below 1000 s, not at 0.0 s"),
     ],
 )
-def test_request_that_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RealTime(**options)

@@ -44,7 +44,7 @@ def sent(bridge):
     return np.array([commands["velocity"] for _, commands in bridge.sent])
 
 
-def test_on_sim_nothing_is_sent_and_the_world_is_driven():
+def test_on_sim_only_the_world_gets_commands():
     runtime, bridge, _ = make()
     runtime.run(cycles=2000)
     assert bridge.sent == []
@@ -54,7 +54,7 @@ def test_on_sim_nothing_is_sent_and_the_world_is_driven():
 
 
 @pytest.mark.parametrize("start", [0.0, 0.5, 2501 * PERIOD, 7.7])
-def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
+def test_every_cycle_contains_one_update(start):
     dps = DpsAlone(ServoScenario())
     context = dps.default_context()
     context.SetTime(start)
@@ -67,7 +67,7 @@ def test_every_cycle_has_one_update_wherever_the_dps_continues(start):
     assert runtime.time == pytest.approx(start + 3.0, abs=1e-12)
 
 
-def test_what_has_come_by_shortly_before_a_cycle_is_taken_in_before_it():
+def test_messages_are_received_shortly_before_the_deadline():
     class Early(SimulatedClock):
         def wait_until(self, t, meanwhile=None):
             if meanwhile is not None:
@@ -83,7 +83,7 @@ def test_what_has_come_by_shortly_before_a_cycle_is_taken_in_before_it():
 
 
 @pytest.mark.parametrize("alone", [False, True])
-def test_the_machine_gets_what_the_dps_commands(alone):
+def test_machine_gets_the_commands_of_the_dps(alone):
     runtime, bridge, _ = switched(alone=alone, rate=0.0)
     runtime.run(cycles=10)
     expected = 5.0 * (TARGET - [0.05, 0.0])
@@ -91,7 +91,7 @@ def test_the_machine_gets_what_the_dps_commands(alone):
     assert runtime.guards.latched == ()
 
 
-def test_the_whole_testbed_and_the_dps_alone_send_the_same():
+def test_testbed_and_dps_alone_send_the_same():
     def moving(t):
         return {**still(t), "position": [0.1 * np.sin(30.0 * t), 0.05 * np.cos(17.0 * t)]}
 
@@ -101,7 +101,7 @@ def test_the_whole_testbed_and_the_dps_alone_send_the_same():
     assert np.array_equal(sent(a), sent(b)) and len(sent(a)) == 300
 
 
-def test_in_shadow_the_dps_listens_and_nothing_is_sent():
+def test_shadow_mode_sends_nothing():
     runtime, bridge, _ = make()
     runtime.cycle()
     runtime.switch("shadow")
@@ -110,7 +110,7 @@ def test_in_shadow_the_dps_listens_and_nothing_is_sent():
     assert np.array_equal(runtime.actuator_command("velocity"), 5.0 * (TARGET - [0.05, 0.0]))
 
 
-def test_in_twin_the_simulated_world_gets_the_command_too():
+def test_twin_mode_commands_the_simulated_world_too():
     runtime, bridge, _ = make(rate=0.0)
     runtime.cycle()
     before = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
@@ -122,7 +122,7 @@ def test_in_twin_the_simulated_world_gets_the_command_too():
     assert len(sent(bridge)) == 100
 
 
-def test_no_command_steps_by_more_than_its_rate_limit_at_any_switch():
+def test_commands_keep_the_rate_limit_at_every_switch():
     runtime, bridge, _ = switched(rate=2.0)
     runtime.run(cycles=700)
     steps = np.abs(np.diff(sent(bridge), axis=0, prepend=[[0.0, 0.0]]))
@@ -130,7 +130,7 @@ def test_no_command_steps_by_more_than_its_rate_limit_at_any_switch():
     assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
 
 
-def test_from_real_to_sim_the_world_starts_from_what_the_dps_believes():
+def test_world_starts_from_belief_after_switch_to_sim():
     runtime, bridge, _ = switched()
     runtime.run(cycles=5)
     runtime.switch("sim")
@@ -142,7 +142,7 @@ def test_from_real_to_sim_the_world_starts_from_what_the_dps_believes():
 
 
 @pytest.mark.parametrize("ways", [["real"], ["twin"], ["sim", "real"]])
-def test_a_command_that_goes_out_goes_on_wherever_its_switch_is_thrown_again(ways):
+def test_repeated_switch_does_not_interrupt_commands(ways):
     runtime, bridge, _ = switched(rate=2.0)
     runtime.run(cycles=300)
     for way in ways:
@@ -151,7 +151,7 @@ def test_a_command_that_goes_out_goes_on_wherever_its_switch_is_thrown_again(way
     assert np.abs(np.diff(sent(bridge), axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
 
 
-def test_a_sensor_that_goes_back_to_sim_finds_the_world_where_the_dps_believes_the_machine_to_be():
+def test_sensor_back_on_sim_sees_world_at_the_belief():
     runtime, _, _ = make()
     runtime.run(cycles=100)
     runtime.switch("shadow")
@@ -172,7 +172,7 @@ def test_dps_with_invalid_belief_can_be_switched_to_sim(caplog):
     assert "the belief cannot be set" in caplog.text
 
 
-def test_a_world_that_drives_already_is_left_alone():
+def test_running_world_is_not_reset_by_a_switch():
     runtime, _, _ = make()
     runtime.run(cycles=100)
     runtime.switch("shadow")
@@ -194,14 +194,14 @@ def refusal(runtime, mode="real"):
     return "; ".join(preparation.reasons)
 
 
-def test_a_switch_to_a_sensor_that_never_spoke_is_refused():
+def test_switch_to_sensor_without_messages_is_refused():
     runtime, _, _ = make(sensors=lambda t: {})
     runtime.cycle()
     assert "position" in refusal(runtime, "shadow")
 
 
 @pytest.mark.parametrize(("listens", "stale"), [("shadow", {"position", "speed"}), ("sim", {"speed"})])
-def test_commands_to_a_machine_that_has_fallen_silent_are_refused(listens, stale):
+def test_switch_to_silent_machine_is_refused(listens, stale):
     runtime, _, _ = make(sensors=lambda t: still(t) if t < 0.02 else {}, continuity={"velocity": ("speed", 5.0)})
     runtime.cycle()
     runtime.switch(listens)
@@ -220,14 +220,14 @@ def test_commands_to_a_machine_that_has_fallen_silent_are_refused(listens, stale
         ({"mode": "real", "act": "sim"}, "not both"),
     ],
 )
-def test_switches_that_there_are_not_are_refused_before_anything_changes(asked, message):
+def test_unknown_switches_are_rejected_without_change(asked, message):
     runtime, _, _ = make(continuity={"velocity": ("speed", 5.0)})
     runtime.cycle()
     with pytest.raises(ValueError, match=message):
         runtime.prepare(**asked)
 
 
-def test_a_switch_to_a_machine_out_of_reach_or_not_ready_is_refused():
+def test_switch_to_unconnected_or_unready_machine_is_refused():
     runtime, bridge, _ = make(rate=0.0, ready=lambda: "its brakes are closed")
     runtime.cycle()
     bridge.up = False
@@ -235,7 +235,7 @@ def test_a_switch_to_a_machine_out_of_reach_or_not_ready_is_refused():
     assert "the bridge is not connected" in reasons and "its brakes are closed" in reasons
 
 
-def test_a_switch_that_was_prepared_in_an_earlier_cycle_is_refused():
+def test_outdated_preparation_is_refused():
     runtime, _, _ = make(rate=0.0)
     runtime.cycle()
     preparation = runtime.prepare("real")
@@ -245,7 +245,7 @@ def test_a_switch_that_was_prepared_in_an_earlier_cycle_is_refused():
     assert runtime.active == ()
 
 
-def test_a_command_that_would_jump_is_refused():
+def test_discontinuous_command_is_refused():
     runtime, bridge, _ = make(continuity={"velocity": ("speed", 0.3)})
     runtime.cycle()
     runtime.switch("shadow")
@@ -258,7 +258,7 @@ def test_a_command_that_would_jump_is_refused():
     assert np.abs(sent(bridge)[0]).max() <= 2.0 * PERIOD * (1 + 1e-9), "it departs from what is measured"
 
 
-def test_a_rate_limit_without_a_measured_start_is_refused():
+def test_rate_limit_without_continuity_is_refused():
     runtime, _, _ = make()
     runtime.cycle()
     assert "give continuity={'velocity'" in refusal(runtime)
@@ -268,7 +268,7 @@ def test_a_rate_limit_without_a_measured_start_is_refused():
 
 
 @pytest.mark.parametrize(("trouble", "kind"), [(1.0, "out of ideas"), (2.0, "not finite")])
-def test_a_dps_that_raises_or_commands_nan_is_replaced_in_the_same_cycle(trouble, kind):
+def test_failing_dps_is_replaced_in_the_same_cycle(trouble, kind):
     runtime, bridge, _ = switched(rate=0.0)
     runtime.run(cycles=5)
     runtime.target.write(runtime.context, {"dps.trouble": trouble})
@@ -286,7 +286,7 @@ def test_a_dps_that_raises_or_commands_nan_is_replaced_in_the_same_cycle(trouble
     assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
 
 
-def test_a_machine_that_falls_silent_leads_to_the_fallback_within_its_age_and_a_cycle():
+def test_silent_machine_activates_fallback_within_max_age_and_a_cycle():
     silent_from = 0.1
 
     def sensors(t):
@@ -312,7 +312,7 @@ def test_a_machine_that_falls_silent_leads_to_the_fallback_within_its_age_and_a_
         (0.03, "stale", {"pace": "position", "patience": 60.0}),
     ],
 )
-def test_a_command_that_a_step_took_long_to_find_is_judged_by_the_age_that_its_samples_have_then(took, kind, options):
+def test_age_of_samples_is_checked_after_a_long_step(took, kind, options):
     runtime, bridge, clock = switched(rate=0.0, **options)
     runtime.run(cycles=5)
     step = runtime.step
@@ -328,7 +328,7 @@ def test_a_command_that_a_step_took_long_to_find_is_judged_by_the_age_that_its_s
     assert (np.linalg.norm(sent(bridge)[-1]) > 0.0) == (kind is None)
 
 
-def test_a_reset_is_refused_while_the_command_would_jump_as_at_a_switch():
+def test_reset_with_discontinuous_command_is_refused():
     runtime, bridge, _ = switched(rate=0.0, continuity={"velocity": ("speed", 1.2)})
     runtime.run(cycles=5)
     runtime.send_fallback("told")
@@ -344,7 +344,7 @@ def test_a_reset_is_refused_while_the_command_would_jump_as_at_a_switch():
     assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
 
 
-def test_a_missed_deadline_is_left_out_and_no_command_is_sent_twice():
+def test_missed_deadlines_are_left_out():
     # The fifth waking is 3.4 periods late.
     runtime, bridge, clock = switched(rate=0.0, lateness=[0.0] * 4 + [3.4 * PERIOD])
     begin = clock.now()
@@ -357,7 +357,7 @@ def test_a_missed_deadline_is_left_out_and_no_command_is_sent_twice():
     assert runtime.target.read(runtime.context, "dps.ticks") == 11.0
 
 
-def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
+def test_paced_loop_steps_once_per_message():
     runtime, bridge, clock = switched(rate=0.0, pace="position")
     before = bridge.sensed["position"].count
     runtime.run(cycles=30)
@@ -365,7 +365,7 @@ def test_a_loop_that_is_paced_by_messages_steps_once_for_each():
     assert bridge.sensed["position"].count >= before + 30
 
 
-def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
+def test_blocked_machine_is_not_commanded_until_reset():
     class Contended(ScriptedBridge):
         blocked_reason = None
 
@@ -387,7 +387,7 @@ def test_a_machine_that_somebody_else_commands_is_not_commanded_until_reset():
     assert runtime.guards.latched[0].kind == "not ready"
 
 
-def test_a_second_publisher_of_commands_is_an_alarm_and_blocks_the_switch_to_real_but_not_the_way_on(caplog):
+def test_second_publisher_is_an_alarm_and_blocks_only_switches(caplog):
     class Contended(ScriptedBridge):
         foreign, competing_publisher = 0, None
 
@@ -415,7 +415,7 @@ def test_a_second_publisher_of_commands_is_an_alarm_and_blocks_the_switch_to_rea
     assert "somebody else commands (heard so far: 1)" in record.message
 
 
-def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():
+def test_loop_that_overslept_sends_no_dps_command():
     runtime, bridge, _ = switched(rate=0.0, lateness=[0.0] * 4 + [50.4 * PERIOD])
     runtime.run(cycles=6)
     assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True] * 4 + [False] * 2
@@ -424,7 +424,7 @@ def test_a_loop_that_slept_for_long_sends_no_command_of_what_it_wakes_up_to():
 
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])
 @pytest.mark.parametrize("asleep", [False, True])
-def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cycles(held_up, missed, asleep):
+def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, asleep):
     runtime, bridge, clock = switched(rate=0.0, pace="position")
     # While it waits for a message, or while it works.
     held = "poll" if asleep else "publish"
@@ -444,7 +444,7 @@ def test_a_paced_loop_that_is_held_up_for_longer_than_its_patience_has_missed_cy
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), SystemExit("a failed assertion in Drake")])
-def test_a_watcher_that_raises_is_left_out_and_the_others_go_on(error):
+def test_watcher_that_raises_is_removed(error):
     seen = []
 
     def broken(cycle):
@@ -455,7 +455,7 @@ def test_a_watcher_that_raises_is_left_out_and_the_others_go_on(error):
     assert [cycle.number for cycle in seen] == [0, 1, 2, 3, 4]
 
 
-def test_requests_of_other_threads_are_served_between_cycles():
+def test_requests_of_other_threads_run_between_cycles():
     runtime, bridge, _ = switched(rate=0.0)
     futures = []
 
@@ -473,7 +473,7 @@ def test_requests_of_other_threads_are_served_between_cycles():
     assert sent(bridge)[-1] == pytest.approx(5.0 * np.array([-0.05, 0.0]))
 
 
-def test_a_request_that_fails_an_assertion_inside_drake_does_not_end_the_loop():
+def test_failed_drake_assertion_in_request_does_not_end_the_loop():
     runtime, _, _ = switched()
 
     def fail():
@@ -485,7 +485,7 @@ def test_a_request_that_fails_an_assertion_inside_drake_does_not_end_the_loop():
         future.result(timeout=1)
 
 
-def test_a_request_that_was_given_up_is_left_out():
+def test_cancelled_request_is_left_out():
     runtime, _, _ = switched()
     done = []
     given_up, served = (runtime.request(lambda name=name: done.append(name)) for name in ("given up", "served"))
@@ -494,7 +494,7 @@ def test_a_request_that_was_given_up_is_left_out():
     assert served.done() and done == ["served"]
 
 
-def test_after_an_outage_the_first_command_departs_from_what_the_machine_reports():
+def test_first_command_after_outage_departs_from_measurement():
     machine = {**still(0.0), "speed": [0.0, 0.0]}
     runtime, bridge, _ = switched(rate=2.0, sensors=lambda t: machine)
     runtime.run(cycles=100)
@@ -512,7 +512,7 @@ def test_after_an_outage_the_first_command_departs_from_what_the_machine_reports
     assert np.abs(np.diff(sent(bridge)[count:], axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
 
 
-def test_an_interruption_sends_the_fallback_once():
+def test_interruption_sends_the_fallback_once():
     runtime, bridge, _ = switched(rate=0.0)
 
     def interrupt():
@@ -525,7 +525,7 @@ def test_an_interruption_sends_the_fallback_once():
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 
 
-def test_an_interruption_that_pybind11_drops_ends_the_loop():
+def test_interruption_dropped_by_pybind11_ends_the_loop():
     runtime, bridge, _ = switched(rate=0.0)
 
     def watch(cycle):
@@ -559,14 +559,14 @@ def test_an_interruption_that_pybind11_drops_ends_the_loop():
         ),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(settings, message):
+def test_invalid_settings_are_rejected(settings, message):
     scenario = ServoScenario()
     clock = SimulatedClock()
     with pytest.raises(ValueError, match=message):
         Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)
 
 
-def test_a_time_that_is_no_number_is_not_waited_for():
+def test_nan_as_duration_is_rejected():
     runtime, _, _ = make()
     with pytest.raises(ValueError, match="a number of seconds, not for nan"):
         runtime.run(seconds=np.nan)
@@ -575,7 +575,7 @@ def test_a_time_that_is_no_number_is_not_waited_for():
     assert runtime.cycles == 0
 
 
-def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
+def test_cycle_records_changes_and_new_values():
     cycles = []
     runtime, _, _ = make(watchers=(cycles.append,), continuity={"velocity": ("speed", 5.0)})
     runtime.cycle()
@@ -594,7 +594,7 @@ def test_a_cycle_tells_what_changed_before_its_step_and_what_was_new():
     assert np.array_equal(cycles[0].fed["position"], [0.05, 0.0])
 
 
-def test_commands_u_that_come_by_the_bridge_reach_the_dps_and_those_that_the_dps_refuses_are_counted():
+def test_received_commands_reach_the_dps_or_are_counted():
     runtime, bridge, _ = make()
     bridge.commands["target"] = ReceivedSignal()
     runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
@@ -608,7 +608,7 @@ def test_commands_u_that_come_by_the_bridge_reach_the_dps_and_those_that_the_dps
 
 
 @pytest.mark.parametrize("address", ["T_act.velocity", "T_sense.speed", "time"])
-def test_switches_and_time_are_not_written(address):
+def test_switches_and_time_cannot_be_written(address):
     runtime, _, _ = make()
     with pytest.raises(ValueError, match="switch"):
         runtime.write({address: 1.0})

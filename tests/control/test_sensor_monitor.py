@@ -36,7 +36,7 @@ def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
     assert "never arrived" in str(fault)
 
 
-def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
+def test_signal_is_stale_beyond_max_age() -> None:
     monitor, sample = SensorMonitor(signal()), received(np.zeros(2), arrived=1.0)
     assert kind(monitor, 1.0499, sample) is None
     fault = monitor.check(1.0625, sample)
@@ -48,7 +48,7 @@ def test_signal_is_stale_beyond_its_maximum_age_until_the_next_sample() -> None:
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 @pytest.mark.parametrize("size", [2, 100])
 @pytest.mark.parametrize("place", [0, -1])
-def test_entry_that_is_not_finite_is_implausible_without_limits_too(bad: float, size: int, place: int) -> None:
+def test_non_finite_entry_is_implausible_without_limits(bad: float, size: int, place: int) -> None:
     value = np.zeros(size)
     value[place] = bad
     assert kind(SensorMonitor(signal(size)), 0.0, received(value)) == "implausible"
@@ -69,14 +69,14 @@ def test_sample_of_another_size_is_implausible(value: np.ndarray) -> None:
     assert kind(SensorMonitor(signal()), 0.0, received(value)) == "implausible"
 
 
-def test_implausible_sample_is_a_fault_until_the_next_one() -> None:
+def test_implausible_sample_is_a_fault_until_the_next() -> None:
     monitor, sample = SensorMonitor(signal(upper=1.0)), received(np.array([0.0, 2.0]))
     assert [kind(monitor, now, sample) for now in (0.0, 0.01)] == ["implausible"] * 2
     sample.value, sample.count = np.zeros(2), 2
     assert kind(monitor, 0.02, sample) is None
 
 
-def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
+def test_jump_is_measured_from_last_accepted_sample() -> None:
     monitor = SensorMonitor(signal(rate=[10.0, 1.0]), jump_tolerance=[0.0, 0.001])
     at = [
         received(np.array([0.0, 0.0]), 0.00, 1),
@@ -90,7 +90,7 @@ def test_jump_is_what_is_out_of_reach_of_the_last_accepted_sample() -> None:
     assert (monitor.value.tolist(), monitor.arrived) == ([-0.32, 0.0315], 0.08)
 
 
-def test_false_level_is_not_accepted_by_being_repeated() -> None:
+def test_repeated_false_level_is_not_accepted() -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     monitor.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 500):
@@ -99,7 +99,7 @@ def test_false_level_is_not_accepted_by_being_repeated() -> None:
     assert kind(monitor, 0.5, received(np.full(2, 0.02), 0.5, 500)) is None
 
 
-def test_samples_among_false_ones_are_accepted() -> None:
+def test_true_samples_among_false_ones_are_accepted() -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     samples = [received(np.full(2, 0.001 * k + (k % 3 == 1)), 0.001 * k, k + 1) for k in range(300)]
     found = [kind(monitor, r.arrived, r) for r in samples]
@@ -108,7 +108,7 @@ def test_samples_among_false_ones_are_accepted() -> None:
 
 
 @pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
-def test_level_jumped_to_can_be_accepted_once_it_is_steady(swing: float, accepted: bool) -> None:
+def test_steady_level_after_jump_can_be_accepted(swing: float, accepted: bool) -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
     monitor.check(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 100):
@@ -135,19 +135,19 @@ def test_jump_is_a_fault_until_the_next_sample() -> None:
     assert [kind(monitor, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
 
 
-def test_sample_that_is_not_new_is_no_jump() -> None:
+def test_old_sample_is_no_jump() -> None:
     monitor, sample = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0), received(np.zeros(2))
     for now in (0.0, 0.001, 0.002):
         assert kind(monitor, now, sample) is None
 
 
-def test_abstract_signal_is_watched_for_its_age_only() -> None:
+def test_only_age_of_abstract_signal_is_checked() -> None:
     monitor = SensorMonitor(Signal("picture", model_value="", max_age=0.1))
     assert kind(monitor, 0.0, received("cat")) is None
     assert kind(monitor, 0.2, received("cat")) == "stale"
 
 
-def test_value_that_the_bridge_checked_by_other_limits_is_checked_again() -> None:
+def test_value_checked_against_other_bounds_is_checked_again() -> None:
     wide, narrow = signal(upper=2.0), signal(upper=1.0)
     sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, bounds=Bounds(wide))
     assert kind(SensorMonitor(narrow), 0.0, sample) == "implausible"
@@ -164,7 +164,7 @@ def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str |
     return [kind(monitor, sample.arrived, sample) for sample in given]
 
 
-def test_sample_that_took_longer_than_the_quickest_one_is_stale_until_one_is_quick_again() -> None:
+def test_sample_with_excess_latency_is_stale() -> None:
     assert delays((100.0, 5.0), (100.01, 5.02), (100.02, 5.05), (100.03, 5.04)) == [None, None, "stale", None]
 
 
@@ -172,25 +172,25 @@ def test_quickest_sample_need_not_be_the_first() -> None:
     assert delays((100.0, 5.03), (100.01, 5.01), (100.02, 5.05)) == [None, None, "stale"]
 
 
-def test_sender_whose_clock_was_set_back_is_measured_anew() -> None:
+def test_latency_is_measured_anew_after_clock_reset() -> None:
     assert delays((100.0, 5.0), (90.0, 5.01), (90.01, 5.05)) == [None, None, "stale"]
 
 
-def test_clocks_that_drift_apart_by_less_than_they_may_make_nothing_stale() -> None:
+def test_slowly_drifting_clocks_make_nothing_stale() -> None:
     drift = 400e-6
     assert set(delays(*[(k * (1.0 - drift), float(k)) for k in range(1000)])) == {None}
 
 
-def test_sample_without_a_time_has_no_delay() -> None:
+def test_sample_without_time_stamp_has_no_latency() -> None:
     assert delays((nan, 5.0), (nan, 6.0)) == [None, None]
 
 
-def test_delay_is_positive() -> None:
+def test_max_delay_must_be_positive() -> None:
     with pytest.raises(ValueError, match="positive max_delay"):
         SensorMonitor(signal(), max_delay=0.0)
 
 
-def test_jumps_need_a_finite_rate_and_a_vector() -> None:
+def test_jump_tolerance_needs_a_vector_with_finite_rate() -> None:
     with pytest.raises(ValueError, match="finite rate"):
         SensorMonitor(signal(), jump_tolerance=0.1)
     with pytest.raises(ValueError, match="abstract"):
@@ -199,7 +199,7 @@ def test_jumps_need_a_finite_rate_and_a_vector() -> None:
         SensorMonitor(signal(rate=1.0), jump_tolerance=[0.1, -0.1])
 
 
-def test_value_is_examined_once_and_its_age_in_every_cycle() -> None:
+def test_value_is_examined_once() -> None:
     class Counting(SensorMonitor):
         examined = 0
 

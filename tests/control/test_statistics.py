@@ -29,7 +29,7 @@ def samples(seed: int, number: int = 5000) -> np.ndarray:
 
 @pytest.mark.parametrize("resolution", [0.01, 0.02, 0.1])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_percentiles_are_those_of_numpy_within_a_bin(resolution: float, seed: int) -> None:
+def test_percentiles_agree_with_numpy_within_a_bin(resolution: float, seed: int) -> None:
     durations = samples(seed, 4987)  # A prime: no percentile falls on the edge between two ranks.
     histogram = filled(durations, resolution=resolution)
     for percent in PERCENTS:
@@ -39,9 +39,7 @@ def test_percentiles_are_those_of_numpy_within_a_bin(resolution: float, seed: in
 
 
 @given(st.lists(st.floats(1e-6, 10.0), min_size=1, max_size=50), st.integers(0, 1000))
-def test_percentile_of_any_durations_is_above_the_true_one_by_a_bin_at_most(
-    durations: list[float], permille: int
-) -> None:
+def test_percentile_exceeds_the_true_one_by_at_most_a_bin(durations: list[float], permille: int) -> None:
     exact = sorted(durations)[max(1, ceil(Fraction(permille, 1000) * len(durations))) - 1]
     found = filled(np.array(durations)).percentile(permille / 10)
     assert exact * (1 - 1e-9) <= found <= exact * 1.01 * (1 + 1e-9)
@@ -66,7 +64,7 @@ def test_percentile_never_exceeds_the_largest() -> None:
     assert filled(np.array([1.004e-3])).percentile(50.0) == 1.004e-3
 
 
-def test_rank_of_a_percentile_is_exact_at_whole_numbers() -> None:
+def test_percentile_rank_is_exact() -> None:
     durations = np.array([1e-3] * 999 + [1.0])
     assert filled(durations).percentile(99.9) < 2e-3
 
@@ -80,19 +78,19 @@ def test_memory_is_constant() -> None:
     assert len(histogram.to_dict()["bins"]) <= 1622  # 1620 bins between 1 us and 10 s at 1 %, and one at each end.
 
 
-def test_empty_histogram_has_no_numbers() -> None:
+def test_empty_histogram_has_nan_statistics() -> None:
     histogram = Histogram()
     assert all(isnan(x) for x in (histogram.mean, histogram.least, histogram.largest, histogram.percentile(50.0)))
 
 
-def test_nan_is_refused_and_not_counted() -> None:
+def test_nan_is_rejected() -> None:
     histogram = Histogram()
     with pytest.raises(ValueError, match="NaN"):
         histogram.record(nan)
     assert histogram.count == 0
 
 
-def test_merged_histograms_are_the_histogram_of_all() -> None:
+def test_merged_histograms_equal_joint_histogram() -> None:
     a, b = samples(5), 0.5 * samples(6)
     merged = filled(a)
     merged.merge(filled(b))
@@ -100,7 +98,7 @@ def test_merged_histograms_are_the_histogram_of_all() -> None:
     assert merged.to_dict() == {**together, "total": pytest.approx(together["total"], rel=1e-12)}
 
 
-def test_histograms_of_other_bins_do_not_merge() -> None:
+def test_histograms_with_other_bins_do_not_merge() -> None:
     with pytest.raises(ValueError, match="merge"):
         Histogram().merge(Histogram(resolution=0.02))
 
@@ -115,20 +113,20 @@ def test_histogram_survives_json(durations: np.ndarray) -> None:
     assert again.to_dict() == histogram.to_dict()
 
 
-def test_bin_that_cannot_be_is_refused() -> None:
+def test_unknown_bin_is_rejected() -> None:
     data = filled(np.array([1e-3])).to_dict()
     with pytest.raises(ValueError, match="no bin 99999"):
         Histogram.from_dict({**data, "bins": {"99999": 1}})
 
 
 @pytest.mark.parametrize("options", [{"resolution": 0.0}, {"resolution": nan}, {"lowest": 0.0}, {"lowest": 20.0}])
-def test_bins_that_cannot_be_are_refused(options: dict[str, float]) -> None:
+def test_invalid_bins_are_rejected(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="histogram"):
         Histogram(**options)
 
 
 @pytest.mark.parametrize("percent", [-1.0, 100.1, nan])
-def test_percentile_out_of_range_is_refused(percent: float) -> None:
+def test_percentile_out_of_range_is_rejected(percent: float) -> None:
     with pytest.raises(ValueError, match="0 to 100"):
         Histogram().percentile(percent)
 
@@ -142,7 +140,7 @@ def test_durations_above_thresholds_are_counted_once() -> None:
     assert statistics.level is Level.ERROR
 
 
-def test_half_a_period_is_a_warning_and_a_whole_one_an_error() -> None:
+def test_default_thresholds_follow_from_the_period() -> None:
     statistics = LoopStatistics(1e-3)
     statistics.record(lateness=0.6e-3, step=1e-4, cycle=0.4e-3)
     assert statistics.level is Level.WARNING
@@ -151,7 +149,7 @@ def test_half_a_period_is_a_warning_and_a_whole_one_an_error() -> None:
     assert statistics.cycles == 2
 
 
-def test_misses_of_cycles_in_a_row_make_one_run() -> None:
+def test_misses_in_a_row_are_counted() -> None:
     statistics = LoopStatistics(1e-3)
     runs = []
     for number in (0, 2, 1, 0, 1, 0):
@@ -162,7 +160,7 @@ def test_misses_of_cycles_in_a_row_make_one_run() -> None:
     assert (statistics.misses, statistics.longest_run) == (4, 3)
 
 
-def test_cycle_without_a_word_of_misses_ends_the_run() -> None:
+def test_cycle_without_misses_ends_the_row() -> None:
     statistics = LoopStatistics(1e-3)
     statistics.miss(2)
     statistics.record(lateness=0.0, step=0.0, cycle=0.0)
@@ -215,17 +213,17 @@ def test_period_must_be_positive(period: float) -> None:
         LoopStatistics(period)
 
 
-def test_threshold_of_nothing_is_refused() -> None:
+def test_threshold_of_unknown_quantity_is_rejected() -> None:
     with pytest.raises(ValueError, match="none for latness"):
         LoopStatistics(1e-3, thresholds={"latness": Threshold(1.0, 2.0)})
 
 
 @pytest.mark.parametrize(("warning", "error"), [(2.0, 1.0), (-1.0, 1.0), (nan, 1.0)])
-def test_warning_comes_before_error(warning: float, error: float) -> None:
+def test_warning_must_not_exceed_error(warning: float, error: float) -> None:
     with pytest.raises(ValueError, match="warning <= error"):
         Threshold(warning, error)
 
 
-def test_number_of_misses_is_not_negative() -> None:
+def test_number_of_misses_must_not_be_negative() -> None:
     with pytest.raises(ValueError, match="-1"):
         LoopStatistics(1e-3).miss(-1)

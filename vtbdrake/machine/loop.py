@@ -15,7 +15,6 @@ from math import inf
 from typing import Any
 
 from vtbdrake.control.clock import Clock, WallClock
-from vtbdrake.control.json_object import json_object
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.lcm.connections import LcmLink
@@ -265,8 +264,11 @@ class MachineLoop:
 
     def _answer(self, text: bytes) -> dict[str, Any]:
         try:
-            more = self._do(json_object(text, InjectedFaultError))
-        except ValueError as error:
+            request = json.loads(text)
+            if not isinstance(request, dict):
+                raise InjectedFaultError(f"a request is a JSON object, not {request!r}")
+            more = self._do(request)
+        except (ValueError, RecursionError) as error:
             _log.warning("request rejected: %s", error)
             return {"error": str(error)}
         return {**self.machine.status().to_dict(), **more}
