@@ -1,4 +1,4 @@
-"""A real bus with an independent client, for tests."""
+"""What tests on a real bus need: an independent client, and functions that wait."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tests.control.arm import status
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import STATUS_CHANNEL
 
-PATIENCE = 60.0  # s, for what depends on another process
+PATIENCE = 60.0  # seconds to wait for another process
 
 
 class Peer:
-    """An independent LCM client, which keeps all that is published, except for what the hub says of itself."""
+    """An independent LCM client that keeps every message except the status of the hub."""
 
     def __init__(self, url: str) -> None:
         self.lcm = lcm.LCM(url)
@@ -28,7 +28,7 @@ class Peer:
             self.heard.append((channel, data))
 
     def hear(self, count: int) -> list[tuple[str, bytes]]:
-        """The first ``count`` messages and what has come with them."""
+        """Return all messages once there are ``count`` of them."""
         end = time.monotonic() + PATIENCE
         while len(self.heard) < count and time.monotonic() < end:
             self.lcm.handle_timeout(100)
@@ -36,7 +36,7 @@ class Peer:
 
 
 def wait(bridge: LcmBridge, condition: Callable[[], bool]) -> bool:
-    """Polls until the condition holds."""
+    """Poll until the condition holds, and return whether it does."""
     end = time.monotonic() + PATIENCE
     while not condition() and time.monotonic() < end:
         bridge.poll(0.02)
@@ -44,7 +44,7 @@ def wait(bridge: LcmBridge, condition: Callable[[], bool]) -> bool:
 
 
 def in_step(bridge: LcmBridge, peer: Peer) -> None:
-    """Returns when the bus carries messages in both directions."""
+    """Return when the bus carries messages from the peer to the bridge."""
     peer.lcm.publish("IIWA_STATUS", status(1).encode())
     assert wait(bridge, lambda: bridge.sensed["position"].count > 0)
 

@@ -1,4 +1,4 @@
-"""The bridge: what it accepts, on its own and on a real bus with other processes."""
+"""The bridge accepts and sends valid messages, alone and on a real bus with other processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Arm:
-    """The reader of the arm's status, and its two signals."""
+    """The reader of an arm's status, and its two signals."""
 
     def __init__(self, *, reorder_window: float = math.inf) -> None:
         self.position, self.torque = ReceivedSignal(), ReceivedSignal()
@@ -152,7 +152,7 @@ def fail(_: Any) -> dict[str, Any]:
 
 
 def exit_process(_: Any) -> dict[str, Any]:
-    raise SystemExit(1)  # what a failed assertion in Drake's C++ is
+    raise SystemExit(1)  # as a failed assertion in Drake's C++ does
 
 
 @pytest.mark.parametrize(
@@ -334,7 +334,7 @@ def test_own_and_earlier_refusals_are_not_foreign() -> None:
     assert told("me", 9, "other") == 2
     assert told("other", 12, "me") == 2
     assert told("me", 13, "me") == 2
-    assert told("me", 0, "other") == 2  # of a hub that was started again
+    assert told("me", 0, "other") == 2  # of a restarted hub
     assert told("me", 1, "other") == 3
     assert foreign.recent(60.0) == {"C"} and foreign.recent(0.0) == set()
 

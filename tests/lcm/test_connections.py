@@ -1,4 +1,4 @@
-"""Connections to a real bus: lost, found again, and never waited for."""
+"""Connections to a real bus are restored, and never waited for."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_poll_notices_a_killed_hub_and_finds_its_successor() -> None:
         os.kill(hub.pid, signal.SIGKILL)
         hub.close()  # waits until it is gone
         assert arm.connected
-        while arm.poll():  # what the hub still said
+        while arm.poll():  # messages that the hub had sent before
             pass
         assert not arm.connected
         assert arm.publish({"position": np.zeros(7)}) == ("position",)
@@ -81,7 +81,7 @@ def test_publish_notices_a_killed_hub() -> None:
         arm.open()
         os.kill(hub.pid, signal.SIGKILL)
         hub.close()
-        for _ in range(2):  # the kernel takes the first: a connection that one end has closed is half open
+        for _ in range(2):  # the first succeeds: the connection is half open
             arm.publish({"position": np.zeros(7)})
         assert not arm.connected
 
@@ -139,7 +139,7 @@ def test_messages_arrive_in_order_and_stamped(hub: Hub) -> None:
         closing(TcpqConnection(hub.url, handlers, PATIENCE, stamped=True)) as receiver,
     ):
         limit = time.monotonic() + PATIENCE
-        while receiver.arrived is None:  # The kernel begins a moment after it was asked to.
+        while receiver.arrived is None:  # The kernel begins to stamp with a delay.
             assert time.monotonic() < limit
             sender.publish([("A", b"")])
             select.select([receiver], [], [], PATIENCE)

@@ -1,4 +1,4 @@
-"""Images and point clouds, as Drake's own systems send them."""
+"""Images and point clouds arrive as Drake's own systems send them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CHANNEL = "PICTURES"
 
 
 def sent_by_drake(system: System, values: list[Any], message_type: Any) -> bytes:
-    """The message that Drake publishes at 0.5 s."""
+    """Return the message that a Drake system publishes at 0.5 s."""
     builder = DiagramBuilder()
     builder.AddSystem(system)
     for port, value in enumerate(values):

@@ -38,7 +38,7 @@ def valid(random: random.Random, utime: int) -> bytearray:
 
 
 def broken(random: random.Random, utime: int) -> bytes:
-    """A message, valid or broken in one of the ways in which messages break."""
+    """Return a message that is valid or broken in some way."""
     data = valid(random, utime)
     way = random.randrange(10)
     if way == 0:
@@ -68,11 +68,11 @@ def stream(seed: int, count: int) -> Iterator[bytes]:
 
 
 class Oracle:
-    """What of a message is to be believed, by lcm-gen's decoder and nothing of the bridge.
+    """Counts by signal which messages are valid, with lcm-gen's decoder and nothing of the bridge.
 
-    All of an `lcmt_iiwa_status` is numbers, so that encoding it again gives the same bytes, and no others. The reorder
-    window is zero: the second message in a row that is late or ahead is believed. What is ahead is so by at least
-    2**21 us, where a bit of the time has flipped; hardly any time passes here.
+    All fields of an `lcmt_iiwa_status` are numbers: encoding it again gives the same bytes. The reorder window is zero:
+    the second message in a row that is late or ahead is accepted. A message that is ahead is so by at least 2**21 us,
+    where a bit of the time has flipped; hardly any time passes here.
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class Oracle:
         self.unfit = False
         self.accepted = Counter[str]()
 
-    def judge(self, data: bytes) -> None:
+    def add(self, data: bytes) -> None:
         try:
             message = lcmt_iiwa_status.decode(data)
         except (ValueError, struct.error, OverflowError, MemoryError):
@@ -107,7 +107,7 @@ class Oracle:
 
 
 def resident() -> int:
-    """Memory of this process, in bytes."""
+    """Return the resident memory of this process, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -118,7 +118,7 @@ def fuzzed() -> tuple[dict[str, ReceivedSignal], Oracle, list[int]]:
     oracle, memory = Oracle(), []
     for number, data in enumerate(stream(1, MESSAGES)):
         reader.take("IIWA_STATUS", data)
-        oracle.judge(data)
+        oracle.add(data)
         value = signals["position"].value
         assert value is None or np.abs(value).max() <= LIMIT
         if number in (MESSAGES // 5, MESSAGES - 1):
@@ -149,8 +149,8 @@ def test_memory_stays_flat(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list
     assert late - early < 5_000_000
 
 
-def judged(received: ReceivedSignal) -> int:
-    """How many messages came, good or bad."""
+def handled(received: ReceivedSignal) -> int:
+    """Return how many messages were accepted or rejected."""
     return received.count + sum(received.rejected.values())
 
 
@@ -165,19 +165,19 @@ for data in stream(2, {count}):
 """
     oracle = Oracle()
     for data in stream(2, count):
-        oracle.judge(data)
+        oracle.add(data)
     with Hub(port=0) as hub, closing(bridge(hub.url, reorder_window=0.0)) as arm:
         arm.open()
         process = subprocess.Popen([sys.executable, "-c", sender, hub.url], cwd=ROOT)
         try:
             end = time.monotonic() + 60.0
-            while judged(arm.sensed["position"]) < count and time.monotonic() < end:
+            while handled(arm.sensed["position"]) < count and time.monotonic() < end:
                 arm.poll(0.1)
             assert process.wait(60.0) == 0
         finally:
             process.kill()
             process.wait()
-        assert judged(arm.sensed["position"]) == count
+        assert handled(arm.sensed["position"]) == count
         for name, received in arm.sensed.items():
             assert received.count == oracle.accepted[name]
             assert received.count + sum(received.rejected.values()) == count

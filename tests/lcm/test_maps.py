@@ -1,4 +1,4 @@
-"""Maps between messages and signals: strict decoding, both ways of vectors, and what is refused."""
+"""Maps decode strictly, carry vectors both ways, and are refused if they do not fit."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_example_of_another_layout_is_refused() -> None:
 
 
 class Made(dict[str, np.ndarray]):
-    """Makes every vector when it is asked for."""
+    """A mapping that makes every vector on request."""
 
     def __getitem__(self, name: str) -> Any:
         return np.full(2, float(name))
