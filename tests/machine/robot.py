@@ -1,4 +1,4 @@
-"""An acrobot with a torque at its elbow, which speaks the iiwa messages of an arm with two joints."""
+"""An acrobot with a torque at its elbow, with the iiwa messages of an arm with two joints."""
 
 from __future__ import annotations
 
@@ -86,24 +86,24 @@ class RobotScenario(Scenario):
 
 
 def torque(value: float, utime: int) -> bytes:
-    """A command."""
+    """Return a torque command."""
     message = lcmt_iiwa_command()
     message.utime, message.num_torques, message.joint_torque = utime, 1, [value]
     return message.encode()
 
 
 def state(data: bytes) -> np.ndarray:
-    """Positions and velocities in a status."""
+    """Return the positions and velocities in a state message."""
     message = lcmt_iiwa_status.decode(data)
     return np.array([*message.joint_position_measured, *message.joint_velocity_estimated])
 
 
 class Listener:
-    """Whoever is on the bus, by means of liblcm: hears what the machine says, and commands it.
+    """A controller on the bus that uses liblcm: it records what the machine sends, and commands it.
 
     Attributes:
         heard: states of the machine, as bytes.
-        statuses: how the machine is, as it says.
+        statuses: the status messages of the machine.
     """
 
     def __init__(self, url: str) -> None:
@@ -114,18 +114,18 @@ class Listener:
         self._lcm.subscribe("VTB_MACHINE_STATUS", lambda _, data: self.statuses.append(json.loads(data)))
 
     def wait(self, condition: Callable[[list[bytes]], bool]) -> list[bytes]:
-        """What has been heard, when the condition is fulfilled."""
+        """Wait until the condition is fulfilled, and return what was heard."""
         while not condition(self.heard):
-            assert self._lcm.handle_timeout(60_000), "nothing is heard any more"
+            assert self._lcm.handle_timeout(60_000), "no message within 60 s"
         return self.heard
 
     def next(self) -> bytes:
-        """The next status."""
+        """Return the next state."""
         count = len(self.heard)
         return self.wait(lambda heard: len(heard) > count)[count]
 
     def until_cycle(self, cycle: int) -> list[bytes]:
-        """What is heard until the machine has done so many cycles; its own status, which comes after it, says so."""
+        """Return what is heard until the machine has done so many cycles; its status, which follows, says so."""
         self._lcm.publish("VTB_MACHINE", b'{"request": "status"}')
         self.wait(lambda heard: bool(self.statuses) and self.statuses[-1]["cycle"] == cycle)
         return list(self.heard)

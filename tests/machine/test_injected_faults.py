@@ -1,4 +1,4 @@
-"""What faults do to messages, given as bytes."""
+"""Injected faults: their effect on messages, given as bytes."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def line(*faults: InjectedFault, delay: int = 0, seed: int = 0) -> DelayLine:
     return made
 
 
-def carry(way: DelayLine, cycles: int, *channels: str) -> list[list[tuple[str, int]]]:
-    """Channel and number of what arrives in each cycle, if each channel is sent the cycle's number in each."""
+def deliver(way: DelayLine, cycles: int, *channels: str) -> list[list[tuple[str, int]]]:
+    """Send the number of the cycle on each channel; return channel and number of what arrives in each cycle."""
     arrived = []
     for cycle in range(cycles):
         for channel in channels or (A,):
@@ -53,7 +53,7 @@ def carry(way: DelayLine, cycles: int, *channels: str) -> list[list[tuple[str, i
     return arrived
 
 
-def damaged(kind: str, count: int) -> list[bytes]:
+def corrupted(kind: str, count: int) -> list[bytes]:
     way = line(Corrupt(kind=kind))
     for _ in range(count):
         way.send(Packet(A, lcmt_iiwa_status, message(1), 0))
@@ -68,70 +68,70 @@ def reason(data: bytes) -> str:
     return ""
 
 
-def test_line_without_faults_carries_everything_at_once() -> None:
-    assert carry(line(), 3, A, B) == [[(A, k), (B, k)] for k in range(3)]
+def test_line_without_faults_delivers_at_once() -> None:
+    assert deliver(line(), 3, A, B) == [[(A, k), (B, k)] for k in range(3)]
 
 
 def test_line_with_a_delay() -> None:
-    assert carry(line(delay=2), 4) == [[], [], [(A, 0)], [(A, 1)]]
+    assert deliver(line(delay=2), 4) == [[], [], [(A, 0)], [(A, 1)]]
 
 
 def test_drop_of_all() -> None:
-    assert carry(line(Drop()), 3) == [[], [], []]
+    assert deliver(line(Drop()), 3) == [[], [], []]
 
 
 def test_drop_of_a_fraction() -> None:
-    arrived = sum(map(len, carry(line(Drop(fraction=0.3)), 2000)))
+    arrived = sum(map(len, deliver(line(Drop(fraction=0.3)), 2000)))
     assert abs(arrived - 1400) < 5 * math.sqrt(2000 * 0.3 * 0.7)
 
 
 def test_delay_is_whole_cycles_rounded_up() -> None:
-    assert carry(line(Delay(seconds=0.0011)), 4) == [[], [], [(A, 0)], [(A, 1)]]
+    assert deliver(line(Delay(seconds=0.0011)), 4) == [[], [], [(A, 0)], [(A, 1)]]
     assert [whole_cycles(k * 0.1, 0.1) for k in range(1000)] == list(range(1000))
 
 
 def test_freeze_repeats_the_first_message_of_each_channel() -> None:
     way = line()
-    carry(way, 3, A, B)
+    deliver(way, 3, A, B)
     way.begin(Freeze(channels=[A]))
-    frozen = carry(way, 3, A, B)
+    frozen = deliver(way, 3, A, B)
     assert frozen == [[(A, 0), (B, k)] for k in range(3)]
 
 
 def test_duplicate() -> None:
-    assert carry(line(Duplicate(copies=2)), 2) == [[(A, k)] * 3 for k in range(2)]
+    assert deliver(line(Duplicate(copies=2)), 2) == [[(A, k)] * 3 for k in range(2)]
 
 
 def test_reorder_swaps_two_messages_of_a_channel() -> None:
-    arrived = carry(line(Reorder()), 4, A, B)
+    arrived = deliver(line(Reorder()), 4, A, B)
     assert arrived == [[], [(A, 1), (A, 0), (B, 1), (B, 0)], [], [(A, 3), (A, 2), (B, 3), (B, 2)]]
 
 
 def test_faults_act_together() -> None:
-    arrived = carry(line(Delay(seconds=0.001), Duplicate(), Freeze()), 3)
+    arrived = deliver(line(Delay(seconds=0.001), Duplicate(), Freeze()), 3)
     assert arrived == [[], [(A, 0), (A, 0)], [(A, 0), (A, 0)]]
 
 
-def test_duplicates_of_a_damaged_message_are_equal() -> None:
+def test_duplicates_of_a_corrupted_message_are_equal() -> None:
     way = line(Duplicate(), Corrupt(kind="random"))
     way.send(Packet(A, lcmt_iiwa_status, message(1), 0))
     one, other = way.arrivals(0)
     assert one == other
 
 
-def test_fault_takes_the_place_of_one_of_its_name() -> None:
+def test_fault_replaces_one_of_the_same_name() -> None:
     way = line(Delay(seconds=0.005), Delay(seconds=0.001))
-    assert carry(way, 3) == [[], [(A, 0)], [(A, 1)]]
+    assert deliver(way, 3) == [[], [(A, 0)], [(A, 1)]]
 
 
-def test_faults_end_and_what_is_on_its_way_arrives() -> None:
+def test_packets_on_their_way_arrive_after_faults_end() -> None:
     way = line(Delay(seconds=0.002))
     way.send(Packet(A, lcmt_iiwa_status, message(7), 0))
     way.end_faults()
-    assert carry(way, 3) == [[(A, 0)], [(A, 1)], [(A, 7), (A, 2)]]
+    assert deliver(way, 3) == [[(A, 0)], [(A, 1)], [(A, 7), (A, 2)]]
 
 
-def test_clock_error_is_that_of_the_channels_named() -> None:
+def test_clock_error_affects_named_channels() -> None:
     way = line(ClockJump(seconds=-2.0, channels=[A]))
     assert (way.clock_error(A), way.clock_error(B)) == (-2.0, 0.0)
     way.end_faults()
@@ -140,37 +140,37 @@ def test_clock_error_is_that_of_the_channels_named() -> None:
 
 def test_flipped_bits_are_one_to_eight() -> None:
     whole = np.frombuffer(message(1), np.uint8)
-    flips = Counter(int(np.unpackbits(np.frombuffer(data, np.uint8) ^ whole).sum()) for data in damaged("bits", 800))
+    flips = Counter(int(np.unpackbits(np.frombuffer(data, np.uint8) ^ whole).sum()) for data in corrupted("bits", 800))
     assert set(flips) == set(range(1, 9))
     assert min(flips.values()) > 50
 
 
 def test_truncated_messages_are_beginnings() -> None:
-    found = damaged("truncate", 200)
+    found = corrupted("truncate", 200)
     assert all(message(1).startswith(data) and len(data) < len(message(1)) for data in found)
     assert {reason(data) for data in found} == {"truncated"}
 
 
 def test_trailing_bytes_follow() -> None:
-    found = damaged("trailing", 50)
+    found = corrupted("trailing", 50)
     assert all(data.startswith(message(1)) and 1 <= len(data) - len(message(1)) <= 64 for data in found)
     assert {reason(data) for data in found} == {"trailing"}
 
 
 def test_wrong_type_differs_in_the_fingerprint_only() -> None:
-    [data] = damaged("type", 1)
+    [data] = corrupted("type", 1)
     assert data[8:] == message(1)[8:]
     assert reason(data) == "fingerprint"
 
 
 def test_random_bytes() -> None:
-    one, other = damaged("random", 2)
+    one, other = corrupted("random", 2)
     assert len(one) == len(other) == len(message(1))
     assert len({one, other, message(1)}) == 3
 
 
-def test_nan_is_in_every_number_that_can_be_one() -> None:
-    [data] = damaged("nan", 1)
+def test_nan_is_in_every_floating_point_number() -> None:
+    [data] = corrupted("nan", 1)
     found = decode(lcmt_iiwa_status, data)
     assert (found.utime, found.num_joints) == (1, 7)
     assert np.isnan([getattr(found, name) for name in found.__slots__[2:]]).all()
@@ -207,11 +207,11 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("fault", EXAMPLES, ids=lambda fault: fault.name)
-def test_faults_travel_as_json(fault: InjectedFault) -> None:
+def test_faults_survive_json(fault: InjectedFault) -> None:
     assert fault_from_dict(json.loads(json.dumps(fault.to_dict()))) == fault
 
 
-def test_all_faults_are_examples() -> None:
+def test_every_fault_is_an_example() -> None:
     assert {fault.name for fault in EXAMPLES} == set(FAULTS)
 
 
@@ -236,6 +236,6 @@ def test_all_faults_are_examples() -> None:
         ),
     ],
 )
-def test_faults_that_cannot_be_are_refused(data: dict[str, Any], message: str) -> None:
+def test_impossible_fault_is_refused(data: dict[str, Any], message: str) -> None:
     with pytest.raises(InjectedFaultError, match=message):
         fault_from_dict(data)

@@ -65,7 +65,7 @@ def recorded(cycles: int) -> tuple[list[float], list[np.ndarray]]:
 # -- cycles
 
 
-def test_machine_under_recorded_commands_moves_as_the_simulation_bit_for_bit() -> None:
+def test_machine_and_simulation_agree_bit_for_bit() -> None:
     commands, states = recorded(300)
     robot = machine()
     for k, command in enumerate(commands):
@@ -77,7 +77,7 @@ def test_machine_under_recorded_commands_moves_as_the_simulation_bit_for_bit() -
         robot.advance()
 
 
-def test_the_newest_command_counts() -> None:
+def test_newest_command_acts() -> None:
     twice, once = machine(), machine()
     for value, utime in ((5.0, 1), (-1.0, 2)):
         twice.receive(COMMAND, torque(value, utime))
@@ -117,7 +117,7 @@ def test_epoch_is_the_time_of_cycle_0() -> None:
 # -- differences from the simulated world
 
 
-def test_noise_has_its_deviation_and_its_seed() -> None:
+def test_noise_has_its_deviation_and_seed() -> None:
     def errors(**options: Any) -> np.ndarray:
         noisy, quiet = machine(**options), machine()
         return np.array([state(a) - state(b) for a, b in zip(run(noisy, 1000), run(quiet, 1000), strict=True)])
@@ -140,7 +140,7 @@ def test_faults_do_not_change_the_noise() -> None:
     assert set(told) < set(run(healthy, 100))
 
 
-def test_perturbation_is_relative_uniform_and_of_what_it_names() -> None:
+def test_perturbation_is_relative_and_uniform() -> None:
     world = WorldAlone(RobotScenario())
     context = world.default_context()
     ratios = []
@@ -155,7 +155,7 @@ def test_perturbation_is_relative_uniform_and_of_what_it_names() -> None:
     np.testing.assert_allclose(np.std(ratios), 0.05 / np.sqrt(3.0), rtol=0.1)
 
 
-def test_perturbed_machine_has_those_values_and_all_others_of_the_scenario() -> None:
+def test_other_values_are_not_perturbed() -> None:
     robot, nominal = machine(perturb=0.05, seed=3), machine()
     for address, variable in robot.world.variables().items():
         if address in robot.perturbed:
@@ -167,12 +167,12 @@ def test_perturbed_machine_has_those_values_and_all_others_of_the_scenario() -> 
     assert run(robot, 5) != run(nominal, 5)
 
 
-def test_values_that_are_set_are_not_perturbed() -> None:
+def test_set_values_are_not_perturbed() -> None:
     mass = "sim.sys.Acrobot.lower_link.mass"
     assert machine(values={mass: 1.5}, perturb=0.5).read(mass) == 1.5
 
 
-def test_values_that_are_set_while_it_runs_hold_from_the_next_cycle_on() -> None:
+def test_values_set_while_running_act_from_the_next_cycle() -> None:
     mass = "sim.sys.Acrobot.lower_link.mass"
     robot, heavy = machine(), machine(values={**PUSHED, mass: 1.5})
     assert robot.messages() == heavy.messages()
@@ -201,7 +201,7 @@ def test_delayed_command_acts_later() -> None:
 # -- safety
 
 
-def test_machine_brakes_before_the_first_command_and_after_its_timeout() -> None:
+def test_machine_brakes_without_commands() -> None:
     robot = machine(timeout=0.01, brake="idle")
     run(robot, 1)
     assert robot.braking
@@ -218,7 +218,7 @@ def test_machine_brakes_before_the_first_command_and_after_its_timeout() -> None
 
 
 @pytest.mark.parametrize("timeout", [0.005, 10.0])
-def test_a_command_that_has_waited_neither_acts_nor_releases_the_brake(timeout: float) -> None:
+def test_late_command_is_rejected(timeout: float) -> None:
     robot, spared = (machine(timeout=timeout, max_latency=0.001) for _ in range(2))
     robot.reject_late(True)
     begin, clock = time.monotonic(), 5_000_000  # us, of the sender: its zero is another one
@@ -235,7 +235,7 @@ def test_a_command_that_has_waited_neither_acts_nor_releases_the_brake(timeout: 
     assert robot.status().rejected == {"torque": {"late": 1}}
 
 
-def test_locked_joints_are_those_with_actuators() -> None:
+def test_brake_locks_joints_with_actuators() -> None:
     robot = machine(timeout=0.01)
     run(robot, 5, command=0.0)
     moved = robot.read(ELBOW)
@@ -252,7 +252,7 @@ def test_locked_joints_are_those_with_actuators() -> None:
 
 
 @pytest.mark.parametrize(("brake", "expected"), [("idle", 0.0), ("hold", 3.0)])
-def test_command_while_braking(brake: str, expected: float) -> None:
+def test_actuation_while_braking(brake: str, expected: float) -> None:
     robot, reference = machine(timeout=0.01, brake=brake), machine(timeout=100.0)
     assert run(robot, 11, command=3.0) == run(reference, 11, command=3.0)
     assert run(robot, 10) == run(reference, 10)
@@ -263,7 +263,7 @@ def test_command_while_braking(brake: str, expected: float) -> None:
 
 
 @pytest.mark.parametrize(("value", "reason"), [(np.nan, "not finite"), (10.5, "limits")])
-def test_bad_commands_are_rejected_and_do_not_keep_the_brake_off(value: float, reason: str) -> None:
+def test_rejected_commands_do_not_release_the_brake(value: float, reason: str) -> None:
     robot = machine(timeout=0.01)
     run(robot, 1, command=1.0)
     run(robot, 11, command=value)
@@ -272,7 +272,7 @@ def test_bad_commands_are_rejected_and_do_not_keep_the_brake_off(value: float, r
     assert (status.accepted, status.rejected) == ({"torque": 1}, {"torque": {reason: 11}})
 
 
-def test_machine_without_its_brake_goes_on() -> None:
+def test_machine_without_brake_repeats_commands() -> None:
     robot, reference = machine(timeout=0.01), machine()
     robot.begin(NoBrake())
     robot.receive(COMMAND, torque(2.0, 1))
@@ -283,7 +283,7 @@ def test_machine_without_its_brake_goes_on() -> None:
     assert robot.braking
 
 
-def test_plant_that_cannot_be_locked_gets_idle_commands() -> None:
+def test_continuous_plant_cannot_be_locked() -> None:
     continuous = RobotScenario(time_step=0.0)
     Machine(continuous)
     with pytest.raises(ValueError, match="only the joints of a discrete plant can be locked"):

@@ -1,4 +1,4 @@
-"""A machine in a process of its own, on a hub, seen and commanded by others by means of liblcm."""
+"""A machine in a child process on a hub, observed and commanded through liblcm."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from vtbdrake.machine import (
     Drop,
     Duplicate,
     Freeze,
+    InjectedFault,
     Machine,
     MachineConfig,
     MachineError,
@@ -52,7 +53,7 @@ def hub() -> Iterator[Hub]:
 
 
 def ends(pid: int) -> bool:
-    """Whether a process has ended, or does so soon."""
+    """Return whether a process ends within 10 s."""
     try:
         process = os.pidfd_open(pid)
     except ProcessLookupError:
@@ -71,7 +72,7 @@ def utime(data: bytes) -> int:
 
 
 class Stepper:
-    """Commands a machine in lock-step, cycle by cycle, always the same, and takes down what is heard in between."""
+    """Commands a machine in lock-step, always alike, and records what it sends in between."""
 
     def __init__(self, url: str, process: MachineProcess) -> None:
         self.process = process
@@ -82,7 +83,7 @@ class Stepper:
         self.step()
 
     def step(self, cycles: int = 1) -> list[bytes]:
-        """What is heard of some cycles."""
+        """Return what is heard in some cycles."""
         del self._listener.heard[:]
         for _ in range(cycles):
             self._cycle += 1
@@ -90,8 +91,8 @@ class Stepper:
         return self._listener.until_cycle(self._cycle)
 
     def healthy(self, *ahead: int) -> list[bytes]:
-        """What would be heard so many cycles after those that have been done, if nothing were wrong."""
-        while len(self._told) <= self._cycle + max(ahead):
+        """Return what a machine without faults sends so many cycles after the present one."""
+        while len(self._told) <= self._cycle + max(ahead, default=0):
             self._told += [data for _, data in self._healthy.messages()]
             self._healthy.receive(COMMAND, torque(0.5, len(self._told)))
             self._healthy.advance()
@@ -100,7 +101,7 @@ class Stepper:
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[Stepper]:
-    """On a bus of its own, for it lives on and would answer the commands of other tests."""
+    """Run on a bus of its own: it lives on, and would answer the commands of other tests."""
     with Hub(port=0) as hub, MachineProcess(RobotScenario(), hub.url, lock_step=True, values=PUSHED) as process:
         yield Stepper(hub.url, process)
 
@@ -114,7 +115,7 @@ def stepper(running: Stepper) -> Iterator[Stepper]:
 # -- cycles
 
 
-def test_machine_in_lock_step_moves_as_the_simulation_bit_for_bit(hub: Hub) -> None:
+def test_machine_in_lock_step_and_simulation_agree_bit_for_bit(hub: Hub) -> None:
     commands, states = recorded(300)
     listener = Listener(hub.url)
     with MachineProcess(RobotScenario(), hub.url, lock_step=True, values=PUSHED):
@@ -124,7 +125,7 @@ def test_machine_in_lock_step_moves_as_the_simulation_bit_for_bit(hub: Hub) -> N
             listener.command(command, k + 1)
 
 
-def test_machine_tells_its_state_once_a_period(hub: Hub) -> None:
+def test_machine_sends_its_state_every_period(hub: Hub) -> None:
     listener = Listener(hub.url)
     with MachineProcess(RobotScenario(), hub.url, period=0.01):
         times = [utime(data) for data in listener.wait(lambda heard: len(heard) >= 30)]
@@ -149,51 +150,29 @@ def test_machine_ends_after_its_cycles(hub: Hub) -> None:
         assert process.wait() == 0
 
 
-# -- faults, as others see them
+# -- injected faults
 
 
-def test_drop(stepper: Stepper) -> None:
-    stepper.process.begin(Drop())
-    assert stepper.step(5) == []
-    stepper.process.end_faults()
-    expected = stepper.healthy(1, 2)
-    assert stepper.step(2) == expected
-
-
-def test_delay(stepper: Stepper) -> None:
-    stepper.process.begin(Delay(seconds=0.003))
-    expected = stepper.healthy(1, 2)
-    assert stepper.step(5) == expected
-    stepper.process.end_faults()
-    expected = stepper.healthy(-2, 1, -1, 2, 0, 3, 4)
-    assert stepper.step(4) == expected
-
-
-def test_freeze(stepper: Stepper) -> None:
-    stepper.process.begin(Freeze())
-    expected = stepper.healthy(1) * 4
-    assert stepper.step(4) == expected
-    stepper.process.end_faults()
-    expected = stepper.healthy(1)
-    assert stepper.step() == expected
-
-
-def test_duplicate(stepper: Stepper) -> None:
-    stepper.process.begin(Duplicate(copies=2))
-    expected = stepper.healthy(1, 1, 1, 2, 2, 2)
-    assert stepper.step(2) == expected
-    stepper.process.end_faults()
-    expected = stepper.healthy(1)
-    assert stepper.step() == expected
-
-
-def test_reorder(stepper: Stepper) -> None:
-    stepper.process.begin(Reorder())
-    expected = stepper.healthy(2, 1, 4, 3)
-    assert stepper.step(4) == expected
-    stepper.process.end_faults()
-    expected = stepper.healthy(1)
-    assert stepper.step() == expected
+@pytest.mark.parametrize(
+    ("fault", "during", "after"),
+    [
+        (Drop(), (5, []), (2, [1, 2])),
+        (Delay(seconds=0.003), (5, [1, 2]), (4, [-2, 1, -1, 2, 0, 3, 4])),
+        (Freeze(), (4, [1, 1, 1, 1]), (1, [1])),
+        (Duplicate(copies=2), (2, [1, 1, 1, 2, 2, 2]), (1, [1])),
+        (Reorder(), (4, [2, 1, 4, 3]), (1, [1])),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_fault_lasts_until_it_is_ended(
+    fault: InjectedFault, during: tuple[int, list[int]], after: tuple[int, list[int]], stepper: Stepper
+) -> None:
+    """A number of cycles, and the healthy messages that are heard then, counted from before them."""
+    stepper.process.begin(fault)
+    for cycles, ahead in (during, after):
+        expected = stepper.healthy(*ahead)
+        assert stepper.step(cycles) == expected
+        stepper.process.end_faults()
 
 
 def test_clock_jump(stepper: Stepper) -> None:
@@ -229,7 +208,7 @@ def test_fault_of_commands(stepper: Stepper) -> None:
     assert after.faults == []
 
 
-def test_machine_brakes_when_commands_stop_and_tells(hub: Hub) -> None:
+def test_status_shows_the_brake_when_commands_stop(hub: Hub) -> None:
     listener = Listener(hub.url)
     utimes = count(1)
 
@@ -251,7 +230,7 @@ def test_machine_brakes_when_commands_stop_and_tells(hub: Hub) -> None:
         assert np.ptp(later[:, 0]) > 0.0
 
 
-def test_what_waited_in_a_hub_that_stood_still_does_not_release_the_brake() -> None:
+def test_commands_held_by_a_stopped_hub_are_rejected() -> None:
     with Hub(port=0) as hub, MachineProcess(RobotScenario(), hub.url) as process:
         bus = lcm.LCM(hub.url)
 
@@ -278,7 +257,7 @@ def test_what_waited_in_a_hub_that_stood_still_does_not_release_the_brake() -> N
         process.until(heard)
 
 
-def test_machine_that_does_not_brake(hub: Hub) -> None:
+def test_no_brake_while_running(hub: Hub) -> None:
     with MachineProcess(RobotScenario(), hub.url, timeout=0.02) as process:
         process.until(lambda status: status.braking)
         process.begin(NoBrake())
@@ -328,7 +307,7 @@ def test_requests_over_lcm(hub: Hub) -> None:
 # -- its end
 
 
-def test_machine_that_waits_in_lock_step_ends_with_who_started_it_however_much_it_hears() -> None:
+def test_waiting_machine_ends_when_its_parent_closes() -> None:
     ours, theirs = socket.socketpair()
     # It hears its own status, takes it for a request, and answers by its status.
     config = MachineConfig(control_channel="TALK", status_channel="TALK")
@@ -344,7 +323,7 @@ def test_machine_that_waits_in_lock_step_ends_with_who_started_it_however_much_i
     assert not went_on
 
 
-def test_machine_dies_when_told(hub: Hub) -> None:
+def test_machine_dies_on_request(hub: Hub) -> None:
     with MachineProcess(RobotScenario(), hub.url) as process:
         assert process.die() == DIED
         assert not process.alive
@@ -354,7 +333,7 @@ def test_machine_dies_when_told(hub: Hub) -> None:
         assert process.status().faults == []
 
 
-def test_machine_can_be_killed(hub: Hub) -> None:
+def test_machine_is_killed_from_outside(hub: Hub) -> None:
     with MachineProcess(RobotScenario(), hub.url) as process:
         assert process.kill() == -signal.SIGKILL
         assert not process.alive
@@ -375,7 +354,7 @@ def test_closing_a_paused_machine_leaves_no_process(hub: Hub) -> None:
     assert not is_there(pid)
 
 
-def test_machine_ends_with_the_process_that_started_it(hub: Hub) -> None:
+def test_machine_ends_with_its_parent(hub: Hub) -> None:
     program = f"""
 import os
 from tests.machine.robot import RobotScenario
@@ -404,7 +383,7 @@ def test_machine_outlives_its_hub() -> None:
         process.close()
 
 
-def test_machine_in_lock_step_tells_its_state_to_those_who_come_late() -> None:
+def test_late_controller_gets_the_state_in_lock_step() -> None:
     with Hub(port=0) as first:
         port = int(first.url.rpartition(":")[2])
         process = MachineProcess(RobotScenario(), first.url, lock_step=True)
@@ -430,7 +409,7 @@ def test_machine_without_a_hub_does_not_start() -> None:
         MachineProcess(RobotScenario(), url).start()
 
 
-def test_error_of_the_scenario_is_told(hub: Hub) -> None:
+def test_machine_without_protocol_does_not_start(hub: Hub) -> None:
     with pytest.raises(MachineError, match="AcrobotScenario has no protocol for its machine"):
         MachineProcess(AcrobotScenario(), hub.url).start()
 

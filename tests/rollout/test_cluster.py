@@ -43,7 +43,7 @@ def test_each_worker_builds_its_testbed_once(cluster, tmp_path):
     assert os.getpid() not in processes
 
 
-def test_the_dashboard_is_dasks_and_knows_the_workers(cluster):
+def test_dashboard_shows_the_workers(cluster):
     def page(path):
         with urllib.request.urlopen(cluster.dashboard + path, timeout=20) as response:
             return response.read().decode()
@@ -55,7 +55,7 @@ def test_the_dashboard_is_dasks_and_knows_the_workers(cluster):
     assert "Dask" in status and "Bokeh" in status, "the charts are there"
 
 
-def test_what_the_workers_were_told_is_taken_back_at_the_end(cluster):
+def test_close_removes_tasks_from_the_workers(cluster):
     def told():
         plugins = cluster.client.run(lambda dask_worker: [name for name in dask_worker.plugins if "vtbdrake" in name])
         return {name for names in plugins.values() for name in names}
@@ -76,14 +76,14 @@ def _bad(theta):
     raise RuntimeError("not today")
 
 
-def test_an_error_in_the_quality_reaches_the_user_and_the_cluster_goes_on(cluster):
+def test_cluster_works_after_a_quality_error(cluster):
     with DaskExecutor(cluster.client) as executor:
         with pytest.raises(QualityError, match="_bad at t = 0 s, .* raises RuntimeError: not today"):
             list(executor.run(RolloutTask(PendulumScenario(), 0.3, Quality(_bad, THETA)), _points(6)))
         _assert_right(executor, TASK, _points(3))
 
 
-def test_an_interruption_takes_back_what_has_not_begun(cluster):
+def test_interruption_cancels_what_has_not_begun(cluster):
     with DaskExecutor(cluster.client) as executor:
         rollouts = executor.run(TASK, _points(1000))
         next(rollouts)
@@ -92,7 +92,7 @@ def test_an_interruption_takes_back_what_has_not_begun(cluster):
 
 
 @pytest.mark.parametrize("how", [KILL, KILL_PARENT])
-def test_a_killed_worker_costs_nothing_but_time(how, cluster, tmp_path, caplog):
+def test_killed_dask_worker_costs_only_time(how, cluster, tmp_path, caplog):
     """Kill -9, in the midst of a simulation, to the process that simulates or to the worker itself."""
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -114,7 +114,7 @@ def test_a_killed_worker_costs_nothing_but_time(how, cluster, tmp_path, caplog):
         (HANG, 0.5, "it took longer than its time limit of 0.5 s"),
     ],
 )
-def test_a_rollout_that_crashes_or_hangs_is_given_up_after_two_tries(how, time_limit, reason, cluster, tmp_path):
+def test_rollout_that_crashes_or_hangs_fails_after_two_tries(how, time_limit, reason, cluster, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
@@ -128,7 +128,7 @@ def test_a_rollout_that_crashes_or_hangs_is_given_up_after_two_tries(how, time_l
     assert results[2].parameters == points[2]
 
 
-def test_a_rollout_with_which_workers_are_lost_fails_alone(cluster, tmp_path):
+def test_rollout_that_kills_dask_workers_fails_alone(cluster, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
@@ -139,7 +139,7 @@ def test_a_rollout_with_which_workers_are_lost_fails_alone(cluster, tmp_path):
     assert "its workers died again and again" in results[2].message
 
 
-def test_a_closed_executor_leaves_no_processes_on_the_workers(cluster):
+def test_closed_executor_leaves_no_processes_on_the_workers(cluster):
     executor = DaskExecutor(cluster.client)
     list(executor.run(TASK, _points(4)))
     assert any(cluster.client.run(_children_of_this_process).values())
@@ -157,7 +157,7 @@ def _slow(theta):
     return abs(theta)
 
 
-def test_a_rollout_beyond_its_time_limit_has_failed(cluster):
+def test_rollout_beyond_its_time_limit_fails(cluster):
     task = RolloutTask(PendulumScenario(), 100.0, Quality(_slow, THETA), threshold=0.5)
     with DaskExecutor(cluster.client, time_limit=1.0) as executor:
         results = dict(executor.run(task, [{THETA: 1.0}, {THETA: 0.1}, {THETA: 1.0}]))
@@ -165,7 +165,7 @@ def test_a_rollout_beyond_its_time_limit_has_failed(cluster):
     assert results[1].message.count("it took longer than its time limit of 1 s") == 2
 
 
-def test_dask_by_name_goes_to_the_scheduler_in_the_environment(cluster, monkeypatch):
+def test_dask_by_name_uses_the_scheduler_in_the_environment(cluster, monkeypatch):
     testbed = PendulumScenario().build()
     monkeypatch.setenv(ADDRESS, cluster.address)
     with make_executor("dask", testbed=testbed, rollouts=3, time_limit=60.0) as executor:
@@ -178,7 +178,7 @@ def test_dask_by_name_goes_to_the_scheduler_in_the_environment(cluster, monkeypa
         make_executor("dask", testbed=testbed, rollouts=3, workers=2)
 
 
-def test_a_client_stays_the_users(cluster):
+def test_client_of_the_user_stays_open(cluster):
     with make_executor(cluster.client, testbed=PendulumScenario().build(), rollouts=3) as executor:
         assert isinstance(executor, DaskExecutor)
     assert cluster.client.status == "running"
@@ -188,7 +188,7 @@ def test_a_client_stays_the_users(cluster):
     assert client.status == "closed"
 
 
-def test_a_scheduler_that_ends_is_an_error_not_a_wait():
+def test_lost_scheduler_is_an_error():
     with dask_cluster(workers=1) as short, Client(short.address, timeout="1s", set_as_default=False) as client:
         rollouts = DaskExecutor(client).run(TASK, _points(1000))
         next(rollouts)
@@ -197,7 +197,7 @@ def test_a_scheduler_that_ends_is_an_error_not_a_wait():
             list(rollouts)
 
 
-def test_nothing_listens_there():
+def test_missing_scheduler_is_an_error():
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(WorkerError, match="no Dask scheduler answers at tcp://127.0.0.1:9: start one"),

@@ -1,4 +1,4 @@
-"""Pools that the user brings: nothing is lost with them, and they stay the user's."""
+"""Pools of the user: broken pools lose little, and the user closes them."""
 
 import concurrent.futures
 import os
@@ -62,14 +62,14 @@ class Counting(concurrent.futures.Executor):
 
 
 @pytest.mark.parametrize(("in_flight", "most"), [(None, 4), (3, 3)])
-def test_the_pool_is_given_a_few_rollouts_at_a_time(in_flight, most):
+def test_pool_gets_a_few_rollouts_at_a_time(in_flight, most):
     pool = Counting(2)
     with FuturesExecutor(pool, in_flight=in_flight) as executor:
         assert len(list(executor.run(TASK, _points(20)))) == 20
     assert (pool.submitted, pool.most) == (20, most)
 
 
-def test_an_interruption_takes_back_what_has_not_begun():
+def test_interruption_cancels_what_has_not_begun():
     pool = Counting(1)
     rollouts = FuturesExecutor(pool, in_flight=8).run(TASK, _points(100))
     next(rollouts)
@@ -91,7 +91,7 @@ def test_each_process_builds_its_testbed_once(pool, request, tmp_path):
     assert len(set(processes)) == len(processes) <= 2
 
 
-def test_the_pool_stays_the_users(process_pool):
+def test_pool_of_the_user_stays_open(process_pool):
     executor = make_executor(process_pool, testbed=TASK.scenario.build(), rollouts=2)
     with executor:
         assert isinstance(executor, FuturesExecutor)
@@ -103,14 +103,14 @@ def _bad(theta):
 
 
 @pytest.mark.parametrize("pool", POOLS)
-def test_an_error_in_the_quality_reaches_the_user_and_the_pool_goes_on(pool, request):
+def test_pool_works_after_a_quality_error(pool, request):
     with FuturesExecutor(request.getfixturevalue(pool)) as executor:
         with pytest.raises(QualityError, match="_bad at t = 0 s, .* raises RuntimeError: not today"):
             list(executor.run(RolloutTask(PendulumScenario(), 0.3, Quality(_bad, THETA)), _points(6)))
         assert len(list(executor.run(TASK, _points(3)))) == 3
 
 
-def test_what_cannot_travel_is_an_error_with_the_remedy(process_pool):
+def test_unpicklable_task_is_an_error_with_a_remedy(process_pool):
     lock = threading.Lock()
     task = RolloutTask(PendulumScenario(), 0.3, Quality(lambda t: float(lock.locked()), THETA))
     with pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
@@ -127,7 +127,7 @@ def _loky(**options):
 
 @pytest.mark.parametrize("make", [_standard, _loky])
 @pytest.mark.parametrize("how", [KILL, -KILL])
-def test_a_killed_process_of_a_pool_costs_its_own_rollout_only(make, how, tmp_path, caplog):
+def test_killed_process_costs_its_own_rollout(make, how, tmp_path, caplog):
     """Once, and then it is run again; or each time."""
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -147,7 +147,7 @@ def test_a_killed_process_of_a_pool_costs_its_own_rollout_only(make, how, tmp_pa
 
 
 @pytest.mark.parametrize(("make", "error"), [(_standard, "BrokenProcessPool"), (_loky, "TerminatedWorkerError")])
-def test_a_broken_pool_that_cannot_be_replaced_costs_what_it_had(make, error, tmp_path):
+def test_broken_pool_without_replacement_loses_its_rollouts(make, error, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
@@ -165,7 +165,7 @@ def test_a_broken_pool_that_cannot_be_replaced_costs_what_it_had(make, error, tm
     assert results[2].parameters == points[2]
 
 
-def test_ray_tries_a_lost_rollout_again(ray_pool, tmp_path):
+def test_ray_repeats_a_lost_rollout(ray_pool, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
@@ -174,7 +174,7 @@ def test_ray_tries_a_lost_rollout_again(ray_pool, tmp_path):
     assert not any(result.failed for result in results.values())
 
 
-def test_processes_of_mpi_give_identical_results(tmp_path):
+def test_mpi_gives_identical_results(tmp_path):
     pytest.importorskip("mpi4py")
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     mpiexec = shutil.which("mpiexec", path=path)
@@ -204,19 +204,19 @@ def test_processes_of_mpi_give_identical_results(tmp_path):
     assert done.stdout.split() == ["2", "12"], done.stderr
 
 
-def test_a_pool_that_was_shut_down_takes_no_more():
+def test_pool_after_shutdown_is_an_error():
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
     with pytest.raises(WorkerError, match="ThreadPoolExecutor takes no more rollouts: cannot schedule new futures"):
         list(FuturesExecutor(pool).run(TASK, _points(1)))
 
 
-def test_something_must_be_in_flight():
+def test_no_rollouts_in_flight_is_refused():
     with pytest.raises(ValueError, match="at least one rollout must be in flight, not 0"):
         FuturesExecutor(ThreadPoolExecutor(1), in_flight=0)
 
 
-def test_make_executor_tells_what_a_pool_decides_itself():
+def test_make_executor_refuses_options_of_the_pool():
     testbed = AcrobotScenario().build()
     with pytest.raises(ValueError, match="a pool that is there already has its own settings: workers=2"):
         make_executor(ThreadPoolExecutor(1), testbed=testbed, rollouts=2, workers=2)

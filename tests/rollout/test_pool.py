@@ -1,4 +1,4 @@
-"""An executor outlives its tasks, the errors in them, and its workers."""
+"""Executors over several tasks, after errors, and after the loss of workers."""
 
 import gc
 import os
@@ -59,7 +59,7 @@ def _assert_right(executor, task, points):
 
 
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
-def test_a_second_task_gets_its_own_results(make):
+def test_second_task_gets_its_own_results(make):
     with make() as executor:
         _assert_right(executor, ANGLE, POINTS)
         _assert_right(executor, OTHER, POINTS)
@@ -74,7 +74,7 @@ def _slow_and_refuses_large_angles(theta):
 
 
 @pytest.mark.parametrize("make", [lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
-def test_after_an_error_in_the_quality_the_pool_serves_another_task(make):
+def test_executor_works_after_a_quality_error(make):
     # The first point is refused at once, while the second one is on its way for 6 s.
     troubled = RolloutTask(AcrobotScenario(), 3.0, Quality(_slow_and_refuses_large_angles, SHOULDER))
     with make() as executor:
@@ -88,7 +88,7 @@ def test_after_an_error_in_the_quality_the_pool_serves_another_task(make):
     assert error_after < 4.0
 
 
-def test_a_worker_that_died_while_idle_costs_nothing(caplog):
+def test_worker_that_died_while_idle_costs_nothing(caplog):
     with ProcessExecutor(2) as executor:
         _assert_right(executor, ANGLE, POINTS)
         executor._workers[0].child.kill()
@@ -106,7 +106,7 @@ def _children():
         return [int(pid) for pid in file.read().split()]
 
 
-def test_a_worker_that_is_killed_while_it_starts_costs_nothing():
+def test_worker_killed_while_starting_costs_nothing():
     others = set(_children())
     with ProcessExecutor(2) as executor:
         executor.start(2)
@@ -115,7 +115,7 @@ def test_a_worker_that_is_killed_while_it_starts_costs_nothing():
         _assert_right(executor, ANGLE, POINTS)
 
 
-def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch, tmp_path):
+def test_all_workers_killed_while_starting_is_an_error(monkeypatch, tmp_path):
     python = tmp_path / "python"
     python.write_text("#!/bin/sh\nkill -9 $$\n")
     python.chmod(0o755)
@@ -124,7 +124,7 @@ def test_workers_that_are_all_killed_while_they_start_are_an_error(monkeypatch, 
         list(executor.run(ANGLE, POINTS))
 
 
-def test_a_closed_executor_has_no_processes_left():
+def test_closed_executor_leaves_no_processes():
     executor = ProcessExecutor(2)
     _assert_right(executor, ANGLE, POINTS[:2])
     children = [worker.child for worker in executor._workers]
@@ -133,7 +133,7 @@ def test_a_closed_executor_has_no_processes_left():
     assert not any(child.alive for child in children)
 
 
-def test_an_error_in_one_thread_is_raised_when_the_others_have_stopped():
+def test_error_in_a_thread_stops_the_others():
     calls = []
     both = threading.Barrier(2)
 
@@ -157,7 +157,7 @@ def test_an_error_in_one_thread_is_raised_when_the_others_have_stopped():
 
 
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(1)])
-def test_a_testbed_is_built_once_for_all_calls(make, tmp_path):
+def test_testbed_is_built_once(make, tmp_path):
     file = tmp_path / "built"
     task = RolloutTask(RecordedScenario(file=str(file)), 0.1, Quality(_angle, THETA))
     with make() as executor:
@@ -167,7 +167,7 @@ def test_a_testbed_is_built_once_for_all_calls(make, tmp_path):
         assert len(file.read_text().split()) == 1 + 4
 
 
-def test_a_worker_that_has_grown_is_replaced(tmp_path):
+def test_worker_that_has_grown_is_replaced(tmp_path):
     file = tmp_path / "built"
     task = RolloutTask(GreedyScenario(file=str(file)), 0.1, Quality(_angle, THETA))
     points = [{"scenario.stiffness": 0.1 * i, THETA: 0.1} for i in range(12)]
@@ -184,13 +184,13 @@ def test_a_worker_that_has_grown_is_replaced(tmp_path):
 
 
 @pytest.mark.parametrize("growth", [0.0, -1.0, "much"])
-def test_a_growth_that_is_no_size_is_refused(growth):
+def test_impossible_growth_is_refused(growth):
     with pytest.raises(ValueError, match="the growth of a worker's memory"):
         ProcessExecutor(1, growth=growth)
 
 
 @pytest.mark.parametrize("finished", [1, 2])
-def test_a_call_that_its_executor_does_not_outlive_is_an_error(finished):
+def test_closing_during_a_call_is_an_error(finished):
     with ProcessExecutor(1) as executor:
         rollouts = executor.run(ANGLE, POINTS)
         for _ in range(finished):
@@ -199,7 +199,7 @@ def test_a_call_that_its_executor_does_not_outlive_is_an_error(finished):
         list(rollouts)
 
 
-def test_two_calls_at_a_time_of_processes_are_refused():
+def test_second_call_during_a_call_is_refused():
     with ProcessExecutor(1) as executor:
         first = executor.run(ANGLE, POINTS)
         next(first)
@@ -209,7 +209,7 @@ def test_two_calls_at_a_time_of_processes_are_refused():
         _assert_right(executor, OTHER, POINTS)
 
 
-def test_workers_end_with_a_main_process_that_is_killed(tmp_path):
+def test_workers_end_with_a_killed_main_process(tmp_path):
     """Also one whose rollout hangs, and so never looks whether there is anyone left to answer to."""
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -247,7 +247,7 @@ def test_threads_are_kept_between_calls():
     assert threading.get_ident() not in seen
 
 
-def test_an_executor_that_is_forgotten_leaves_no_threads():
+def test_forgotten_executor_leaves_no_threads():
     task = RolloutTask(PendulumScenario(), 0.1, Quality(_angle, THETA))
     executor = ThreadExecutor(2)
     list(executor.run(task, [{THETA: 0.1}] * 4))
@@ -281,7 +281,7 @@ class PickledScenario(PendulumScenario):
         return super().__reduce_ex__(protocol)
 
 
-def test_a_task_is_pickled_once_for_all_calls():
+def test_task_is_pickled_once():
     task = RolloutTask(PickledScenario(), 0.1, Quality(_angle, THETA))
     PickledScenario.count = 0
     with ProcessExecutor(1) as executor:
