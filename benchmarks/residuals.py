@@ -112,7 +112,7 @@ def arm_loop(*, seed: int, mass: float | None = None) -> Iterator[Runtime]:
                 patience=PATIENCE / PERIOD,
                 continuity=CONTINUITY,
             )
-            while not all(reception.count for reception in bridge.sensed.values()):
+            while not all(received.count for received in bridge.sensed.values()):
                 bridge.poll(PATIENCE)
             runtime.switch("real")
             runtime.write({"u.motion": float(CIRCLE)})

@@ -135,7 +135,7 @@ class _Real:
     def __enter__(self) -> _Real:
         self._machine.start()
         deadline = time.monotonic() + PATIENCE
-        while not all(reception.count for reception in self._bridge.sensed.values()):
+        while not all(received.count for received in self._bridge.sensed.values()):
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the machine has not told its state in {PATIENCE:g} s")
             self._bridge.poll(1.0)

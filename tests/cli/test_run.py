@@ -73,7 +73,7 @@ def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
         scenario.deploy(hub.url, target=testbed, context=context) as runtime,
     ):
         ear = Ear(hub.url)
-        while not all(reception.count for reception in runtime.bridge.sensed.values()):
+        while not all(received.count for received in runtime.bridge.sensed.values()):
             assert runtime.bridge.poll(PATIENCE)
         runtime.switch("real")
         runtime.cycle()

@@ -47,8 +47,8 @@ class ScriptedBridge(Bridge):
         now = self._clock.now()
         values = self.sensors(now)
         for name, value in values.items():
-            reception = self.sensed[name]
-            reception.value, reception.arrived, reception.count = np.asarray(value), now, reception.count + 1
+            received = self.sensed[name]
+            received.value, received.arrived, received.count = np.asarray(value), now, received.count + 1
         return len(values)
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:

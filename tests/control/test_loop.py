@@ -164,7 +164,7 @@ class Loop:
     def sense(self) -> None:
         """Waits until every sensor signal has arrived."""
         for _ in range(round(PATIENCE)):
-            if all(reception.count for reception in self.bridge.sensed.values()):
+            if all(received.count for received in self.bridge.sensed.values()):
                 return
             self.bridge.poll(1.0)
 

@@ -1,4 +1,4 @@
-"""Numbers in the byte order of LCM, big-endian, at any place in memory."""
+"""Big-endian numbers, as LCM sends them, at any address."""
 
 from libc.stdint cimport uint16_t, uint32_t, uint64_t
 from libc.string cimport memcpy

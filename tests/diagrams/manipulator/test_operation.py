@@ -73,14 +73,14 @@ def test_the_motion_is_chosen_over_lcm() -> None:
         bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
         bridge.open()
         runtime = Runtime(testbed, bridge, clock=SimulatedClock())
-        speaker, reception = lcm.LCM(hub.url), bridge.commands["motion"]
+        speaker, received = lcm.LCM(hub.url), bridge.commands["motion"]
 
         def say(utime: int, motion: float) -> None:
             message = lcmt_scope()
             message.utime, message.size, message.value = utime, 1, [motion]
-            known, limit = (reception.count, sum(reception.rejected.values())), time.monotonic() + PATIENCE
+            known, limit = (received.count, sum(received.rejected.values())), time.monotonic() + PATIENCE
             speaker.publish("ARM_MOTION", message.encode())
-            while (reception.count, sum(reception.rejected.values())) == known:
+            while (received.count, sum(received.rejected.values())) == known:
                 assert time.monotonic() < limit
                 runtime.cycle()
 
@@ -92,7 +92,7 @@ def test_the_motion_is_chosen_over_lcm() -> None:
         runtime.run(cycles=2500)
         bridge.close()
     assert (before, refused) == (HOME, HOME)
-    assert reception.rejected == {"limits": 1}
+    assert received.rejected == {"limits": 1}
     assert testbed.read(runtime.context, "dps.impl.motion") == CIRCLE
 
 

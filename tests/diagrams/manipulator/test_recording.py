@@ -42,7 +42,7 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
     ):
         bridge.open()
         for _ in range(round(PATIENCE)):
-            if all(reception.count for reception in bridge.sensed.values()):
+            if all(received.count for received in bridge.sensed.values()):
                 break
             bridge.poll(1.0)
         runtime.switch("real")

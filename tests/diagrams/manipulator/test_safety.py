@@ -127,7 +127,7 @@ class GuardedArm:
         self.context = WORLD.default_context()
         self.simulator = WORLD.simulator(self.context)
         self.simulator.Initialize()
-        self.receptions = {signal.name: ReceivedSignal() for signal in interface.sense}
+        self.received = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.heard: Callable[[dict[str, Any]], dict[str, Any]] = lambda measured: measured
         self.cycles = 1
         self.simulator.AdvanceTo(T)  # The sensors measure what the arm's brakes hold.
@@ -144,9 +144,9 @@ class GuardedArm:
 
     def cycle(self, **options: Any) -> Verdict:
         now = self.cycles * T
-        for name, value in self.heard({name: self.measured(name) for name in self.receptions}).items():
-            self.receptions[name].accept(np.array(value), now, now)
-        verdict = self.guards.check(now, self.receptions, {"joint_torque": gravity(self.pose)}, **options)
+        for name, value in self.heard({name: self.measured(name) for name in self.received}).items():
+            self.received[name].accept(np.array(value), now, now)
+        verdict = self.guards.check(now, self.received, {"joint_torque": gravity(self.pose)}, **options)
         self.guards.note_unsent(())
         if "joint_torque" in verdict.actuation:
             WORLD.actuate(self.context, "joint_torque", verdict.actuation["joint_torque"])
@@ -158,7 +158,7 @@ class GuardedArm:
         return [self.cycle() for _ in range(cycles)]
 
     def reset(self) -> tuple[str, ...]:
-        return self.guards.reset(self.cycles * T, self.receptions)
+        return self.guards.reset(self.cycles * T, self.received)
 
 
 def test_arm_whose_sensors_fall_silent_is_carried_and_then_left_to_its_brakes() -> None:

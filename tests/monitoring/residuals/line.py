@@ -30,9 +30,9 @@ class Ear(Bridge):
         self.commands = {}
         self.heard: deque[tuple[str, bytes]] = deque()
         signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
-        receptions = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
+        received = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
         self._readers = {
-            map.channel: ChannelReader(map, [signals[name] for name in map.signals], receptions, 0.1)
+            map.channel: ChannelReader(map, [signals[name] for name in map.signals], received, 0.1)
             for map in protocol.sense
         }
 
