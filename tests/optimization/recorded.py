@@ -19,7 +19,7 @@ def point(
     exact: bool = True,
     method: str = "TPE",
 ) -> Mapping[str, Any]:
-    """A judged point; without values, one that failed."""
+    """Return an evaluated point; without values, one that failed."""
     return {"at": tuple(at), "values": values, "violations": tuple(violations), "exact": exact, "method": method}
 
 

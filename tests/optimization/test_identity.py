@@ -1,4 +1,4 @@
-"""When a problem is the same one: it is not the way in which it is written that counts, but what it means."""
+"""The identity of a problem: its meaning counts, not the way in which it is written."""
 
 import functools
 import importlib

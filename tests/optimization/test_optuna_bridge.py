@@ -240,7 +240,7 @@ def test_a_study_moves_to_another_file_by_way_of_optuna(url):
     assert values == {tuple(t.parameters.values()): t.values for t in first.trials}
 
 
-def test_points_of_others_are_judged_by_our_rollouts(url):
+def test_points_of_others_are_evaluated_by_our_rollouts(url):
     theirs = optuna.create_study(storage=url, study_name="theirs")
     theirs.enqueue_trial({THETA: 0.25, RATE: -1.0})
     theirs.add_trial(
@@ -258,8 +258,8 @@ def test_points_of_others_are_judged_by_our_rollouts(url):
     assert study.import_optuna(url, "theirs") == 2
     assert study.import_optuna(url, "theirs") == 0, "they wait already"
     run(study, 16)
-    judged = {tuple(t.parameters.values()): t.value for t in study.trials if t.origin == "user"}
-    assert judged == {at: problem.rollout(at).value for at in [(0.25, -1.0), (0.5, 0.5)]}
+    evaluated = {tuple(t.parameters.values()): t.value for t in study.trials if t.origin == "user"}
+    assert evaluated == {at: problem.rollout(at).value for at in [(0.25, -1.0), (0.5, 0.5)]}
     assert study.import_optuna(url, "theirs") == 0
 
 

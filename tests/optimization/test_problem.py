@@ -157,7 +157,7 @@ def test_a_range_that_is_empty_or_reversed_is_refused(lower, upper):
         ({"horizon": -1.0}, "horizon t_m must be positive"),
         ({"quality": _angle}, r"give quality as Quality\(f, of=.* not as <function _angle"),
         ({"quality": None}, "give quality as .* not as None"),
-        ({"quality": [vtb.Constraint(_angle, THETA, at_most=1.0)]}, "give quality as .* Constraint.* has no place"),
+        ({"quality": [vtb.Constraint(_angle, THETA, at_most=1.0)]}, "give quality as .* Constraint.* does not fit"),
         ({"constraints": vtb.Constraint(_angle, THETA, at_most=1.0)}, "give constraints as .* not as Constraint"),
         ({"constraints": [vtb.Quality(_angle, THETA)]}, "give constraints as .* Quality.* does not fit"),
         ({"parameters": OMEGA}, r"give parameters as \[Parameter\(address, lower, upper\), ...\], not as 'sim"),

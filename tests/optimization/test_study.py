@@ -257,7 +257,7 @@ def _rollouts(path: Path) -> int:
         return 0
 
 
-def test_points_given_by_another_process_are_judged_and_told(tmp_path):
+def test_points_given_by_another_process_are_evaluated_and_told(tmp_path):
     path = tmp_path / "a.db"
     pendulum_problem().study(path, solver="cmaes", seed=1).run(rollouts=12, executor="serial", progress=False).close()
     code = (

@@ -1,6 +1,9 @@
 """The file of a study when it cannot be used: what is said, and that nothing is lost."""
 
+import json
 import random
+import sqlite3
+import zlib
 
 import pytest
 
@@ -51,6 +54,29 @@ def test_a_closed_study_says_that_it_is_closed(tmp_path):
     for use in (lambda: study.trials, lambda: study.add([0.0, 0.0]), lambda: study.run(rollouts=1, progress=False)):
         with pytest.raises(StudyError, match=r"a\.db is closed"):
             use()
+
+
+def test_a_file_with_trials_at_negative_positions_goes_on(tmp_path):
+    path = tmp_path / "a.db"
+    with pendulum_problem().study(path, solver="sobol") as study:
+        study.run(rollouts=8, executor="serial", progress=False)
+    # Files used to keep the trials of an earlier solver there.
+    with sqlite3.connect(path) as db:
+        rows = [
+            ("trials", (batch, position - 100, *rest))
+            for batch, position, *rest, _ in db.execute("SELECT * FROM trials").fetchall()
+        ]
+        db.execute("DELETE FROM trials")
+        db.execute("DELETE FROM meta WHERE key IN ('told', 'first_position')")
+        for table, row in [*rows, ("meta", ("told", json.dumps(0)))]:
+            sealed = (*row, zlib.crc32(repr((table, *row)).encode()))
+            db.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(sealed))})", sealed)
+    db.close()
+    whole = pendulum_problem().study(solver="sobol").run(rollouts=16, executor="serial", progress=False)
+    with pendulum_problem().study(path) as study:
+        assert len(study.trials) == 8
+        study.run(rollouts=16, executor="serial", progress=False)
+        assert [trial.point for trial in study.trials] == [trial.point for trial in whole.trials]
 
 
 def everything(path):

@@ -31,7 +31,7 @@ _REPEATS = 5
 
 @dataclass(frozen=True)
 class Chance:
-    """How often a value was unsafe when its rollout was repeated under one condition with jittered start values.
+    """The share of unsafe rollouts of one value, repeated under one condition with jittered start values.
 
     Attributes:
         value: the parameter's value.
@@ -47,12 +47,12 @@ class Chance:
 
     @property
     def share(self) -> float:
-        """The share of unsafe rollouts."""
+        """Return the share of unsafe rollouts."""
         return self.unsafe / self.rollouts
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % confidence interval of the probability of an unsafe rollout (Clopper and Pearson, 1934)."""
+        """Return the 95 % confidence interval of the probability of an unsafe rollout (Clopper and Pearson, 1934)."""
         from scipy.stats import binomtest  # It takes longer to load than all the rest.
 
         found = binomtest(self.unsafe, self.rollouts).proportion_ci(0.95, method="exact")
@@ -109,7 +109,7 @@ class Boundary:
 
     @property
     def worst_chances(self) -> tuple[Chance, ...]:
-        """The chance of each repeated value under its worst condition, in the order of the values."""
+        """Return the chance of each repeated value under its worst condition, in the order of the values."""
         worst: dict[float, Chance] = {}
         for chance in self.chances:
             if chance.value not in worst or chance.share > worst[chance.value].share:

@@ -82,7 +82,7 @@ class ProblemFunction(casadi.Callback):
 
     @property
     def rollouts(self) -> int:
-        """The number of rollouts so far."""
+        """Return the number of rollouts so far."""
         return len(self._known)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Evaluates points of a problem: the rollouts that they take, their values over all conditions, their gradients."""
+"""The evaluation of points: the rollouts that they take, their values over all conditions, their gradients."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _STEP = 1e-7
 
 
 class Evaluator:
-    """Evaluates batches of points by rollouts that are known, or are run.
+    """An evaluator of batches of points, by rollouts that are known or are run.
 
     Args:
         problem: what is asked.

@@ -1,4 +1,4 @@
-"""What a study is about, as plain data: enough to tell another problem from the same one."""
+"""The identity of a problem as plain data, and how another one differs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MEASURES = ("qualities", "constraints")
 
 
 def describe(problem: Problem) -> dict[str, Any]:
-    """A problem as JSON data."""
+    """Return a problem as JSON data."""
     task = problem.task
     described = {
         "scenario": problem.scenario.record(),
@@ -52,10 +52,14 @@ def describe(problem: Problem) -> dict[str, Any]:
 
 
 def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Values as they come back from a file.
+    """Return values as JSON gives them back.
+
+    Args:
+        values: what is to be stored, by name.
+        what: a word for the values in the error.
 
     Raises:
-        ValueError: one is neither a number, nor a word, nor made of these; the error says of ``what``.
+        ValueError: one is neither a number, nor a word, nor made of these.
     """
     try:
         found: dict[str, Any] = json.loads(json.dumps(dict(values), default=lambda value: value.tolist()))
@@ -79,16 +83,15 @@ def _measure(measure: Quality | Constraint) -> dict[str, Any]:
 
 
 def _code(function: Callable[..., Any]) -> str:
-    """A digest of a function: of its source text and of the values that it uses, see `_text`."""
+    """Return a digest of a function: of its source text and of the values that it uses, see `_text`."""
     return hashlib.sha256(_text(function).encode()).hexdigest()[:16]
 
 
 def _text(value: Any, seen: set[int] | None = None) -> str:
-    """The same text for the same value in every process.
+    """Return a text of a value that is the same in every process.
 
-    Plain data as they are; functions and classes by their source and by what they use: closure, default values, and the
-    constants, functions and classes of their module and of others of the user's; all else by its type and the plain
-    data in it.
+    Plain data is written out; functions and classes are given by their source and by what they use: closure, default
+    values, and the constants, functions and classes of the user's modules; all else by its type and its plain data.
     """
     seen = set() if seen is None else seen
     if isinstance(value, np.generic | np.ndarray):
@@ -125,13 +128,13 @@ def _text(value: Any, seen: set[int] | None = None) -> str:
 
 
 def _object_text(value: Any) -> str:
-    """The type of an object, and the plain data in it."""
+    """Return the type of an object, and the plain data in it."""
     plain = {k: v for k, v in getattr(value, "__dict__", {}).items() if isinstance(v, (*_PLAIN, *_ARRAYS))}
     return f"{type(value).__qualname__}({', '.join(f'{k}={_text(v)}' for k, v in plain.items())})"
 
 
 def _source(function: FunctionType) -> str | CodeType:
-    """Its source text; what was typed into an interpreter has none, but it has bytecode."""
+    """Return the source text of a function, or its code if it was typed into an interpreter."""
     try:
         return textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
@@ -139,7 +142,7 @@ def _source(function: FunctionType) -> str | CodeType:
 
 
 def _used(function: FunctionType) -> list[tuple[str, Any]]:
-    """What a function uses of its surroundings, by name; only data and the user's own code count."""
+    """Return the closure and the globals that a function uses, by name; only data and the user's own code count."""
     names, cells = function.__code__.co_freevars, function.__closure__ or ()
     closure = [(name, _content(cell)) for name, cell in zip(names, cells, strict=True)]
     words = _words(function.__code__)
@@ -156,7 +159,7 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
 
 
 def _words(code: CodeType) -> list[str]:
-    """The names that a function uses, and the functions and comprehensions in it."""
+    """Return the names that a function uses, with those of its inner functions and comprehensions."""
     inner = [word for constant in code.co_consts if isinstance(constant, CodeType) for word in _words(constant)]
     return list(dict.fromkeys([*code.co_names, *inner]))
 
@@ -169,7 +172,7 @@ def _content(cell: CellType) -> Any:
 
 
 def _members(kind: type) -> list[tuple[str, Any]]:
-    """The constants and functions of a class; what Python has generated follows from the rest."""
+    """Return the constants and functions of a class, without what Python has generated."""
     found = []
     for name, member in vars(kind).items():
         for attribute in ("__func__", "fget", "func"):  # Static and class methods, properties, cached properties.
@@ -182,7 +185,7 @@ def _members(kind: type) -> list[tuple[str, Any]]:
 
 
 def _is_own(thing: Any) -> bool:
-    """Whether a module, a class or a function is the user's: neither Python's, nor this package's, nor installed."""
+    """Return whether a module, class or function is the user's: not of Python, of this package, or installed."""
     return _is_own_module(thing.__name__ if isinstance(thing, ModuleType) else str(thing.__module__))
 
 
@@ -195,7 +198,7 @@ def _is_own_module(name: str) -> bool:
 
 
 def _classes(problem: Problem) -> dict[str, str]:
-    """Digests of the user's code in a testbed: its scenario and risk, its systems and the functions that they hold."""
+    """Return digests of the user's code in a testbed: scenario, risk, systems and the functions that they hold."""
     found: dict[str, Any] = {}
     for kind in (type(problem.scenario), type(problem.risk)):
         found[f"{kind.__module__}:{kind.__qualname__}"] = kind
@@ -228,12 +231,12 @@ def _start(problem: Problem) -> str:
 
 
 def dimensions(described: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """The parameters of a described problem."""
+    """Return the parameters of a described problem."""
     return tuple(Choice(**data) if "options" in data else Parameter(**data) for data in described["parameters"])
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """In what two described problems differ but in their code, each in a phrase."""
+    """Return the differences of two described problems except for their code, each as a phrase."""
     found = []
     for key in sorted({*theirs, *ours} - {"code"}):
         a, b = theirs.get(key), ours.get(key)
@@ -248,7 +251,7 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
 
 
 def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """What code of two described problems differs, which are the same otherwise, each in a phrase."""
+    """Return the differences in code of two otherwise equal described problems, each as a phrase."""
     pairs = ((a, b) for key in _MEASURES for a, b in zip(theirs[key], ours[key], strict=True))
     found = [
         f"the function {a['name']} has other code, or uses other values" for a, b in pairs if a["code"] != b["code"]
@@ -266,7 +269,7 @@ def _without_code(measures: Any) -> list[dict[str, Any]]:
 
 
 def versions() -> dict[str, str]:
-    """Of what decides about the numbers."""
+    """Return the versions of Python and of the packages on which the numbers depend."""
     found = {"python": platform.python_version()}
     for package in ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "optuna", "casadi"):
         try:
@@ -277,7 +280,7 @@ def versions() -> dict[str, str]:
 
 
 def revision(scenario: Scenario) -> str:
-    """The git revision of the folder that the scenario's class comes from, ``+`` if it was changed; empty without
+    """Return the git revision of the folder of the scenario's class, with ``+`` if it was changed; empty without
     git."""
     try:
         folder = Path(inspect.getfile(type(scenario))).parent

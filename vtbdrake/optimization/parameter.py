@@ -21,7 +21,7 @@ class _Addressed:
 
     @property
     def is_field(self) -> bool:
-        """Whether it is a field of the scenario."""
+        """Return whether it is a field of the scenario."""
         return self.address.startswith(FIELD)
 
     def _variable(self, variables: Variables) -> Variable:
@@ -77,17 +77,17 @@ class Parameter(_Addressed):
 
     @property
     def is_continuous(self) -> bool:
-        """Whether all numbers of the range are values, as gradients need it."""
+        """Return whether all numbers of the range are values, as gradients need it."""
         return not self.integer
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """The values at the ends of the range."""
+        """Return the values at the ends of the range."""
         return self.lower, self.upper
 
     @property
     def range_text(self) -> str:
-        """The range as text."""
+        """Return the range as text."""
         return f"[{self.lower:g}, {self.upper:g}]"
 
     def check(self, value: Any) -> float | int:
@@ -173,12 +173,12 @@ class Choice(_Addressed):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The options."""
+        """Return the options."""
         return self.options
 
     @property
     def range_text(self) -> str:
-        """The options as text."""
+        """Return the options as text."""
         return "{" + ", ".join(repr(option) for option in self.options) + "}"
 
     def check(self, value: Any) -> Any:

@@ -203,7 +203,7 @@ class Problem:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The units of the parameters; empty for fields of the scenario."""
+        """Return the units of the parameters; empty for fields of the scenario."""
         variables = self.testbed.variables()
         return tuple("" if p.is_field else variables[p.address].unit for p in self.parameters)
 

@@ -301,69 +301,68 @@ class Study:
 
     @property
     def queue(self) -> dict[int, dict[str, Any]]:
-        """The points given by hand that are not evaluated yet: number -> the point, address -> value."""
+        """Return the points given by hand that are not evaluated yet: number -> the point, address -> value."""
         return self._file.queue()
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """The attributes of the study, see `set_attribute`; those of a point are `Trial.attributes`."""
+        """Return the attributes of the study, see `set_attribute`; those of a point are `Trial.attributes`."""
         return self._file.attributes().get(None, {})
 
     # -- what it is about
 
     @property
     def path(self) -> Path | None:
-        """The path of the file; None if the study is in memory."""
+        """Return the path of the file; None if the study is in memory."""
         return self._file.path
 
     @property
     def parameters(self) -> tuple[Dimension, ...]:
-        """The parameters that are varied."""
+        """Return the parameters that are varied."""
         return dimensions(self._meta["problem"])
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The units of the parameters, see `Problem.units`."""
+        """Return the units of the parameters, see `Problem.units`."""
         return tuple(self._meta["units"])
 
     @property
     def directions(self) -> tuple[str, ...]:
-        """``maximize`` or ``minimize`` for each quality."""
+        """Return ``maximize`` or ``minimize`` for each quality."""
         return tuple(
             "minimize" if quality["minimize"] else "maximize" for quality in self.record["problem"]["qualities"]
         )
 
     @property
     def signs(self) -> tuple[float, ...]:
-        """1 for a quality, -1 for a cost."""
+        """Return 1 for a quality and -1 for a cost, for each of them."""
         return tuple(-1.0 if direction == "minimize" else 1.0 for direction in self.directions)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the qualities."""
+        """Return the names of the qualities."""
         return tuple(quality["name"] for quality in self._meta["problem"]["qualities"])
 
     @property
     def record(self) -> dict[str, Any]:
-        """What the study is about: the problem, the scenario, the solver, the seed, the versions, the git revision, and
-        the ``changes`` of the code that were allowed."""
+        """Return what describes the study: problem, solver, seed, versions, git revision, allowed code ``changes``."""
         return dict(self._meta)
 
     # -- what it has found
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """All evaluated points."""
+        """Return all evaluated points."""
         return tuple(self._file.trials())
 
     @property
     def rollouts(self) -> dict[RolloutKey, Outcome]:
-        """All finished rollouts by (point, number of the condition)."""
+        """Return all finished rollouts by (point, number of the condition)."""
         return self._file.outcomes()
 
     @property
     def finished(self) -> dict[RolloutKey, datetime]:
-        """The time at which each rollout was finished, in UTC."""
+        """Return the time at which each rollout was finished, in UTC."""
         return self._file.finished()
 
     def __len__(self) -> int:
@@ -372,7 +371,7 @@ class Study:
 
     @property
     def best(self) -> Trial:
-        """s^0*, equation (18), among the points examined: the best that keeps all constraints.
+        """Return s^0*, equation (18), among the points examined: the best that keeps all constraints.
 
         Raises:
             ValueError: there are several qualities, or no point has a value and keeps the constraints.

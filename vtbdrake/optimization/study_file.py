@@ -55,7 +55,7 @@ class StudyError(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a study keeps of one finished rollout; the fields have the meaning of those of `RolloutResult`."""
+    """The record of one finished rollout in a study; its fields are those of `RolloutResult`."""
 
     h: float
     value: float
@@ -83,7 +83,7 @@ class Trial(PointValues):
         violations: one per constraint, the worst over the conditions: at most 0 where it holds.
         exact: False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is
             known but that the point violates a constraint.
-        origin: ``solver`` or ``user``, depending on who asked for the point.
+        origin: ``solver`` or ``user``, whichever asked for the point.
         method: the solver's method at that time.
         batch: the number of the batch of points that were evaluated together.
         attributes: the user's notes on the point, see `Study.set_attribute`.
@@ -101,12 +101,12 @@ class Trial(PointValues):
 
     @property
     def point(self) -> Point:
-        """The values of the parameters, in their order."""
+        """Return the values of the parameters, in their order."""
         return tuple(self.parameters.values())
 
     @property
     def value(self) -> float:
-        """The value of the first quality."""
+        """Return the value of the first quality."""
         return self.values[0]
 
 
@@ -262,7 +262,7 @@ class StudyFile:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What the study is about: the problem, the solver, the seed and so on, by name."""
+        """Return the description of the study by name: the problem, the solver, the seed and so on."""
         return {key: json.loads(value) for key, value, _ in self._rows("meta")}
 
     def set(self, key: str, value: Any) -> None:
@@ -361,7 +361,7 @@ class StudyFile:
 
     def _withdraw(self) -> None:
         """Mark all trials as those of an earlier solver."""
-        after = self._number("SELECT coalesce(max(position), 0) + 1 FROM trials")
+        after = self._number("SELECT coalesce(max(position) + 1, 0) FROM trials")
         self._set({"told": 0, "first_position": max(after, self._get("first_position", 0))})
 
     def change_code(

@@ -1,4 +1,4 @@
-"""One run of a study: asks the solver, evaluates its points by rollouts, records them, and tells the solver."""
+"""One run of a study: ask the solver, evaluate and record its points, tell the solver."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LOG_PERIOD = 30.0
 
 
 class _RunEnd(Exception):  # noqa: N818
-    """The run is over, in the middle of a batch."""
+    """The end of a run in the middle of a batch."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)

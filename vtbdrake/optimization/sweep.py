@@ -93,38 +93,38 @@ class Sweep:
 
     @property
     def h(self) -> np.ndarray:
-        """h(s^0), equation (17), shape (n,); NaN where the rollout failed."""
+        """Return h(s^0), equation (17), shape (n,); NaN where the rollout failed."""
         return np.array([rollout.h for rollout in self.rollouts])
 
     @property
     def t_star(self) -> np.ndarray:
-        """t*, equation (16), in seconds, shape (n,); NaN where the rollout failed."""
+        """Return t*, equation (16), in seconds, shape (n,); NaN where the rollout failed."""
         return np.array([rollout.t_star for rollout in self.rollouts])
 
     @property
     def exceeded(self) -> np.ndarray:
-        """Whether the threshold was exceeded (G1, equation (14), has an element), shape (n,)."""
+        """Return whether the threshold was exceeded (G1, equation (14), has an element), shape (n,)."""
         return np.array([rollout.exceedances.size > 0 for rollout in self.rollouts], dtype=bool)
 
     @property
     def violated(self) -> np.ndarray:
-        """Whether a constraint of the problem was violated, shape (n,); False where the rollout failed."""
+        """Return whether a constraint of the problem was violated, shape (n,); False where the rollout failed."""
         first = len(self.minimize) - 1
         return np.array([max(rollout.measures[first:], default=0.0) > 0.0 for rollout in self.rollouts], dtype=bool)
 
     @property
     def unsafe(self) -> np.ndarray:
-        """Whether the threshold was exceeded, a constraint violated, or the simulation failed, shape (n,)."""
+        """Return whether the threshold was exceeded, a constraint violated, or the simulation failed, shape (n,)."""
         return self.exceeded | self.violated | self.failed
 
     @property
     def failed(self) -> np.ndarray:
-        """Whether the simulation failed, shape (n,)."""
+        """Return whether the simulation failed, shape (n,)."""
         return np.array([rollout.failed for rollout in self.rollouts], dtype=bool)
 
     @property
     def evaluations(self) -> tuple[Evaluation, ...]:
-        """The evaluation of each point that has finished all its conditions, as in a study.
+        """Return the evaluation of each point that has finished all its conditions, as in a study.
 
         Raises:
             ValueError: the sweep was loaded from a file that could not hold its risk.

@@ -257,8 +257,8 @@ def test_what_racing_dropped_is_no_start_of_a_local_search():
         if "around" in solver.method:
             break
         # Nothing bounds a quality without `upper`: what is dropped may be anything.
-        judged = [evaluation(p, SPHERE.cost) for p in points]
-        solver.tell([e if e.values[0] > -4.0 else replace(e, values=(np.inf,), exact=False) for e in judged])
+        told = [evaluation(p, SPHERE.cost) for p in points]
+        solver.tell([e if e.values[0] > -4.0 else replace(e, values=(np.inf,), exact=False) for e in told])
     solver.close()
     assert SPHERE.cost(points[0]) < 0.1
 
@@ -294,7 +294,7 @@ def test_auto_leaves_a_search_that_stalls(short_model):
     assert solver.message == "5 starts in a row found nothing better"
 
 
-def test_auto_judges_the_given_start_first():
+def test_auto_evaluates_the_given_start_first():
     solver = make_solver("auto", SPHERE.space, start=(3.0, 3.5))
     assert solver.ask() == [(3.0, 3.5)]
     solver.close()

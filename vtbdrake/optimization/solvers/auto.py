@@ -82,7 +82,7 @@ class Auto(Solver):
 
     @property
     def changes(self) -> tuple[tuple[int, str], ...]:
-        """The methods used so far, each with the number of evaluations asked for before it began."""
+        """Return the methods used so far, each with the number of evaluations asked for before it began."""
         return tuple(self._changes)
 
     # -- the plan
@@ -104,7 +104,7 @@ class Auto(Solver):
 
     @property
     def _batch(self) -> int:
-        """The number of points that the model asks for at a time; one if there are few, so that it learns from each."""
+        """Return the number of points that the model asks for at a time; 1 with a small budget, to learn from each."""
         return 4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4)
 
     def _global_stages(self) -> Iterator[None]:
@@ -187,12 +187,12 @@ class Auto(Solver):
 
     @property
     def _continuous(self) -> list[int]:
-        """The indices of the continuous parameters."""
+        """Return the indices of the continuous parameters."""
         return [i for i, parameter in enumerate(self.search.space) if parameter.is_continuous]
 
     @property
     def _local_limit(self) -> int:
-        """The largest number of evaluations of a local search."""
+        """Return the largest number of evaluations of a local search."""
         return 20 * (len(self._continuous) + 1)
 
     def _left_but_polish(self) -> float:

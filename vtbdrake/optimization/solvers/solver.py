@@ -33,24 +33,24 @@ class PointValues:
 
     @property
     def failed(self) -> bool:
-        """Whether the point has no value because a simulation failed."""
+        """Return whether the point has no value because a simulation failed."""
         # An infinite bound is no failure: it belongs to a dropped point of which little is known.
         return any(isnan(value) or (self.exact and isinf(value)) for value in self.values)
 
     @property
     def feasible(self) -> bool:
-        """Whether the point has values, or bounds of them, and keeps all constraints as far as is known."""
+        """Return whether the point has values, or bounds of them, and keeps all constraints as far as is known."""
         return not self.failed and all(violation <= 0.0 for violation in self.violations)
 
     @property
     def counts(self) -> bool:
-        """Whether the point can be the best: it is feasible, and its values are exact."""
+        """Return whether the point can be the best: it is feasible, and its values are exact."""
         return self.exact and self.feasible
 
 
 @dataclass(frozen=True)
 class Evaluation(PointValues):
-    """What a solver is told of a point.
+    """The record of a point that a solver is told.
 
     Attributes:
         point: s^0.
@@ -74,12 +74,12 @@ class Evaluation(PointValues):
 
     @property
     def usable(self) -> bool:
-        """Whether the simulation gave numbers, feasible or not."""
+        """Return whether the simulation gave numbers, feasible or not."""
         return not self.failed and not any(isnan(violation) for violation in self.violations)
 
     @property
     def total_violation(self) -> float:
-        """The sum of the violated constraints' violations."""
+        """Return the sum of the violated constraints' violations."""
         return sum(max(violation, 0.0) for violation in self.violations)
 
 
@@ -154,7 +154,7 @@ class Search:
 
     @property
     def size(self) -> int:
-        """The number of parameters, n."""
+        """Return the number of parameters, n."""
         return len(self.space)
 
     def point(self, u: Any) -> Point:
@@ -263,7 +263,7 @@ class Solver(ABC):
 
     @property
     def method(self) -> str:
-        """The name of the method in use at the moment."""
+        """Return the name of the method in use at the moment."""
         return self.name
 
     @abstractmethod
@@ -284,7 +284,7 @@ class Solver(ABC):
 
     @property
     def _left(self) -> int | None:
-        """The number of evaluations that may be asked for; None: any number."""
+        """Return the number of evaluations that may be asked for; None: any number."""
         # Efforts are fractions, whose sum is not exact.
         return None if self._budget is None else max(0, int(self._budget + 1e-6))
 

@@ -1,4 +1,4 @@
-"""Where a problem starts, how far its rollouts go, under which condition, and what half a sweep may say."""
+"""Sweeps: where a problem starts, how far its rollouts go, under which condition, and what half a sweep shows."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Racing: what it leaves out never changes the best point, whatever the kind of problem, risk and solver."""
+"""Racing: what it leaves out never changes the best point, for every problem, risk and solver."""
 
 import importlib.util
 import random
@@ -252,7 +252,7 @@ def test_one_failed_simulation_leaves_a_point_without_value():
     assert evaluations[a].failed and not evaluations[a].feasible
 
 
-def test_equal_points_are_judged_once():
+def test_equal_points_are_evaluated_once():
     a = (0.25,)
     runs: list = []
     known: dict = {}
