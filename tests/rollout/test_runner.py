@@ -479,3 +479,8 @@ class WithGusts(AcrobotScenario):
 def test_what_no_copy_can_repeat_is_refused():
     with pytest.raises(ValueError, match="no copy can continue"):
         WithGusts().build()
+
+
+def test_a_rollout_does_not_keep_the_pace_of_its_scenario():
+    paced = PendulumScenario(simulator_config=SimulatorConfig(accuracy=1e-3, target_realtime_rate=1.0))
+    assert RolloutRunner(RolloutTask(paced, 100.0)).run({}).wall_time < 50.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.primitives import ConstantValueSource, Gain
 
 from tests.testbeds import AcrobotScenario, PendulumScenario, PoseRelay
@@ -260,3 +261,10 @@ def test_value_that_was_given_is_not_changed_by_the_next() -> None:
     feed("force", first)
     feed("force", np.array([2.0]))
     assert first.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("make", [DpsAlone, WorldAlone])
+def test_a_loop_sets_the_pace_of_what_runs_alone(make):
+    scenario = AcrobotScenario(simulator_config=SimulatorConfig(target_realtime_rate=1.0))
+    assert make(scenario).simulator().get_target_realtime_rate() == 0.0
+    assert scenario.build().simulator().get_target_realtime_rate() == 1.0

@@ -54,7 +54,7 @@ class DpsAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            simulator_config=_without_plant(scenario.simulator_config),
+            simulator_config=_unpaced(scenario.simulator_config, has_plant=False),
             scenario=scenario,
             extra=board.command_variables(interface.commands),
         )
@@ -94,10 +94,12 @@ def _is_dps(path: str) -> bool:
     return path == "dps" or path.startswith("dps.")
 
 
-def _without_plant(config: SimulatorConfig) -> SimulatorConfig:
-    # CENIC integrates a MultibodyPlant, and there is none.
+def _unpaced(config: SimulatorConfig, *, has_plant: bool = True) -> SimulatorConfig:
+    """Return a config for a loop that sets the pace itself."""
     own = copy.deepcopy(config)
-    if own.integration_scheme == "cenic":
+    own.target_realtime_rate = 0.0
+    # CENIC integrates a MultibodyPlant.
+    if own.integration_scheme == "cenic" and not has_plant:
         own.integration_scheme = "runge_kutta3"
     return own
 
@@ -134,7 +136,7 @@ class WorldAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=parts.interface,
-            simulator_config=own.simulator_config,
+            simulator_config=_unpaced(own.simulator_config),
             scenario=own,
             extra=parts.extra_variables,
             plant_roles=parts.plant_roles(),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from typing import Any, Union
 
 import numpy as np
+import pydrake.manipulation
 from pydrake.geometry import (
     MakeRenderEngineGl,
     MakeRenderEngineGltfClient,
@@ -17,7 +19,6 @@ from pydrake.geometry import (
     SceneGraphConfig,
 )
 from pydrake.lcm import DrakeLcmParams
-from pydrake.manipulation import ApplyNamedPositionsAsDefaults, IiwaDriver, SchunkWsgDriver, ZeroForceDriver
 from pydrake.multibody.parsing import (
     GetScopedFrameByName,
     ModelDirective,
@@ -34,6 +35,9 @@ from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
 
 _log = logging.getLogger(__name__)
+# JointStiffnessDriver is newer than drake 1.51.
+_DRIVERS = ("IiwaDriver", "JointStiffnessDriver", "SchunkWsgDriver", "ZeroForceDriver")
+Driver: Any = Union[tuple(vars(pydrake.manipulation)[n] for n in _DRIVERS if n in dir(pydrake.manipulation))]  # noqa: UP007
 
 
 @dataclass
@@ -69,7 +73,7 @@ class HardwareSimScenario(Scenario):
     random_seed: int = 0
     simulation_duration: float | None = None
     lcm_buses: dict[str, DrakeLcmParams] = field(default_factory=dict)
-    model_drivers: dict[str, IiwaDriver | SchunkWsgDriver | ZeroForceDriver] = field(default_factory=dict)
+    model_drivers: dict[str, Driver] = field(default_factory=dict)
     visualization: VisualizationConfig = field(default_factory=VisualizationConfig)
 
     def add_models(self, builder: VirtualTestbedBuilder) -> list[ModelInstanceInfo]:
@@ -89,7 +93,7 @@ class HardwareSimScenario(Scenario):
         try:
             models = ProcessModelDirectives(ModelDirectives(directives=self.directives), Parser(plant))
             plant.Finalize()
-            ApplyNamedPositionsAsDefaults(self.initial_position, plant)
+            pydrake.manipulation.ApplyNamedPositionsAsDefaults(self.initial_position, plant)
         except RuntimeError as error:
             raise ScenarioError(f"{type(self).__name__}: the models cannot be added: {error}") from error
         return list(models)

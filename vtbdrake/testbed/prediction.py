@@ -74,7 +74,6 @@ class Predictor:
         self._world.write(self._context, self._values)
         self._feed = self._world.feed(self._context)
         self._simulator = self._world.simulator(self._context)
-        self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
         self.set_time(0)
 
