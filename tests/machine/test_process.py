@@ -43,7 +43,7 @@ from vtbdrake.machine import (
 )
 from vtbdrake.machine.injected_faults import CORRUPTIONS
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from vtbdrake.recording.log_reader import ControlLog, LogEvents, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 CYCLES = 20
 
 
