@@ -1,4 +1,4 @@
-"""Classes that another process cannot import, and that are derived from Drake's, are the same there."""
+"""Pickled classes of the main program, including those derived from Drake's, in another process."""
 
 import subprocess
 import sys
@@ -61,7 +61,7 @@ print(made().{call}, type(made) is kind, made.__module__)
         ("Concrete", "size()", "5"),
     ],
 )
-def test_a_class_of_the_main_program_is_made_again_elsewhere(expression, call, expected):
+def test_class_of_the_main_program_is_rebuilt_elsewhere(expression, call, expected):
     define = DEFINE.format(expression=expression)
     sent = subprocess.run([sys.executable, "-c", define], capture_output=True, timeout=60, check=True).stdout
     read = subprocess.run(

@@ -90,17 +90,17 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """The process id."""
+        """Return the process id of the child."""
         return self._process.pid
 
     @property
     def exit_code(self) -> int | None:
-        """The exit code: None while the child runs, the negative number of the signal if a signal ended it."""
+        """Return the exit code: None while the child runs, the negative number of a signal that ended it."""
         return self._process.poll()
 
     @property
     def alive(self) -> bool:
-        """True while the process exists, running or stopped."""
+        """Return True while the process exists, running or stopped."""
         return self.exit_code is None
 
     def wait_until_ready(self, timeout: float | None = 60.0) -> None:

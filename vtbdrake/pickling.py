@@ -1,4 +1,4 @@
-"""Objects as bytes for other processes, also of classes and functions that are defined in a notebook or in a script."""
+"""Objects as bytes for other processes, including classes and functions that a notebook or a script defines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cloudpickle
 
 
 class _Pickler(cloudpickle.Pickler):
-    """cloudpickle's pickler, which also sends classes that are derived from Drake's.
+    """The pickler of cloudpickle, extended by classes that are derived from Drake's.
 
     cloudpickle sends what is defined in ``__main__`` by value, and with a class its metaclass. The metaclass of Drake's
     classes (pybind11's, nanobind's) cannot be imported under its name, and a copy of it is a "metaclass conflict". So

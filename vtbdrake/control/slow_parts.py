@@ -96,7 +96,7 @@ class SlowParts:
 
     @property
     def statistics(self) -> dict[str, SlowStatistics]:
-        """The statistics of the slow parts, by path."""
+        """Return the statistics of the slow parts, by path."""
         return {part.path: part.statistics for part in self._parts}
 
     def receive(self) -> None:

@@ -1,4 +1,4 @@
-"""A worker process: it does for the control loop what takes long or could wait, while the loop never waits for it."""
+"""Worker processes, to which the control loop hands over what takes long, without ever waiting for them."""
 
 from __future__ import annotations
 
@@ -94,17 +94,17 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """The process id of the worker."""
+        """Return the process id of the worker."""
         return self._child.pid
 
     @property
     def alive(self) -> bool:
-        """True while the worker runs and can be reached."""
+        """Return True while the worker runs and can be reached."""
         return not self._lost and self._child.alive
 
     @property
     def unsent(self) -> int:
-        """The number of bytes that wait to be sent."""
+        """Return the number of bytes that wait to be sent."""
         return self._unsent_bytes
 
     def post(self, *parts: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""The machine: a process that plays the physical robot, with a simulation of its own.
+"""The machine: a simulation of the physical robot in a process of its own.
 
 It knows the world and the LCM protocol of the scenario, and nothing of the controller. The maps of the
 `vtbdrake.lcm.protocol.Protocol` make the bridge of the controller and, read in the other direction, the machine.

@@ -89,7 +89,7 @@ class InjectedFault:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockJump(InjectedFault):
-    """The time in the machine's messages is wrong by ``seconds``. (The machine applies it when it makes them.)"""
+    """The time in the messages is wrong by ``seconds``; the machine adds it when it makes them."""
 
     name = "clock_jump"
     sides = (SENSE,)
@@ -148,7 +148,7 @@ class Corrupt(InjectedFault):
 
 @dataclass(frozen=True, kw_only=True)
 class Duplicate(InjectedFault):
-    """Every message arrives ``copies`` times more."""
+    """Every message arrives again, ``copies`` times."""
 
     name = "duplicate"
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"copies": (1, 1000)}
@@ -237,10 +237,10 @@ def whole_cycles(seconds: float, period: float) -> int:
 
 
 class DelayLine:
-    """One direction of the way between a machine and its controller: a delay, and the faults that have begun.
+    """One direction between a machine and its controller: a latency, and the faults that have begun.
 
     Args:
-        delay: the number of cycles that every packet takes, without faults.
+        delay: the latency of every packet without faults, in cycles.
         period: the period of a cycle, in seconds.
         random: the source of random numbers of the faults.
 

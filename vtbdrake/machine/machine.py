@@ -1,4 +1,4 @@
-"""The machine: a simulated world that plays the physical robot, cycle by cycle, without a clock or a bus."""
+"""The machine: a simulated world in place of the physical robot, cycle by cycle, without a clock or a bus."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MICROSECONDS = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class MachineConfig:
-    """How a machine differs from the simulated world, and how it behaves.
+    """Configuration of a machine: its differences from the simulated world, and its behaviour.
 
     Raises:
         ValueError: a value is out of its range.
@@ -168,17 +168,17 @@ class Machine:
 
     @property
     def time(self) -> float:
-        """The time of its world, in seconds."""
+        """Return the time of its world, in seconds."""
         return self.cycle * self.config.period
 
     @property
     def channels(self) -> list[str]:
-        """The LCM channels of actuator commands."""
+        """Return the LCM channels of actuator commands."""
         return list(self._readers)
 
     @property
     def braking(self) -> bool:
-        """True if it braked in its last cycle."""
+        """Return True if the machine braked in its last cycle."""
         return self._brake.engaged
 
     def read(self, address: str) -> Any:
@@ -206,7 +206,7 @@ class Machine:
     # -- cycles
 
     def receive(self, channel: str, data: bytes) -> None:
-        """Take a message of the controller, which passes the latency and the injected faults before it is decoded."""
+        """Take a message of the controller. It passes the latency and the injected faults before it is decoded."""
         self._lines[ACT].send(Packet(channel, self._types[channel], data, self.cycle))
 
     def advance(self) -> None:
@@ -293,7 +293,7 @@ class Machine:
 
 
 class HoldingBrake:
-    """The safety of the machine itself, when no commands arrive.
+    """The brake of the machine itself, which engages when no commands arrive.
 
     ``lock``: the joints that have actuators stop at once, as if brakes engaged, and the actuators get their idle
     commands; it needs a discrete plant. ``idle``: the actuators get their idle commands. ``hold``: they keep the last

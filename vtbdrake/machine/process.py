@@ -104,7 +104,7 @@ class MachineProcess:
 
     @property
     def pid(self) -> int:
-        """The process id of the machine.
+        """Return the process id of the machine.
 
         Raises:
             MachineError: it has not been started.
@@ -113,7 +113,7 @@ class MachineProcess:
 
     @property
     def alive(self) -> bool:
-        """True while its process exists, also while it is paused."""
+        """Return True while the process of the machine exists, also while it is paused."""
         return self._child is not None and self._child.alive
 
     def status(self) -> MachineStatus:

@@ -73,7 +73,7 @@ class DaskExecutor(Executor):
         self._sent: OrderedDict[str, str] = OrderedDict()
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """See `Executor.run`.
+        """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
@@ -148,6 +148,7 @@ class DaskExecutor(Executor):
         return max(2, 2 * self._threads)
 
     def close(self) -> None:
+        """Remove the tasks from the workers; close the client, unless it belongs to the user."""
         if self._client.status == "running":
             for name in self._sent.values():
                 self._client.unregister_worker_plugin(name)
@@ -174,7 +175,7 @@ def _given_up(error: BaseException) -> WorkerError:
 
 
 def _error(outcome: Any) -> BaseException | None:
-    """Return the error in Dask or in the rollout. (The status of a future may change after its outcome arrived.)"""
+    """Return the error in Dask or in the rollout; the status of a future may change after its outcome has arrived."""
     if isinstance(outcome, BaseException):
         return _given_up(outcome)
     error = outcome[1] if isinstance(outcome, tuple) else pickle.loads(outcome)[1]

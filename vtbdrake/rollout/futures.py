@@ -50,7 +50,7 @@ class FuturesExecutor(Executor):
         self._rescue: ProcessExecutor | None = None
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """See `Executor.run`.
+        """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to another process, or the pool takes no more work.
@@ -111,6 +111,7 @@ class FuturesExecutor(Executor):
             yield rest[i], result
 
     def close(self) -> None:
+        """End the processes that replaced a broken pool. The pool itself belongs to the user."""
         if self._rescue is not None:
             self._rescue.close()
             self._rescue = None
@@ -133,7 +134,7 @@ def _result(future: _Future) -> RolloutResult:
 
 
 class _Worker:
-    """What a process of the pool keeps: the tasks used last, by digest, and their runners."""
+    """The state of a process of the pool: the tasks used last, by digest, and their runners."""
 
     def __init__(self) -> None:
         self._runners = Runners(Testbeds())

@@ -72,7 +72,7 @@ class ProcessExecutor(Executor):
             self._workers.append(_Worker(self._kept, self._growth))
 
     def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """See `Executor.run`.
+        """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
@@ -200,6 +200,7 @@ class ProcessExecutor(Executor):
         return new
 
     def close(self) -> None:
+        """End all workers."""
         for worker in self._workers:
             worker.kill()
         self._workers.clear()
