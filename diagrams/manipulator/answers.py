@@ -1,4 +1,4 @@
-"""The row C1 of the table of answers."""
+"""Row C1 of the table of answers: the tracking error of the arm on the machine and in simulation."""
 
 from __future__ import annotations
 
@@ -23,27 +23,28 @@ from vtbdrake_diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Tria
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
 
-# The machine's masses, friction and the like are not those of the simulation.
+# Masses, friction and other parameters of the machine differ from those of the simulation.
 PERTURB, SEED = 0.05, 7
 
-# How well the tip is to follow its reference, RMS, in m; and how much worse on the machine than in simulation.
+# The largest tracking error of the tip on the machine, RMS, in m; and its largest ratio to the error in simulation.
 TOLERANCE, RATIO = 0.005, 2.0
 
 # Cycles for which the whole testbed commands the machine, in the short version.
 COMPARED = 3000
 
-# Nothing but the machine's next message begins a cycle: it is waited for so many seconds.
+# The time to wait for the next message of the machine, which begins a cycle, in s.
 PATIENCE = 60.0
 
 
 @dataclass
 class Trials:
-    """Of one law: the same motions in simulation, and on the machine by the DPS alone.
+    """Results of one control law: the same motions in simulation, and on the machine by the DPS alone.
 
     Attributes:
-        compared: cycles in which the whole testbed commanded a machine of its own.
-        identical: whether the DPS alone commanded the same in these, bit for bit.
-        latched: why the guards did not let the DPS command all the time; empty if they did.
+        simulated, real: The tracks in simulation and on the machine.
+        compared: The number of cycles in which the whole testbed commanded a machine of its own.
+        identical: Whether the DPS alone sent the same actuator commands in these cycles, bit for bit.
+        latched: The faults for which the guards latched; empty if they did not.
     """
 
     simulated: Track
@@ -54,10 +55,10 @@ class Trials:
 
 
 def control(full: bool) -> Answer:
-    """How well does the arm do its motions, on the machine and in the simulation that they were developed in?
+    """Measure how well the arm tracks its motions, on the machine and in simulation.
 
-    In lock-step with the machine's process: however busy this computer is, the answer is the same. The short version
-    compares testbed and stripped DPS for the first `COMPARED` cycles, the long one for all.
+    The loop runs in lock-step with the machine, so the answer does not depend on the load of this computer. The short
+    version compares testbed and DPS alone in the first `COMPARED` cycles, the long one in all.
     """
     trials = {name: _trials(law, full) for name, law in LAWS.items()}
     errors = {name: (rms(trial.simulated.errors()), rms(trial.real.errors())) for name, trial in trials.items()}
@@ -116,11 +117,11 @@ def _bridge(scenario: ManipulatorScenario, hub: Hub) -> Bridge:
 
 
 class _Real:
-    """A machine, and a loop in lock-step with it whose switches are on real.
+    """A machine and a loop in lock-step with it, whose switches are on real.
 
     Attributes:
-        loop: the machine waits for its next command.
-        commands: all that was sent.
+        loop: The loop; the machine waits for its next actuator command.
+        commands: All torques that were sent, shape (7,) each.
     """
 
     def __init__(
@@ -130,17 +131,17 @@ class _Real:
         self._bridge = _bridge(scenario, hub)
         self._machine = MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED)
         deployment = scenario.deployment().in_lock_step("wrench", wait=PATIENCE)
-        self.loop = deployment.runtime(target, self._bridge, context=context, watchers=(self._take_down,))
+        self.loop = deployment.runtime(target, self._bridge, context=context, watchers=(self._collect,))
 
     def __enter__(self) -> _Real:
         self._machine.start()
         deadline = time.monotonic() + PATIENCE
         while not all(received.count for received in self._bridge.sensed.values()):
             if time.monotonic() > deadline:
-                raise TimeoutError(f"the machine has not told its state in {PATIENCE:g} s")
+                raise TimeoutError(f"the machine has not sent its state within {PATIENCE:g} s")
             self._bridge.poll(1.0)
         self.loop.switch("real")
-        # A first command begins the exchange.
+        # The first actuator command begins the exchange.
         self.loop.cycle()
         return self
 
@@ -148,5 +149,5 @@ class _Real:
         self._machine.close()
         self._bridge.close()
 
-    def _take_down(self, cycle: Cycle) -> None:
+    def _collect(self, cycle: Cycle) -> None:
         self.commands.append(cycle.verdict.actuation["joint_torque"].copy())

@@ -4,7 +4,7 @@ Sources of the numbers:
 
 * [P] published in the data sheet "LBR iiwa 7 R800, LBR iiwa 14 R820" (KUKA, 2015): lengths between the axes, joint
   ranges, joint speeds, joint torques, 29.9 kg in all.
-* [D] derived: follows from the other numbers by the reason that stands beside it.
+* [D] derived: follows from the other numbers for the reason given beside it.
 * [A] assumed: plausible, not published.
 
 Frames: link i has its origin on the axis of joint i; at zero joint angles all links' axes are parallel to the world's
@@ -77,34 +77,34 @@ class Arm:
 
     @property
     def offsets(self) -> tuple[float, ...]:
-        """From the origin of the link before to that of each link, along z (m)."""
+        """Distance from the origin of the previous link to that of each link, along z (m)."""
         return (self.base_height, *self.lengths[:-1])
 
     @property
     def tip_offset(self) -> float:
-        """From the origin of the last link to T, along z (m)."""
+        """Distance from the origin of the last link to T, along z (m)."""
         return self.lengths[-1] + self.tool_length
 
     @property
     def reflected_inertias(self) -> NDArray[np.float64]:
-        """Of the rotors, about the joints' axes: N^2 I (kg m^2)."""
+        """Inertias of the rotors about the axes of the joints, N^2 I, shape (7,), in kg m^2."""
         return self.gear_ratio**2 * np.array(self.rotor_inertias)
 
     def link_inertia(self, k: int) -> SpatialInertia:
-        """M_LLo_L of link k (0 is the first): a solid cylinder that reaches to the next joint."""
+        """Return M_LLo_L of link k (0 is the first), a solid cylinder that reaches to the next joint."""
         length = self.lengths[k]
         return _cylinder(self.masses[k], self.radii[k], length)
 
     def base_inertia(self) -> SpatialInertia:
-        """M_BBo_B of the base, which stands on the floor."""
+        """Return M_BBo_B of the base, which stands on the floor."""
         return _cylinder(self.base_mass, self.radii[0], self.base_height)
 
     def tool_inertia(self) -> SpatialInertia:
-        """M_SSo_S of the tool."""
+        """Return M_SSo_S of the tool."""
         return _cylinder(self.tool_mass, self.tool_radius, self.tool_length + self.ball_radius)
 
 
 def _cylinder(mass: float, radius: float, length: float) -> SpatialInertia:
-    """About its lower end."""
+    """Return the inertia about the lower end."""
     centered = SpatialInertia.SolidCylinderWithMass(mass, radius, length, [0.0, 0.0, 1.0])
     return centered.Shift([0.0, 0.0, -length / 2])

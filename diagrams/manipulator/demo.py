@@ -1,4 +1,4 @@
-"""``make demo-control``: an arm in simulation, in the shadow of the machine, on it; the machine killed, and back."""
+"""``make demo-control``: an arm in simulation, in shadow mode and on a machine, which is killed and restarted."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from vtbdrake_diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Tra
 
 LAWS = ("cartesian_impedance", "admittance")
 
-# The machine is not what the DPS was made with: masses, friction and the like are off by up to this.
+# Masses, friction and other parameters of the machine differ from those of the DPS by up to this fraction.
 PERTURB, SEED = 0.05, 7
 
-# Deadlines missed in a row after which the arm floats in place; the machine brakes by itself after 100.
+# Consecutive missed deadlines after which the arm floats in place; the machine brakes by itself after 100.
 MAX_MISSED = 50
 
-# Latches from which on the figures of a trial mean nothing: the arm was not where its motion left it.
+# With more latches than this, the figures of a trial mean nothing: the motions were interrupted too often.
 MANY_LATCHES = 30
 
 HUB_PRIORITY, LOOP_PRIORITY, MACHINE_PRIORITY = 80, 75, 70
 
-# When the press is looked at, in seconds from its begin.
+# Times in the press at which the force is printed, in seconds from its beginning.
 INSTANTS = (0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6)
 
 
 class Attendant:
-    """Resets the guards as soon as they let it, and takes down why they had latched; a watcher of the loop."""
+    """A watcher of the loop that resets the guards as soon as possible, and collects their faults."""
 
     def __init__(self) -> None:
         self.loop: Runtime | None = None
@@ -66,7 +66,7 @@ class Attendant:
 
 
 class Demo:
-    """One law, from the simulation to the machine."""
+    """The way of one control law from the simulation to the machine."""
 
     def __init__(self, law: str, hub: Hub) -> None:
         self.law = law
@@ -78,7 +78,7 @@ class Demo:
         self.attendant = Attendant()
 
     def run(self, *, death: bool) -> None:
-        """Everything, with ``death`` and recovery of the machine or without."""
+        """Run all stages; ``death`` adds those in which the machine is killed and restarted."""
         print(f"\n== {self.law}\n")
         self.bridge.open()
         try:
@@ -111,7 +111,7 @@ class Demo:
         self._switch(loop, "shadow")
         loop.run(seconds=1.0)
         command = loop.actuator_command("joint_torque")
-        print(f"shadow  the DPS feels the machine and commands the simulated arm; it would command {_torque(command)}")
+        print(f"shadow  real sensors feed the DPS, which commands the simulated arm: {_torque(command)}")
         print(f"        sent to the machine so far: {self.bridge.sent['joint_torque'].count} commands")
         return loop
 
@@ -123,12 +123,12 @@ class Demo:
         return loop
 
     def _deployment(self) -> Deployment:
-        """A new one each time, for its fallback has a memory."""
+        """Return a new deployment, because its fallback has a state."""
         deployment = self.scenario.deployment()
         return replace(deployment, guards={**deployment.guards, "max_missed": MAX_MISSED})
 
     def _switch(self, loop: Runtime, mode: str) -> None:
-        """Tried again where something was late just now."""
+        """Switch, with some attempts if a message is late."""
         for _ in range(100):
             self.bridge.poll(0.1)
             preparation = loop.prepare(mode)
@@ -141,63 +141,59 @@ class Demo:
         track = run_trial(loop)
         self.attendant.loop = None
         print(f"real    the DPS alone commanded the machine (perturbed by up to {PERTURB:.0%}), {loop.cycles} cycles")
-        self._tell_latches()
+        self._print_latches()
         return track
 
     def _die_and_recover(self, loop: Runtime) -> None:
         print("\nThe machine is killed in the middle of a circle:")
         loop.target.write(loop.context, {"u.motion": float(CIRCLE)})
         loop.run(seconds=2.2)
-        _release(loop)
+        _reset_guards(loop)
         killed = time.monotonic()
         os.kill(self.machine.pid, signal.SIGKILL)
         loop.run(until=lambda: bool(loop.guards.latched), seconds=5.0)
         fault = loop.guards.latched[0]
         print(f"  {1e3 * (fault.time - killed):.1f} ms later the guards latch: {fault.reason}")
         loop.run(seconds=0.5 * CARRY)
-        print(f"  the loop goes on, and sends what carries the arm where it was last: {_torque(_last_sent(loop))}")
+        print(f"  the loop continues, and carries the arm at its last pose: {_torque(_last_sent(loop))}")
         loop.run(seconds=CARRY)
         sent = self.bridge.sent["joint_torque"].count
         loop.run(seconds=0.5)
         silent = self.bridge.sent["joint_torque"].count == sent
         print(
-            f"  {CARRY:g} s after the last sample it {'falls' if silent else 'DOES NOT FALL'} silent: brakes take over"
+            f"  {CARRY:g} s after the last sample, it {'stops' if silent else 'DOES NOT STOP'} sending: brakes engage"
         )
         with suppress(SwitchRefusedError):
             loop.reset()
-        print(f"  a reset is {'refused' if loop.guards.latched else 'GRANTED'} as long as nothing is sensed")
+        print(f"  a reset is {'rejected' if loop.guards.latched else 'ACCEPTED'} as long as the sensors are silent")
         birth = threading.Thread(target=self.machine.start)
         birth.start()
-        # The reference is where the arm is, wherever the machine will be.
+        # The reference follows the arm, wherever the machine starts.
         loop.target.write(loop.context, {"u.motion": float(FOLLOW)})
         loop.run(until=lambda: not birth.is_alive() and not _sensor_faults(loop), seconds=60.0)
         birth.join()
         loop.run(seconds=0.1)
-        print("  the machine is started again: its sensors are fresh, the arm floats")
-        _release(loop)
+        print("  the machine is restarted: its sensors are fresh, the arm floats in place")
+        _reset_guards(loop)
         self.attendant.reasons.clear()
         self.attendant.loop = loop
         errors = run_trial(loop, (CIRCLE,)).errors((CIRCLE,))
         print(
             f"  reset; the next circle is tracked to {1e3 * rms(errors):.2f} mm (RMS), {1e3 * errors.max():.2f} at most"
         )
-        self._tell_latches()
+        self._print_latches()
 
-    # -- what came out
+    # -- results
 
-    def _tell_latches(self) -> None:
-        """What was missed, if anything."""
+    def _print_latches(self) -> None:
+        """Print the faults for which the guards latched, if any."""
         reasons = self.attendant.reasons
         if reasons:
-            print(
-                f"        latches of the guards, each reset as soon as they let it: {len(reasons)}; the first because"
-            )
+            print(f"        latches of the guards, each reset as soon as possible: {len(reasons)}; the first because")
             print(f"        {reasons[0]}")
         if len(reasons) > MANY_LATCHES:
-            print(
-                "        With so many, the machine's figures tell about this computer, not about the control law: give"
-            )
-            print("        it real-time rights (see above), or less to do beside.")
+            print("        With so many latches, the figures describe this computer, not the control law: give")
+            print("        it real-time rights (see above), or less other load.")
 
     def _report(self, simulated: Track, real: Track) -> None:
         rows = []
@@ -227,8 +223,8 @@ class Demo:
         )
 
 
-def _release(loop: Runtime) -> None:
-    """Resets the guards, as soon as nothing speaks against it."""
+def _reset_guards(loop: Runtime) -> None:
+    """Reset the guards as soon as possible."""
     for _ in range(1000):
         if not loop.guards.latched:
             return
@@ -255,9 +251,9 @@ def _torque(values: np.ndarray) -> str:
 
 
 def main() -> None:
-    logging.disable(logging.ERROR)  # What the guards would log is told here.
+    logging.disable(logging.ERROR)  # The demo prints what the guards would log.
     begin = time.perf_counter()
-    print("A seven-joint arm, developed in simulation, then run at 1 kHz against a process that plays the machine.")
+    print("A seven-joint arm, developed in simulation, then run at 1 kHz on a machine in another process.")
     with Hub(port=0, protect=["IIWA_COMMAND"], priority=HUB_PRIORITY) as hub:
         for law in LAWS:
             Demo(law, hub).run(death=law == LAWS[0])

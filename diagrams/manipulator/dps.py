@@ -1,4 +1,4 @@
-"""The arm's data processing system: one function builds it for the testbed, its copies and the robot."""
+"""The data processing system of the arm: one function builds it for the testbed, its copies and the robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, func
 from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
 from vtbdrake_diagrams.manipulator.motions import HOME, parameters, reference
 
-# Name -> (initial value, unit). The first of a system is what others need of it.
+# Name -> (initial value, unit). Other systems need the first one.
 States = dict[str, tuple[object, str]]
 
 _STATE = "state"
@@ -27,7 +27,7 @@ SENSOR_SIGNALS = {"joint_position": JOINTS, "joint_velocity": JOINTS, "joint_tor
 def make_dps(
     law: str = "cartesian_impedance", *, period: float = 0.001, arm: Arm | None = None, compile: bool = True
 ) -> Diagram:
-    """The DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
+    """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
 
     Input ports: ``joint_position`` (7, rad), ``joint_velocity`` (7, rad/s), ``joint_torque_measured`` (7, N m, on the
     joints' output side), ``wrench`` (6, [torque; force] that the tool exerts on the sensor at the flange, in the
@@ -37,12 +37,14 @@ def make_dps(
     the input at one sample is in the torque from then on. The wrench is perceived first, and acts one period later.
 
     Args:
-        law: a name of `LAWS`.
-        compile: evaluates machine code where there is a C compiler, which it needs when it runs for the first time; the
-            results are the same, bit for bit.
+        law: The control law, a key of `LAWS`.
+        period: The sample period of ``env`` and ``impl``, in seconds.
+        arm: The arm that the controller assumes.
+        compile: Compile the arithmetic if there is a C compiler, which is needed at the first use only; the results are
+            the same, bit for bit.
 
     Raises:
-        ValueError: there is no such law.
+        ValueError: There is no such law.
     """
     if law not in LAWS:
         raise ValueError(f"law is {law!r}, but must be one of {', '.join(LAWS)}.")
@@ -67,7 +69,7 @@ def make_dps(
 
 
 def _make_sense() -> Diagram:
-    """The raw values and, beside them, ``offset``, which is added."""
+    """Return the system that adds the parameter ``offset`` to the raw values."""
     builder = DiagramBuilder()
     raw = builder.AddNamedSystem("raw", Multiplexer(list(SENSOR_SIGNALS.values())))
     size = sum(SENSOR_SIGNALS.values())
@@ -82,7 +84,7 @@ def _make_sense() -> Diagram:
 
 
 def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
-    r"""The perceived environment: where the arm is, and what touches it.
+    r"""Return the system that perceives the environment: where the arm is, and what touches it.
 
     ``contact_wrench`` F_T, [torque; force] that the environment exerts on the tip, in the world, follows the sensor's
     wrench, less the tool's weight, by a first-order low-pass. (The tool's inertia is left in: 0.4 N at 1 m/s^2.)
@@ -145,7 +147,7 @@ def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
 
 
 def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, compile: bool) -> System:
-    """Motions and control law in one; ``torque`` changes no faster than ``torque_rate``.
+    """Return the system of motions and control law; ``torque`` changes no faster than ``torque_rate``.
 
     ``perceived`` is the size of the state of ``env``.
     """
@@ -189,8 +191,9 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
 
 
 def _make_act(arm: Arm, size: int) -> Diagram:
-    """The torque, with which the state of ``impl`` begins (``size``), and, beside it, ``offset``, which is added; held
-    between the limits of the joints.
+    """Return the system that adds ``offset`` to the torque, and saturates it at the limits of the joints.
+
+    The torque is the first part of the state of ``impl``, whose size is ``size``.
     """
     builder = DiagramBuilder()
     limits = np.array(arm.torques)
@@ -207,7 +210,7 @@ def _make_act(arm: Arm, size: int) -> Diagram:
 
 
 def gravity_torque(model: ArmDynamics) -> np.ndarray:
-    """What holds the arm at home (7, N m)."""
+    """Return the torque that holds the arm at home, shape (7,), in N m."""
     q = casadi.SX.sym("q", JOINTS)
     zero = casadi.SX(JOINTS, 1)
     hold = function("hold", {"q": q}, {"torque": model.inverse_dynamics(q, zero, zero)})
@@ -230,7 +233,7 @@ def _system(
     period: float,
     compile: bool,
 ) -> System:
-    """The system x_next = following(x, p, inputs), with all its state in one vector, which is its output.
+    """Return the system x_next = following(x, p, inputs), with all its state in one vector, which is its output.
 
     Every group of a Context that Python reads and writes costs more than the arm's dynamics. The addresses of the state
     are those of its parts.

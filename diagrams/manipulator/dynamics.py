@@ -18,7 +18,7 @@ Expression = Any  # casadi.SX or casadi.DM
 
 @dataclass(frozen=True)
 class TipMotion:
-    """Pose of T in the world, and J with V_WT = [w; v] = J qdot, as in Drake's SpatialVelocity."""
+    """The pose of T in the world, and J with V_WT = [w; v] = J qdot, as in Drake's SpatialVelocity."""
 
     R: Expression
     p: Expression
@@ -45,7 +45,7 @@ class ArmDynamics:
         self._offsets = [_sparse(np.array([0.0, 0.0, offset])) for offset in self.arm.offsets]
 
     def tip(self, q: Expression) -> TipMotion:
-        """Of the tool's tip T, for q (7)."""
+        """Return pose and Jacobian of the tip T for the joint positions q, shape (7,)."""
         R, p = casadi.SX.eye(3), casadi.SX.zeros(3)
         axes, origins = [], []
         for k in range(JOINTS):
@@ -58,7 +58,7 @@ class ArmDynamics:
         return TipMotion(R, p, casadi.densify(casadi.horzcat(*columns)))
 
     def tip_bias(self, q: Expression, v: Expression) -> Expression:
-        """Jdot v (6): the tip's [angular; linear] acceleration while the joints turn uniformly, in the world."""
+        """Return Jdot v, the [angular; linear] acceleration of the tip at constant joint velocities, in the world."""
         R = casadi.SX.eye(3)
         omega, alpha, acceleration = (casadi.SX.zeros(3) for _ in range(3))
         for k in range(JOINTS):
@@ -73,7 +73,7 @@ class ArmDynamics:
     def inverse_dynamics(
         self, q: Expression, v: Expression, a: Expression, *, gravity: float = GRAVITY, rotors: bool = True
     ) -> Expression:
-        """tau (7) = M(q) a + C(q, v) v + g(q), by the recursion of Newton and Euler in the links' frames.
+        """Return tau = M(q) a + C(q, v) v + g(q), by the recursion of Newton and Euler in the links' frames.
 
         With ``rotors``, M has their reflected inertia on its diagonal, and tau is the drives' torque; without, tau is
         what the joints' torque sensors see. Luh, Walker, Paul, "On-Line Computational Scheme for Mechanical
@@ -110,7 +110,7 @@ class ArmDynamics:
         return casadi.densify(casadi.vertcat(*tau))
 
     def momentum(self, q: Expression, v: Expression) -> tuple[Expression, Expression]:
-        """p = M(q) v of the links, and dL/dq of their Lagrangian L = v' M v / 2 - U: Lagrange's equation is then
+        """Return p = M(q) v of the links, and dL/dq of their Lagrangian L = v' M v / 2 - U: Lagrange's equation is then
 
         dp/dt = dL/dq + tau, for the torques tau that act on the links.
 
@@ -143,7 +143,7 @@ class ArmDynamics:
         return casadi.densify(casadi.vertcat(*p)), casadi.densify(casadi.vertcat(*gradient))
 
     def _rotation(self, k: int, angle: Expression) -> Expression:
-        """Of link k in the one before."""
+        """Return the rotation of link k in the previous link."""
         sign = sum(self.arm.axes[k])
         c, s = casadi.cos(angle), sign * casadi.sin(angle)
         R = casadi.SX(3, 3)
@@ -155,16 +155,16 @@ class ArmDynamics:
 
 
 def function(name: str, arguments: dict[str, Expression], results: dict[str, Expression]) -> casadi.Function:
-    """A casadi.Function of named arguments, with what is computed twice computed once."""
+    """Return a casadi.Function of named arguments, with common subexpressions eliminated."""
     dense = [casadi.densify(value) for value in results.values()]
     return casadi.Function(name, list(arguments.values()), dense, list(arguments), list(results), {"cse": True})
 
 
 def _turned(omega: Expression, alpha: Expression, r: Expression) -> Expression:
-    """Acceleration at r that comes from turning."""
+    """Return the acceleration at r due to rotation."""
     return casadi.cross(alpha, r) + casadi.cross(omega, casadi.cross(omega, r))
 
 
 def _sparse(values: np.ndarray) -> casadi.SX:
-    """Zeros that CasADi leaves out."""
+    """Return an expression without structural zeros."""
     return casadi.sparsify(casadi.SX(casadi.DM(np.where(np.abs(values) < 1e-15, 0.0, values))))

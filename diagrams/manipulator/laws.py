@@ -61,18 +61,18 @@ class Law:
 
 
 class _Projection:
-    """J+ and N, of the least squares with a trace of damping, so that they stay finite where J loses rank."""
+    """J+ and N of least squares with a little damping, which keeps them finite where J loses rank."""
 
     def __init__(self, J: Expression) -> None:
         self._J = J
         self._root = casadi.chol(J @ J.T + 1e-8 * casadi.SX.eye(6))
 
     def inverse(self, V: Expression) -> Expression:
-        """J+ V."""
+        """Return J+ V."""
         return self._J.T @ self._solved(V)
 
     def null(self, tau: Expression) -> Expression:
-        """N tau."""
+        """Return N tau."""
         return tau - self._J.T @ self._solved(self._J @ tau)
 
     def _solved(self, b: Expression) -> Expression:
@@ -118,7 +118,7 @@ def _joint_impedance(
 def _cartesian(
     model: ArmDynamics, q: Expression, v: Expression, r: Reference
 ) -> tuple[TipMotion, _Projection, Expression, Expression, Expression, Expression]:
-    """The tip, its projection and bias, and e, V_r - J v and A_r for the reference."""
+    """Return the tip, its projection and bias, and e, V_r - J v and A_r for the reference."""
     tip, goal = model.tip(q), model.tip(r.q)
     error = _pose_error(tip.R, tip.p, goal.R, goal.p + r.dp)
     V_r = goal.J @ r.v + _linear(r.dv)

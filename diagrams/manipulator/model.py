@@ -1,4 +1,4 @@
-"""Writes the SDF model of the arm.
+"""The SDF model of the arm.
 
 ``python -m vtbdrake_diagrams.manipulator.model`` rewrites the file in ``models/``.
 """
@@ -31,8 +31,10 @@ _ALONG_Y = f"{text(pi / 2)} 0 0"
 
 
 def arm_sdf(arm: Arm | None = None) -> str:
-    """Model ``arm``: links ``base``, ``link_1`` to ``link_7`` and ``tool``, joints ``joint_1`` to ``joint_7`` and,
-    fixed, ``flange``, which carries the force/torque sensor; frame ``tip``. Only the ball at its tip collides.
+    """Return the text of the SDF model ``arm``.
+
+    It has the links ``base``, ``link_1`` to ``link_7`` and ``tool``, the joints ``joint_1`` to ``joint_7``, the fixed
+    joint ``flange``, which carries the force/torque sensor, and the frame ``tip``. Only the ball at the tip collides.
     """
     arm = arm or Arm()
     root, model = start_model("arm", "base", note=NOTE)
@@ -88,7 +90,7 @@ def _tube(link: ET.Element, name: str, radius: float, start: float, end: float, 
 
 
 def write() -> None:
-    """Rewrites the shipped file."""
+    """Write the file in ``models/``."""
     ARM_SDF.parent.mkdir(exist_ok=True)
     ARM_SDF.write_text(arm_sdf())
 

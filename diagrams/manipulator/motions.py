@@ -29,7 +29,7 @@ FOLLOW, HOME, SWING, PRESS, CIRCLE = range(len(MOTIONS))
 
 
 def parameters(arm: Arm) -> dict[str, tuple[object, str, tuple[float, float]]]:
-    """Value, unit and bounds of what the motions depend on."""
+    """Return value, unit and bounds of each parameter of the motions."""
     return {
         "home": (arm.home, "rad", (-pi, pi)),
         "home_duration": (3.0, "s", (0.1, 60.0)),
@@ -44,7 +44,7 @@ def parameters(arm: Arm) -> dict[str, tuple[object, str, tuple[float, float]]]:
 
 @dataclass(frozen=True)
 class Reference:
-    """What a law is to follow at this instant, and what the motion remembers.
+    """The reference for a control law at one instant, and the next state of the motion.
 
     Attributes:
         in_joints: 1 while the motion is given in joint space.
@@ -72,13 +72,15 @@ class Reference:
 def reference(
     wanted: Expression, q: Expression, state: dict[str, Expression], p: dict[str, Expression], *, period: float
 ) -> Reference:
-    """
+    """Return the reference of the motion that is under way.
+
     Args:
-        wanted: the commanded motion.
-        q: the measured joint positions.
-        state: ``motion`` under way, its ``clock`` (s), the joint positions ``start`` where it began, and the laws'
-            ``reference`` (7) at the last instant.
-        p: `parameters`.
+        wanted: The commanded motion.
+        q: The measured joint positions, shape (7,), in rad.
+        state: The ``motion`` under way, its ``clock`` (s), the joint positions ``start`` where it began, and the
+            ``reference`` of the law at the last instant, shape (7,).
+        p: The values of `parameters`.
+        period: The sample period, in seconds.
     """
     before = state["motion"]
     follow = wanted < FOLLOW + 0.5
@@ -121,7 +123,7 @@ def reference(
 
 
 def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression, Expression]:
-    """P(x) and its first two derivatives by time, x = t / duration being held in [0, 1]."""
+    """Return P(x) and its first two time derivatives, for x = t / duration, limited to [0, 1]."""
     x = casadi.fmin(casadi.fmax(x, 0), 1)
     return (
         x**3 * (10 + x * (6 * x - 15)),
@@ -131,7 +133,7 @@ def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression,
 
 
 def _there_and_back(t: Expression, duration: Expression, *, rise: float) -> tuple[Expression, Expression, Expression]:
-    """0 to 1 in ``rise * duration``, and back to 0 in the same time at the end."""
+    """Return a profile from 0 to 1 in ``rise * duration``, and back to 0 in the same time at the end."""
     back = t > duration / 2
     side = casadi.if_else(back, duration - t, t)
     value, speed, acceleration = _flank(side / (rise * duration), rise * duration)

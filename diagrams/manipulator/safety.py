@@ -1,4 +1,4 @@
-"""What the arm does when its DPS cannot be relied on, or its sensors cannot: it floats where it is, or brakes."""
+"""The fallback of the arm: after a fault of its DPS or its sensors, it floats in place, or its brakes take over."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
 POSITION, VELOCITY = "joint_position", "joint_velocity"
 
 JUMP_TOLERANCE = {POSITION: 0.03, VELOCITY: 0.3, "joint_torque_measured": 50.0, "wrench": 100.0}
-"""The change of each sensor signal that is believed at any time, in the signal's unit."""
+"""The change of each sensor signal that is always plausible, in the unit of the signal."""
 
 DISAGREEMENT = 0.2
 """The largest difference between the measured velocity and that of the positions (rad/s)."""
@@ -38,16 +38,16 @@ CARRY = 0.2
 
 
 class FloatInPlace(Fallback):
-    """Carries the arm's weight, and holds it by the joint impedance law's springs and dampers, tau = g(q) + K (h - q)
-    - D v.
+    """A fallback that carries the weight of the arm, and holds it by the joint impedance law.
 
-    The pose h is dragged along where the arm is more than `SLIP` away: the arm is held wherever it was when this takes
-    over, and gives way to who pushes it. The measured velocity counts only as far as the positions bear it out, to
-    `DISAGREEMENT`.
+        tau = g(q) + K (h - q) - D v
 
-    Without a fresh position this carries the weight at the last pose that was accepted, for `CARRY` seconds from that
-    sample on. Then, or if no position was ever accepted, it sends nothing: the arm's own time-out lets its brakes fall
-    in. An arm that nobody sees cannot be held by torques.
+    The pose h is that of the arm when the fallback takes over. It follows the arm at a distance of `SLIP`, so the arm
+    yields to a push. The measured velocity is limited to what the positions confirm, up to `DISAGREEMENT`.
+
+    Without a fresh position, it carries the weight at the last accepted pose, for `CARRY` seconds after that sample.
+    Then, or if no position was ever accepted, it sends nothing, and the time-out of the arm applies its brakes: torques
+    cannot hold an arm whose position is unknown.
     """
 
     otherwise = Silence()
@@ -84,14 +84,14 @@ class FloatInPlace(Fallback):
         torque: NDArray[np.float64] = self._gravity(q).full().ravel()
         if POSITION in sensed and VELOCITY in sensed:
             self._held = q.copy() if self._held is None else np.clip(self._held, q - SLIP, q + SLIP)
-            v = self._borne_out(q, sensed[VELOCITY], dt)
+            v = self._confirmed(q, sensed[VELOCITY], dt)
             torque += self._stiffness * (self._held - q) - self._damping * v
         return torque
 
-    def _borne_out(self, q: NDArray[np.float64], v: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """The measured velocity ``v``, no larger than what the positions say, and none that they contradict."""
+    def _confirmed(self, q: NDArray[np.float64], v: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """Return the measured velocity ``v``, limited to what the positions confirm."""
         if self._before is None:
-            self._velocity = v.copy()  # What the guards accepted until now; the positions correct it.
+            self._velocity = v.copy()  # The guards accepted it until now; the positions correct it.
         elif dt > 0.0:
             self._velocity += min(dt / SMOOTHING, 1.0) * ((q - self._before) / dt - self._velocity)
         self._before = q
@@ -100,5 +100,5 @@ class FloatInPlace(Fallback):
 
 
 def arm_fallback() -> dict[str, Fallback]:
-    """What commands the arm after a fault: it floats in place."""
+    """Return the fallback by actuator signal: the arm floats in place."""
     return {"joint_torque": FloatInPlace()}

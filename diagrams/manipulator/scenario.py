@@ -38,7 +38,7 @@ from vtbdrake_diagrams.manipulator.motions import HOME, MOTIONS
 from vtbdrake_diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm_fallback
 
 LARGEST_DELAY = 50
-"""Of the drives' commands, in periods."""
+"""The largest latency of commands to the drives, in periods."""
 
 
 def _plant() -> MultibodyPlantConfig:
@@ -54,19 +54,19 @@ class ManipulatorScenario(Scenario):
     plant_config: MultibodyPlantConfig = field(default_factory=_plant)
     # joint_impedance, cartesian_impedance or admittance.
     law: str = "cartesian_impedance"
-    # Of sensors, DPS and drives, in seconds.
+    # The sample period of sensors, DPS and drives, in seconds.
     period: float = 0.001
-    # True has the DPS's arithmetic compiled where there is a C compiler; the results are the same.
+    # Whether to compile the arithmetic of the DPS if there is a C compiler; the results are the same.
     compile: bool = True
     # False is free space.
     wall: bool = False
-    # Of the wall's face from the world's origin, along x, in m; sim.env.wall.mount.pose moves it.
+    # The distance of the wall's face from the world's origin along x, in m; sim.env.wall.mount.pose moves it.
     wall_distance: float = 0.825
-    # Of the wall's face, in N/m.
+    # The stiffness of the wall's face, in N/m.
     wall_stiffness: float = 10e3
-    # Of the wall, after Hunt and Crossley, in s/m.
+    # The dissipation of the wall, after Hunt and Crossley, in s/m.
     wall_dissipation: float = 5.0
-    # Static and dynamic, of ball and wall.
+    # The static and dynamic friction coefficient of ball and wall.
     wall_friction: float = 0.1
     # Errors of the sensors, exact by default; latency in periods.
     position_errors: ErrorModel = field(default_factory=ErrorModel)
@@ -98,7 +98,7 @@ class ManipulatorScenario(Scenario):
     def interface(self) -> Interface:
         arm = Arm()
         age = 10 * self.period
-        margin = np.radians(5.0)  # joints run into their stops a little
+        margin = np.radians(5.0)  # joints run a little into their stops
         return Interface(
             sense=[
                 Signal(
@@ -111,7 +111,7 @@ class ManipulatorScenario(Scenario):
                     max_age=age,
                 ),
                 Signal("joint_velocity", size=JOINTS, unit="rad/s", lower=-10.0, upper=10.0, rate=1e3, max_age=age),
-                # Impacts are quick: for torque and wrench, only what cannot be is told apart.
+                # Impacts are fast: for torque and wrench, the limits exclude only impossible values.
                 Signal("joint_torque_measured", size=JOINTS, unit="N m", lower=-1e3, upper=1e3, rate=1e5, max_age=age),
                 Signal("wrench", size=6, unit="N m, N", lower=-2e3, upper=2e3, rate=1e5, max_age=age),
             ],
@@ -174,7 +174,7 @@ class ManipulatorScenario(Scenario):
         return make_dps(self.law, period=self.period, compile=self.compile)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        # The plant's modules, which the DPS on the robot does without.
+        # Imported here: the DPS on the robot runs without a plant.
         from vtbdrake_diagrams.manipulator.world import Push, add_arm, add_wall, set_ball_material
 
         arm = Arm()
@@ -222,7 +222,7 @@ class ManipulatorScenario(Scenario):
         builder.connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
         for k, name in enumerate(JOINT_NAMES):
             for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
-                # All joints in one reading: whoever looks at the belief while the loop runs has little time.
+                # One reading for all joints: the belief is read while the loop runs.
                 builder.believe(
                     f"sim.sys.arm.{name}.{value}",
                     of=[f"dps.env.joint_{value}"],

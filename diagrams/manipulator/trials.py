@@ -1,4 +1,4 @@
-"""Trials of the arm: a program of motions, and how well they were done, in simulation and on a machine alike."""
+"""Trials of the arm: a program of motions and its tracking errors, in simulation and on a machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, func
 from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME, MOTIONS, PRESS, SWING, parameters, reference
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
-# How the arm in a trial is: the wall is where the press meets it, and the swing does not.
+# The press meets the wall at this distance (m), and the swing does not.
 WALL_DISTANCE = 0.835
 DURATIONS = {
     "dps.impl.home_duration": 1.0,
@@ -32,18 +32,17 @@ _STEP = 1e-4  # s, of the prediction's integration
 
 
 def trial_scenario(law: str) -> ManipulatorScenario:
-    """The arm before the wall."""
+    """Return the scenario of the arm in front of the wall."""
     return ManipulatorScenario(law=law, wall=True, wall_distance=WALL_DISTANCE)
 
 
 class Trial:
-    """Has a DPS do motions one after another, and then go home; asked after every cycle whether it is done, it takes
-    down what happens.
+    """A program of motions, one after another and then home, as the ``until`` of `Runtime.run`; it records samples.
 
     Args:
-        runtime: whose DPS it is; its context is written to.
-        motions: what to do.
-        every: how many cycles lie between two samples.
+        runtime: The loop of the DPS; its context is changed.
+        motions: The motions to command.
+        every: The number of cycles between two samples.
     """
 
     def __init__(self, runtime: Runtime, motions: Sequence[int] = PROGRAM, *, every: int = 5) -> None:
@@ -59,7 +58,7 @@ class Trial:
         self._command(self._left[0])
 
     def __call__(self) -> bool:
-        """`Runtime.run`'s ``until``."""
+        """Command the next motion if it is due, record a sample, and return whether the trial is done."""
         motion = int(self._motion(self._context))
         if self._left and motion == self._left[0]:
             del self._left[0]
@@ -75,11 +74,11 @@ class Trial:
 
     @property
     def done(self) -> bool:
-        """Whether the arm is on its way home."""
+        """True if the arm is on its way home."""
         return not self._left
 
     def track(self) -> Track:
-        """How well it went so far."""
+        """Return the track until now."""
         return Track.of({name: np.array(values) for name, values in self._samples.items()}, self.parameters)
 
 
@@ -88,7 +87,7 @@ _RECORDED = ("env.joint_position", "env.contact_wrench", "impl.motion", "impl.cl
 
 @dataclass(frozen=True)
 class Track:
-    """Where the tip was to be and where it was, sample by sample.
+    """Reference and position of the tip, sample by sample.
 
     Attributes:
         motion: the motion under way, shape (n,).
@@ -106,7 +105,7 @@ class Track:
 
     @classmethod
     def of(cls, samples: dict[str, NDArray[np.float64]], values: dict[str, Any], *, period: float = 0.001) -> Track:
-        """From the DPS's variables; the reference is that of the update at which the position was measured."""
+        """Return the track from variables of the DPS; reference and position belong to the same update."""
         clock = samples["impl.clock"] - period
         positions = _positions(values, period)
         columns = [samples["impl.motion"], clock, samples["impl.start"], samples["env.joint_position"]]
@@ -115,13 +114,13 @@ class Track:
         return cls(samples["impl.motion"], clock, wanted, tip, samples["env.contact_wrench"].reshape(-1, 6)[:, 3:])
 
     def errors(self, motions: Sequence[int] = FREE) -> NDArray[np.float64]:
-        """Distances of the tip from its reference during some motions, in m."""
+        """Return the distances of the tip from its reference during some motions, shape (k,), in m."""
         during = np.isin(self.motion, motions)
         found: NDArray[np.float64] = np.linalg.norm(self.tip[during] - self.wanted[during], axis=1)
         return found
 
     def contact(self, law: LawAlongX, scenario: ManipulatorScenario) -> Contact:
-        """The force during the press, beside what the law and the wall predict."""
+        """Return the force during the press, and the prediction from law and wall."""
         during = self.motion == PRESS
         clock, wanted = self.clock[during], self.wanted[during, 0]
         return Contact(clock, law.force(clock, wanted, scenario), -self.force[during, 0])
@@ -129,7 +128,9 @@ class Track:
 
 @dataclass(frozen=True)
 class LawAlongX:
-    """What a Cartesian law makes of the arm along the world's x: M x'' + D x' + K x = F, x away from the reference.
+    """The behaviour of the arm along the world's x under a Cartesian law, M x'' + D x' + K x = F.
+
+    x is the distance from the reference.
 
     Attributes:
         inertia: M, in kg; 0 for the impedance law, which leaves the arm its own: it predicts statics.
@@ -143,7 +144,7 @@ class LawAlongX:
 
     @classmethod
     def of(cls, target: AddressedDiagram) -> LawAlongX:
-        """With the gains that a target has by default."""
+        """Return the behaviour for the default gains of a target."""
         context, known = target.default_context(), target.variables()
         values = {
             name: float(target.read(context, f"dps.impl.{name}")[3]) if f"dps.impl.{name}" in known else 0.0
@@ -154,7 +155,7 @@ class LawAlongX:
     def force(
         self, clock: NDArray[np.float64], wanted: NDArray[np.float64], scenario: ManipulatorScenario
     ) -> NDArray[np.float64]:
-        """On the wall, while the reference of the tip moves as wanted (n,), in m.
+        """Return the force on the wall while the reference of the tip moves as ``wanted``, shape (n,), in N.
 
         Without inertia that of two springs in series; else of the mass against the wall, which pushes back by Hunt and
         Crossley's k d (1 + c d').
@@ -191,21 +192,26 @@ class Contact:
     felt: NDArray[np.float64]
 
     def at(self, clock: float) -> tuple[float, float]:
-        """Predicted and felt force at an instant."""
+        """Return the predicted and the measured force at an instant, in N."""
         k = int(np.abs(self.clock - clock).argmin())
         return float(self.predicted[k]), float(self.felt[k])
 
 
 def rms(values: NDArray[np.float64]) -> float:
-    """Root of the mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def run_trial(runtime: Runtime, motions: Sequence[int] = PROGRAM, *, limit: float = 60.0) -> Track:
-    """Has the loop's DPS do the motions, until it is on its way home.
+    """Run a loop until its DPS has done the motions, and return the track.
+
+    Args:
+        runtime: The loop.
+        motions: The motions to command.
+        limit: The longest duration, in seconds of cycles.
 
     Raises:
-        TimeoutError: it is not after so many seconds' worth of cycles.
+        TimeoutError: The motions took longer.
     """
     trial = Trial(runtime, motions)
     runtime.run(until=trial, cycles=round(limit / runtime.period))
@@ -215,7 +221,7 @@ def run_trial(runtime: Runtime, motions: Sequence[int] = PROGRAM, *, limit: floa
 
 
 def _positions(values: dict[str, Any], period: float) -> Any:
-    """(motion, clock, start, q) -> the tip's reference and the tip."""
+    """Return the function (motion, clock, start, q) -> (reference of the tip, tip)."""
     model = ArmDynamics()
     symbols: dict[str, Expression] = {
         "motion": casadi.SX.sym("motion"),

@@ -1,4 +1,4 @@
-"""The simulated arm and what it touches: what a MultibodyPlant needs beside the SDF."""
+"""The simulated arm and its environment, as far as they are not in the SDF file."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from vtbdrake_diagrams.manipulator.model import ARM_SDF
 
 BALL_STIFFNESS = 1e8
-"""Of the ball at the tip, in N/m [A]: in series with any wall's it hardly counts."""
+"""The stiffness of the ball at the tip, in N/m [A], much larger than that of any wall."""
 
 WALL_THICKNESS = 0.1
 
 
 def add_arm(plant: MultibodyPlant, arm: Arm) -> ModelInstanceIndex:
-    """Adds the arm, standing on the world's origin, at home."""
+    """Add the arm to a plant, at the origin of the world and in its home pose."""
     (instance,) = Parser(plant).AddModels(str(ARM_SDF))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     for name, angle in zip(JOINT_NAMES, arm.home, strict=True):
@@ -34,7 +34,7 @@ def add_arm(plant: MultibodyPlant, arm: Arm) -> ModelInstanceIndex:
 
 
 def add_wall(plant: MultibodyPlant, *, distance: float, stiffness: float, dissipation: float, friction: float) -> None:
-    """Adds model instance ``wall``: a slab across the world's x, on the frame ``mount``, which the Context can move.
+    """Add the model instance ``wall``: a slab across the world's x, on the frame ``mount``, which the Context can move.
 
     Args:
         distance: of its face from the world's origin (m).
@@ -56,7 +56,7 @@ def add_wall(plant: MultibodyPlant, *, distance: float, stiffness: float, dissip
 
 
 def set_ball_material(plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, friction: float) -> None:
-    """Makes the ball at the tip stiff, before contexts are made."""
+    """Make the ball at the tip stiff; call it before a context is created."""
     material = ProximityProperties()
     AddContactMaterial(0.0, BALL_STIFFNESS, CoulombFriction(friction, friction), material)
     for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName("tool", arm)):
@@ -64,7 +64,7 @@ def set_ball_material(plant: MultibodyPlant, scene_graph: SceneGraph, arm: Model
 
 
 class Push(LeafSystem):
-    """A wrench on a frame of a body, that stays until it is changed.
+    """A source of a constant wrench on a frame of a body, a parameter.
 
     .. pydrake_system::
 
