@@ -152,11 +152,6 @@ def test_simulated_clock_is_late_by_list() -> None:
     assert [clock.wait_until(float(t)) for t in (1, 2, 3, 4)] == [1.25, 2.0, 3.5, 4.0]
 
 
-def test_simulated_clock_is_late_by_function() -> None:
-    clock = SimulatedClock(lateness=lambda call: 0.125 * call)
-    assert [clock.wait_until(float(t)) for t in (1, 2, 3)] == [1.0, 2.125, 3.25]
-
-
 def test_advance_adds_simulated_time() -> None:
     clock = SimulatedClock()
     clock.advance(0.75)

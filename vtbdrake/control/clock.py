@@ -67,14 +67,12 @@ class SimulatedClock(Clock):
 
     Args:
         start: the first time, in seconds.
-        lateness: delay of `wait_until` in seconds: one per call (none after the last), or a function of the number of
-            the call, from 0.
+        lateness: delay of `wait_until` in seconds, one per call; later calls have none.
     """
 
-    def __init__(self, *, start: float = 0.0, lateness: Sequence[float] | Callable[[int], float] = ()) -> None:
+    def __init__(self, *, start: float = 0.0, lateness: Sequence[float] = ()) -> None:
         self._now = start
-        self._lateness = lateness if callable(lateness) else _from_list(lateness)
-        self._calls = 0
+        self._lateness = iter(tuple(lateness))
 
     def now(self) -> float:
         return self._now
@@ -82,10 +80,9 @@ class SimulatedClock(Clock):
     def wait_until(self, t: float, meanwhile: Callable[[], object] | None = None) -> float:
         if not isfinite(t):
             raise ValueError(f"the deadline must be finite, not {t}")
-        late = self._lateness(self._calls)
+        late = next(self._lateness, 0.0)
         if not late >= 0.0:
             raise ValueError(f"lateness must not be negative, unlike {late} s")
-        self._calls += 1
         self._now = max(self._now, t + late)
         return self._now
 
@@ -94,8 +91,3 @@ class SimulatedClock(Clock):
         if not 0.0 <= seconds < float("inf"):
             raise ValueError(f"time advances by a finite number of seconds from 0 on, not by {seconds}")
         self._now += seconds
-
-
-def _from_list(values: Sequence[float]) -> Callable[[int], float]:
-    fixed = tuple(values)
-    return lambda call: fixed[call] if call < len(fixed) else 0.0

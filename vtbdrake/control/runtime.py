@@ -19,7 +19,14 @@ from vtbdrake.control.guards import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepping import RESET, Cycle, Stepped
-from vtbdrake.control.switching import Preparation, SwitchRefusedError, check_continuity, discontinuities, prepare
+from vtbdrake.control.switching import (
+    Preparation,
+    SwitchRefusedError,
+    check_continuity,
+    discontinuities,
+    perform,
+    prepare,
+)
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -310,7 +317,7 @@ class Runtime(Stepped):
             raise SwitchRefusedError(f"the switch was prepared {age} cycles ago: prepare it anew")
         if preparation.reasons:
             raise SwitchRefusedError("; ".join(preparation.reasons))
-        preparation.perform()
+        perform(self, preparation.sense, preparation.act)
 
     def switch(self, mode: str | None = None, **sides: Any) -> None:
         """Prepare and perform a switch. Call it in the thread that runs the cycles, or between cycles.

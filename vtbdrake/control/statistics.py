@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from itertools import accumulate
 from math import ceil, exp, inf, log, nan
 from typing import Any
@@ -133,14 +132,6 @@ class Histogram:
         return self.resolution, self.lowest, self.highest
 
 
-class Level(IntEnum):
-    """Severity of what was measured."""
-
-    OK = 0
-    WARNING = 1
-    ERROR = 2
-
-
 @dataclass
 class Threshold:
     """Thresholds of a duration, with counts of the durations above them.
@@ -161,13 +152,9 @@ class Threshold:
         if not 0.0 <= self.warning <= self.error:
             raise ValueError(f"a threshold needs 0 <= warning <= error, not {self.warning} and {self.error}")
 
-    @property
-    def level(self) -> Level:
-        """The worst level so far."""
-        return Level.ERROR if self.errors else Level.WARNING if self.warnings else Level.OK
-
 
 QUANTITIES = ("lateness", "step", "cycle")
+_COUNTS = ("misses", "run", "longest_run", "foreign")
 
 
 class LoopStatistics:
@@ -233,29 +220,12 @@ class LoopStatistics:
         return self.histograms["cycle"].count
 
     @property
-    def level(self) -> Level:
-        """The worst level of all thresholds so far."""
-        return max(threshold.level for threshold in self.thresholds.values())
-
-    def merge(self, other: LoopStatistics) -> None:
-        """Add the statistics of another run. Its misses and ours do not form one row.
-
-        Raises:
-            ValueError: its period or a threshold is different.
-        """
-        if self._shape() != other._shape():
-            raise ValueError(
-                "statistics merge if their period and thresholds agree, but these are "
-                f"{self._shape()} and {other._shape()}"
-            )
-        for name in QUANTITIES:
-            self.histograms[name].merge(other.histograms[name])
-            self.thresholds[name].warnings += other.thresholds[name].warnings
-            self.thresholds[name].errors += other.thresholds[name].errors
-        self.misses += other.misses
-        self.run = other.run
-        self.longest_run = max(self.longest_run, other.longest_run)
-        self.foreign += other.foreign
+    def level(self) -> str:
+        """The worst so far: ``error`` or ``warning`` if a duration exceeded such a threshold, otherwise ``ok``."""
+        thresholds = self.thresholds.values()
+        return (
+            "error" if any(t.errors for t in thresholds) else "warning" if any(t.warnings for t in thresholds) else "ok"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the statistics as plain data, fit for JSON."""
@@ -263,10 +233,7 @@ class LoopStatistics:
             "period": self.period,
             "histograms": {name: histogram.to_dict() for name, histogram in self.histograms.items()},
             "thresholds": {name: vars(threshold).copy() for name, threshold in self.thresholds.items()},
-            "misses": self.misses,
-            "run": self.run,
-            "longest_run": self.longest_run,
-            "foreign": self.foreign,
+            **{name: getattr(self, name) for name in _COUNTS},
         }
 
     @classmethod
@@ -276,8 +243,8 @@ class LoopStatistics:
         statistics = cls(data["period"], thresholds=thresholds)
         for name in QUANTITIES:
             statistics.histograms[name].merge(Histogram.from_dict(data["histograms"][name]))
-        statistics.misses, statistics.run = data["misses"], data["run"]
-        statistics.longest_run, statistics.foreign = data["longest_run"], data["foreign"]
+        for name in _COUNTS:
+            setattr(statistics, name, data[name])
         return statistics
 
     def __str__(self) -> str:
@@ -290,12 +257,9 @@ class LoopStatistics:
             cells = [f"{1e6 * seconds:.0f}" for seconds in durations]
             lines.append(form.format(name, *cells, threshold.warnings, threshold.errors))
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
-        lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level.name.lower()}")
+        lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level}")
         if self.foreign:
             lines.append(
                 f"ALARM: other publishers commanded the machine, too: {self.foreign} of their commands were heard"
             )
         return "\n".join(lines)
-
-    def _shape(self) -> tuple[Any, ...]:
-        return self.period, *((t.warning, t.error) for t in self.thresholds.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,17 +27,19 @@ class SwitchRefusedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Preparation:
-    """The first phase of a switch: the reasons against it, and the function that throws it.
+    """The first phase of a switch: what it changes, and the reasons against it.
 
     Attributes:
+        sense: new positions by sensor signal.
+        act: new positions by actuator signal.
         reasons: the reasons against the switch; empty if there are none.
         cycle: number of the runtime's cycles when they were collected.
-        perform: throws the switch.
     """
 
+    sense: Mapping[str, str]
+    act: Mapping[str, str]
     reasons: tuple[str, ...]
     cycle: int
-    perform: Callable[[], None]
 
 
 def prepare(
@@ -95,10 +97,7 @@ def prepare(
             reasons.append(competing)
         reasons += discontinuities(runtime, becoming)
 
-    def perform() -> None:
-        _throw(runtime, senses, acts)
-
-    return Preparation(tuple(reasons), runtime.cycles, perform)
+    return Preparation(senses, acts, tuple(reasons), runtime.cycles)
 
 
 def _positions(
@@ -162,8 +161,8 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
     return found
 
 
-def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
-    target, context = runtime.target, runtime.context
+def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
+    """Throw the switches of a preparation without reasons against it; `Runtime.perform` calls this."""
     for name, position in acts.items():
         if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
             # The commands depart from what is measured; a signal that is commanded already goes on.
@@ -173,11 +172,11 @@ def _throw(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str])
         {f"sense.{name}": position for name, position in senses.items()}
         | {f"act.{name}": position for name, position in acts.items()},
     )
-    if isinstance(target, DpsAlone):
+    if isinstance(runtime.target, DpsAlone):
         runtime.start_dps()
         return
     runtime.feed()
-    throw(target, context, senses, acts)
+    throw(runtime.target, runtime.context, senses, acts)
     runtime.read_switches()
 
 
