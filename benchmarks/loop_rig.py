@@ -98,12 +98,12 @@ class Rig:
         runtime.overheads.clear()
         runtime.commanded.clear()
         runtime.lateness.clear()
-        missed, worked = runtime.missed, time.thread_time()
+        missed, worked = runtime.statistics.misses, time.thread_time()
         runtime.run(cycles=cycles)
         runtime.worked = time.thread_time() - worked
         if runtime.guards.latched:
             raise RuntimeError(f"the loop ended in a safe stop: {runtime.guards.latched[0]}")
-        return runtime.missed - missed
+        return runtime.statistics.misses - missed
 
     def drain(self) -> None:
         """Takes in what came while somebody else had his turn, until no more comes than the machine tells now."""
