@@ -101,5 +101,5 @@ def test_abstract_signal_has_no_zero() -> None:
 
 @pytest.mark.parametrize("gain", [-1.0, [1.0, -2.0], float("nan")])
 def test_brake_with_negative_gain_is_rejected(gain: object) -> None:
-    with pytest.raises(ValueError, match="accelerate"):
+    with pytest.raises(ValueError, match="are not negative"):
         Brake("joint_state", gain=gain)

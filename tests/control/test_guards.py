@@ -597,7 +597,7 @@ happenings = st.sampled_from(["go", "go", "wild", "nan", "raise", "lost", "back"
 def test_sent_command_is_always_one_step_from_acting_command(
     script: list[tuple[str, int, float]],
 ) -> None:
-    """The machine goes where it likes once it has heard nothing for more than ten cycles."""
+    """The machine moves freely once it has heard nothing for more than ten cycles."""
     mute = False
     quiet = FallbackController(lambda *_: NO_COMMAND if mute else [8.0, -8.0], otherwise=Hold())
     loop = measured_loop(fallback={"torque": quiet})
