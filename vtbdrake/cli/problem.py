@@ -276,7 +276,7 @@ def boundary(
     plot: Path | None,
     **problem: Any,
 ) -> None:
-    """How far may a parameter go before f exceeds the threshold?
+    """Find how far a parameter may go before f exceeds the threshold.
 
     A coarse grid over the range is refined below the first failure, under each condition.
 
