@@ -94,6 +94,6 @@ def test_dask_without_its_package_names_the_extra(pendulum, monkeypatch):
 def test_workers_start_with_their_executor_and_end_with_it():
     testbed = PendulumScenario().build()
     with make_executor("processes", testbed=testbed, rollouts=3, workers=5) as executor:
-        processes = [worker.process for worker in executor._workers]
-        assert len(processes) == 3 and all(process.poll() is None for process in processes)
-    assert all(process.poll() is not None for process in processes)
+        children = [worker.child for worker in executor._workers]
+        assert len(children) == 3 and all(child.alive for child in children)
+    assert not any(child.alive for child in children)
