@@ -75,11 +75,11 @@ class Bridge(ABC):
     @property
     @abstractmethod
     def connected(self) -> bool:
-        """Whether messages can be received and sent at present."""
+        """Return whether messages can be received and sent at present."""
 
     @property
     def blocked_reason(self) -> str | None:
-        """Why commands that leave do not reach the machine, as far as is known; None if they do."""
+        """Return why commands that leave do not reach the machine, as far as is known; None if they do."""
         return None
 
     @property
@@ -89,7 +89,7 @@ class Bridge(ABC):
 
     @property
     def competing_publisher(self) -> str | None:
-        """Which other publisher commands the machine at present, as one sentence; None if none is heard."""
+        """Return which other publisher commands the machine at present, as a sentence; None if none is heard."""
         return None
 
     @abstractmethod

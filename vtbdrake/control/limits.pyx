@@ -314,7 +314,7 @@ class PassThrough:
 
     @property
     def has_start(self):
-        """Whether anything was sent."""
+        """Return whether anything was sent."""
         return self.last_sent is not None
 
     def start_from(self, value):

@@ -131,7 +131,7 @@ class SensorMonitor(StalenessMonitor):
 
     @property
     def steady(self) -> bool:
-        """Whether the signal has jumped, and its samples have agreed with each other for `SETTLING` since then."""
+        """Return whether the signal has jumped and its samples have agreed for `SETTLING` since then."""
         return self._rejected is not None and self._rejected_at - self._steady_since >= SETTLING
 
     def accept_steady(self) -> None:

@@ -1,4 +1,4 @@
-"""What a loop steps (the testbed or the DPS alone), its ports to the machine, and the record of each cycle."""
+"""The target that a loop steps (a testbed or the DPS alone), its ports to the machine, and the record of each cycle."""
 
 from __future__ import annotations
 
