@@ -69,6 +69,17 @@ def test_variables_show_a_table(testbed):
     assert table.count("<tr>") == 1 + len(testbed.variables())
 
 
+def test_a_snapshot_shows_its_values(testbed):
+    table = testbed.snapshot(testbed.default_context())._repr_html_()
+    assert f"<td>{ELBOW}</td><td>0.</td>" in table
+
+
+def test_the_dps_alone_shows_its_signals():
+    shown = DpsAlone(AcrobotScenario())._repr_html_()
+    assert "<td>sensor</td><td>joint_state</td><td>4</td>" in shown
+    assert "<td>actuator</td><td>torque</td><td>1</td>" in shown
+
+
 @pytest.mark.parametrize("owner", ["variables", "snapshot"])
 def test_ipython_completes_addresses(owner):
     climber = SpaceClimberScenario().build()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from html import escape
 from types import MappingProxyType
 from typing import Any
 
@@ -15,7 +16,7 @@ from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.codecs import SnapshotError, abstract_state
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
 from vtbdrake.state.systems import group_size, is_camera, is_scene_graph, leaves, read_group, write_group
-from vtbdrake.state.variables import VariableError, Variables
+from vtbdrake.state.variables import VariableError, Variables, html_table
 
 KIND = "vtbdrake snapshot"
 VERSION = 1
@@ -66,6 +67,11 @@ class Snapshot:
     def __repr__(self) -> str:
         owner = self.scenario.get("scenario", "a bare Diagram").partition(":")[2] or "a bare Diagram"
         return f"Snapshot(t={self.time:g} s, {owner}, {len(self.values)} variables)"
+
+    def _repr_html_(self) -> str:
+        """Show the values as a table in a notebook."""
+        rows = [(address, np.array2string(value, precision=5, threshold=6)) for address, value in self.values.items()]
+        return f"<b>{escape(repr(self))}</b>{html_table([('address', 'value'), *rows])}"
 
     def _ipython_key_completions_(self) -> list[str]:
         """Complete ``snapshot["dps.<TAB>`` in IPython."""

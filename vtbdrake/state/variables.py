@@ -125,6 +125,12 @@ class AddressError(KeyError, ValueError):
 _ENTRY = re.compile(r"(.+)\[(\d+)\]")
 
 
+def html_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return an HTML table for a notebook, which scrolls if it is long."""
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div style="max-height: 30em; overflow: auto"><table>{body}</table></div>'
+
+
 class Variables(Mapping[str, Variable]):
     """The variables of one Diagram, in the order of its systems; ``address[3]`` is one entry of an array.
 
@@ -177,9 +183,7 @@ class Variables(Mapping[str, Variable]):
 
     def _repr_html_(self) -> str:
         """Show a table in a notebook."""
-        rows = [("address", "kind", "shape", "unit", "bounds"), *map(_row, self._listed.values())]
-        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        return f'<div style="max-height: 30em; overflow: auto"><table>{body}</table></div>'
+        return html_table([("address", "kind", "shape", "unit", "bounds"), *map(_row, self._listed.values())])
 
     def _ipython_key_completions_(self) -> list[str]:
         """Complete ``variables["dps.<TAB>`` in IPython."""

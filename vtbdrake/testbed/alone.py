@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from vtbdrake.state import Snapshot
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
+from vtbdrake.state.variables import html_table
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.signal import Feed, Interface, SignalError
@@ -60,6 +62,17 @@ class DpsAlone(AddressedDiagram):
         )
         self.dps = dps
         self._copiers: dict[int, StateCopier] = {}
+
+    def _repr_html_(self) -> str:
+        """Show the signals and the variables in a notebook."""
+        sides = (
+            ("sensor", self.interface.sense),
+            ("actuator", self.interface.act),
+            ("command", self.interface.commands),
+        )
+        signals = [(kind, signal.name, str(signal.size or ""), signal.unit) for kind, side in sides for signal in side]
+        variables = self.variables()._repr_html_()
+        return f"<b>{escape(repr(self))}</b>{html_table([('signal', 'name', 'size', 'unit'), *signals])}{variables}"
 
     def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:
         """Return a context in which the DPS continues from a context of its testbed, at the same time."""
