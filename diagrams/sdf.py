@@ -73,14 +73,14 @@ def add_geometry(owner: ET.Element, shape: ET.Element, pose: str) -> None:
 
 
 def box(x: float, y: float, z: float) -> ET.Element:
-    """Edges in metres."""
+    """Return a box; its edges are in metres."""
     element = ET.Element("box")
     ET.SubElement(element, "size").text = f"{text(x)} {text(y)} {text(z)}"
     return element
 
 
 def cylinder(radius: float, length: float) -> ET.Element:
-    """Along z, in metres."""
+    """Return a cylinder along z; radius and length are in metres."""
     element = ET.Element("cylinder")
     ET.SubElement(element, "radius").text = text(radius)
     ET.SubElement(element, "length").text = text(length)
@@ -88,14 +88,14 @@ def cylinder(radius: float, length: float) -> ET.Element:
 
 
 def sphere(radius: float) -> ET.Element:
-    """In metres."""
+    """Return a sphere; the radius is in metres."""
     element = ET.Element("sphere")
     ET.SubElement(element, "radius").text = text(radius)
     return element
 
 
 def text(value: float) -> str:
-    """12 digits: the same text whatever the last bits are."""
+    """Return a number with 12 digits, so that rounding errors in the last bits do not change the text."""
     return f"{round(float(value), 12) + 0.0:.12g}"
 
 

@@ -1,4 +1,4 @@
-"""What the tables of answers and of benchmarks have in common: which rows to run, and the file they end in."""
+"""Common parts of the tables of answers and of benchmarks: the choice of the rows to run, and the file of results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _function(entry: str | Callable[..., Any]) -> Callable[..., Any]:
 
 
 def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a JSON list of objects, completely or not at all; null stands for infinite and NaN, so for an open end."""
+    """Write a JSON list of objects, completely or not at all; infinite values and NaN become null."""
     with whole_file(path) as partial:
         partial.write_text(json.dumps([_plain(dict(row)) for row in rows], indent=2, allow_nan=False) + "\n")
 

@@ -1,4 +1,4 @@
-"""How the DPS of a scenario runs on its machine, and the call that starts it."""
+"""The deployment of a scenario's DPS on its machine, and the call that starts it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _ready(bridge: Bridge) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Deployment:
-    """How a DPS runs on its machine: what they exchange, what guards the machine, what begins a cycle.
+    """The description of a DPS on its machine: the messages, the guards, and the clock of its cycles.
 
     A scenario describes its own by overriding `Scenario.deployment`::
 

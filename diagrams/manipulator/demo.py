@@ -251,6 +251,7 @@ def _torque(values: np.ndarray) -> str:
 
 
 def main() -> None:
+    """Run the demo with each control law on a machine in another process."""
     logging.disable(logging.ERROR)  # The demo prints what the guards would log.
     begin = time.perf_counter()
     print("A seven-joint arm, developed in simulation, then run at 1 kHz on a machine in another process.")

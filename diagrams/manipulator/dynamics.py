@@ -110,13 +110,14 @@ class ArmDynamics:
         return casadi.densify(casadi.vertcat(*tau))
 
     def momentum(self, q: Expression, v: Expression) -> tuple[Expression, Expression]:
-        """Return p = M(q) v of the links, and dL/dq of their Lagrangian L = v' M v / 2 - U: Lagrange's equation is then
+        """Return the momentum p = M(q) v of the links and dL/dq of their Lagrangian L = v' M v / 2 - U.
 
-        dp/dt = dL/dq + tau, for the torques tau that act on the links.
+        Lagrange's equation is then dp/dt = dL/dq + tau, for the torques tau that act on the links.
 
-        In the frame of link k, about its origin, what it carries beyond has the momentum [l; h] (angular, linear) and
-        the first moment s; a is its axis. Of its velocity, only what it has from the link before, [w; u], depends on
-        q_k, as gravity g does: they turn against the joint. So p_k = a . l and dL/dq_k = a . (s x g - w x l - u x h).
+        Link k and all links beyond it have, in the frame of link k and about its origin, the momentum [l; h] (angular,
+        linear) and the first moment s; a is the axis of the joint. Only gravity g and the velocity [w; u] of the link
+        before depend on q_k: seen from link k, they turn against the joint. So p_k = a . l and
+        dL/dq_k = a . (s x g - w x l - u x h).
         """
         zero = casadi.SX(3, 1)
         omega, velocity, g = zero, zero, _sparse(np.array([0.0, 0.0, -GRAVITY]))

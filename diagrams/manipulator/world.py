@@ -37,10 +37,12 @@ def add_wall(plant: MultibodyPlant, *, distance: float, stiffness: float, dissip
     """Add the model instance ``wall``: a slab across the world's x, on the frame ``mount``, which the Context can move.
 
     Args:
-        distance: of its face from the world's origin (m).
-        stiffness: of its face (N/m): a ball that has sunk in by x feels stiffness x, in Drake's point contact.
-        dissipation: of Hunt and Crossley (s/m).
-        friction: static and dynamic, with the ball.
+        plant: The plant, not yet finalized.
+        distance: Distance of the slab's face from the world's origin (m).
+        stiffness: Stiffness of the face (N/m): a ball that penetrates it by x is pushed back with stiffness x, in
+            Drake's point contact.
+        dissipation: Hunt and Crossley dissipation (s/m).
+        friction: Coefficient of static and of dynamic friction.
     """
     wall = plant.AddModelInstance("wall")
     X_WM = RigidTransform([distance, 0.0, 0.5])

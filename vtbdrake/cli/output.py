@@ -1,4 +1,4 @@
-"""What the commands print and write: numbers, tables, CSV files, recordings."""
+"""Output of the commands: numbers, tables, CSV files, recordings."""
 
 from __future__ import annotations
 

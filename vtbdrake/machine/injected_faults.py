@@ -185,7 +185,7 @@ class Delay(InjectedFault):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(InjectedFault):
-    """Of every two messages of a channel the second arrives first, and the first right after it.
+    """Every two messages of a channel are swapped: the second arrives first, and the first right after it.
 
     A message that waits for its partner when the fault ends is lost.
     """

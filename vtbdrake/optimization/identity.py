@@ -280,8 +280,10 @@ def versions() -> dict[str, str]:
 
 
 def revision(scenario: Scenario) -> str:
-    """Return the git revision of the folder of the scenario's class, with ``+`` if it was changed; empty without
-    git."""
+    """Return the git revision of the folder of the scenario's class, with ``+`` if it was changed.
+
+    Without git it is empty.
+    """
     try:
         folder = Path(inspect.getfile(type(scenario))).parent
     except (OSError, TypeError):

@@ -93,7 +93,7 @@ class Sweep:
 
     @property
     def h(self) -> np.ndarray:
-        """Return h(s^0), equation (17), shape (n,); NaN where the rollout failed."""
+        """Return the quality of each rollout, equation (17), shape (n,); NaN where the rollout failed."""
         return np.array([rollout.h for rollout in self.rollouts])
 
     @property

@@ -32,10 +32,10 @@ def as_whole(name: str, value: Any) -> int:
 
 
 def as_addresses(name: str, values: Any) -> tuple[str, ...]:
-    """Return one address, or several, as a tuple; raise a ValueError for anything else.
+    """Return one address, or several, as a tuple.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: The argument is neither a string nor an iterable of strings.
     """
     return all_of(str, (values,) if isinstance(values, str) else values, name=name, form="[address, ...]")
 
@@ -44,11 +44,13 @@ def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
     """Return the values as a tuple, after a check that each is a ``kind``.
 
     Args:
-        name: of the argument.
-        form: how it is given.
+        kind: The expected type of each value.
+        values: The argument to check.
+        name: Name of the argument, for error messages.
+        form: The expected form of the argument, for error messages.
 
     Raises:
-        ValueError: they are no list, or one is of another kind.
+        ValueError: The argument is not a list, or a value is of another type.
     """
     if not isinstance(values, Iterable) or isinstance(values, str | Mapping):
         raise ValueError(f"give {name} as {form}, not as {values!r}")

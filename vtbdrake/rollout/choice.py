@@ -1,4 +1,4 @@
-"""Which executor runs the rollouts: by name, by an object that the user brings, or by what the testbed is made of."""
+"""The choice of an executor: by name, by an object of the user, or by the systems of the testbed."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def make_executor(
     if isinstance(executor, concurrent.futures.Executor):
         _refuse("a pool that is there already", workers=workers, time_limit=time_limit)
         return FuturesExecutor(executor)
-    # A client can only be given by someone who has imported its package.
+    # A client exists only if its package has been imported.
     distributed = sys.modules.get("distributed")
     if distributed is not None and isinstance(executor, distributed.Client):
         return _dask(executor, workers=workers, time_limit=time_limit)

@@ -1,5 +1,4 @@
-"""Derivatives of a rollout: the state by AutoDiff through the simulation, the quality by the directions in which it
-moves."""
+"""Derivatives of a rollout: of its states by AutoDiff, and of its quality along the directions of the states."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ class DerivativeRunner:
     known; f is evaluated at s +- e ds/dp, so that f may be any function in Python.
 
     Args:
-        task: the rollout. Its threshold is not looked at.
+        task: The rollout. Its threshold is ignored.
         testbed: built from the task's scenario, of systems that convert to AutoDiffXd.
 
     Raises:
@@ -138,7 +137,7 @@ class DerivativeRunner:
         systems = {path: system for path, _, system in self._pairs}
         for (path, group, index), value in self._groups(context).items():
             gradient = np.stack([direction[path, group, index] for direction in directions], axis=1)
-            # NaN stands for no value, such as no command: it has no derivative.
+            # NaN means no value, such as no command: it has no derivative.
             gradient[np.isnan(gradient)] = 0.0
             if gradient.any():
                 leaf = systems[path].GetMyMutableContextFromRoot(seeded)

@@ -1,4 +1,4 @@
-"""Where rollouts run: one after another, or in threads that share a Diagram."""
+"""Executors, which run rollouts: one after another, or in threads that share a Diagram."""
 
 from __future__ import annotations
 

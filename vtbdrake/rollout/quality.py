@@ -212,8 +212,9 @@ def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = Fa
 
 
 def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize: bool = False) -> int:
-    """Return the index of the sample at t*, equations (14) to (16): the first that exceeds ``threshold``, else the
-    first of the best.
+    """Return the index of the sample at t*, equations (14) to (16).
+
+    It is the first sample that exceeds ``threshold``; if none does, the first of the best.
     """
     found = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
     return int(found[0]) if found.size else int(np.argmin(samples) if minimize else np.argmax(samples))

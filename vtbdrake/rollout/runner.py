@@ -438,7 +438,10 @@ class Runners:
         are an error.
 
         Args:
-            begin: called when the testbed is there, before the rollout.
+            task: The rollout.
+            point: Address, or scenario field with its prefix -> value.
+            cancel: An event that ends the rollout when it is set.
+            begin: Called when the testbed has been built, before the rollout.
         """
         with Interruptible():
             fields, variables = split(point)

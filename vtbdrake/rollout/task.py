@@ -209,8 +209,7 @@ class RolloutTask:
         return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
 
     def instants(self, t0: float, timings: Sequence[tuple[float, float]]) -> np.ndarray:
-        """Return the simulator's clock at the sample times: t0 + t or, where an event is meant to coincide, its
-        instant.
+        """Return the simulator's time at each sample: t0 + t, or the instant of an event that coincides up to rounding.
 
         Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
         advanced to the one would take another step, of 1e-16 s, to the other.

@@ -66,7 +66,7 @@ def _write(
 
 
 def _most(packed: int) -> int:
-    """Return what a file of ``packed`` bytes may unpack to; deflate can pack a thousand equal bytes into one."""
+    """Return the size that ``packed`` bytes may unpack to; deflate can pack a thousand equal bytes into one."""
     return max(LARGEST, 100 * packed)
 
 
@@ -77,15 +77,18 @@ def read_archive(
     version: int,
     make: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
 ) -> T:
-    """Return what ``make(header, arrays)`` makes of what `write_archive` wrote, or of the bytes of it.
+    """Read an archive that `write_archive` wrote, and return ``make(header, arrays)``.
 
     Args:
-        make: an exception that it raises is reported as damage of the file.
+        source: Path of the archive, or its bytes.
+        kind: The expected kind of archive.
+        version: The expected version of that kind.
+        make: Function of the header and the arrays. An exception that it raises is reported as damage of the file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ArchiveError: the file is damaged, of another kind, or of another version, or it would take a lot more memory
-            than it has bytes (more than 1 GiB and than a hundred times as much).
+        FileNotFoundError: There is no such file.
+        ArchiveError: The file is damaged, of another kind or version, or it would unpack to more than 1 GiB and more
+            than a hundred times its size.
     """
     path = f"an archive of {len(source)} bytes" if isinstance(source, bytes) else source
     if not isinstance(source, bytes) and os.path.exists(source) and not os.path.isfile(source):
@@ -152,8 +155,9 @@ def _array(data: bytes) -> np.ndarray:
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to; at the end, that file replaces ``path``, unless an exception was
-    raised.
+    """Yield a path beside ``path`` to write to, and replace ``path`` by that file at the end.
+
+    After an exception ``path`` is unchanged.
     """
     target = Path(path)
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")

@@ -23,10 +23,11 @@ def codec_of(model: Any, *, varying: bool = False) -> Codec:
     dataclass is one array per field, by its name; its fields are arrays and numbers.
 
     Args:
-        varying: arrays and images may have another size than ``model``. Else one of another size is refused.
+        model: A value of the type to encode.
+        varying: Accept arrays and images of another size than ``model``; by default they are rejected.
 
     Raises:
-        ValueError: there is none for its type.
+        ValueError: There is no codec for the type of ``model``.
     """
     if isinstance(model, np.ndarray) and not model.dtype.hasobject:
         return _any_array_codec() if varying else array_codec(model.shape, model.dtype)

@@ -1,4 +1,4 @@
-"""What a LeafSystem declares about itself: named variables, codecs of its abstract state, and how it can be freed."""
+"""Declarations of a LeafSystem: named variables, codecs of its abstract state, and slots that let it be freed."""
 
 from __future__ import annotations
 

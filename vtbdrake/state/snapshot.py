@@ -163,11 +163,14 @@ def apply(
     """Set time, state and parameters of ``context`` from ``snapshot``.
 
     Args:
-        only: selects the systems that are set, by path; left out, all are.
+        snapshot: The snapshot to apply.
+        diagram: The Diagram to set the state of.
+        context: A root context of ``diagram``.
+        variables: The variables of ``diagram``.
+        only: Predicate of a path that selects the systems to set; by default all.
 
     Raises:
-        SnapshotError: the Diagram is built in another way than the one that the snapshot was taken from; the
-            context is unchanged.
+        SnapshotError: The Diagram differs in structure from that of the snapshot; the context is unchanged.
     """
     systems = [(path, system) for path, system in leaves(diagram) if only(path)]
     left = {key for key in snapshot.groups if only(key.partition("/")[0])}
@@ -208,7 +211,7 @@ def apply(
         if path in writers:
             writers[path](leaf_context)
     for variable in hidden:
-        # Write only what differs: writing makes SceneGraph and cameras compute anew.
+        # Write only what differs: writing invalidates the caches of SceneGraph and cameras.
         if not np.array_equal(variable.get(context), snapshot.values[variable.address]):
             variable.set(context, snapshot.values[variable.address])
 

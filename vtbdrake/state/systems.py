@@ -210,10 +210,11 @@ def collect(
     """Return the variables of every system of ``diagram``.
 
     Args:
-        plant_prefix: (path of a plant, name of a model instance) -> prefix of the addresses of what belongs to
-            that instance. By default the path of the plant.
-        skip: selects the leaf systems whose variables are left out, by path.
-        extra: further variables of the diagram.
+        diagram: The Diagram to search.
+        plant_prefix: Function of (path of a plant, name of a model instance) that returns the prefix of the addresses
+            of that instance. By default the path of the plant.
+        skip: Predicate of a path that selects the leaf systems to leave out.
+        extra: Further variables of the diagram.
     """
     plant_prefix = plant_prefix or (lambda path, instance: path)
     systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]

@@ -246,8 +246,10 @@ class AddressedDiagram:
             raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
 
     def copier_from(self, source: AddressedDiagram) -> StateCopier:
-        """Return a copier from contexts of ``source`` (this diagram, or another of the same scenario) to contexts of
-        this one.
+        """Return a copier from contexts of ``source`` to contexts of this diagram.
+
+        Args:
+            source: This diagram, or another of the same scenario.
         """
         return StateCopier(source.diagram, source.variables(), self.diagram, self._variables)
 

@@ -166,13 +166,15 @@ class WorldAlone(AddressedDiagram):
         return context
 
     def actuate(self, context: Context, name: str, value: Any) -> None:
-        """Give the simulated actuator ``name`` a command, which lasts until the next one.
+        """Set the actuator command of the simulated actuator ``name``, which lasts until the next one.
 
         Args:
-            value: an array of shape (size,), a scalar for all entries, or a value of an abstract signal.
+            context: A root context of this world.
+            name: The actuator signal.
+            value: An array of shape (size,), a scalar for all entries, or a value of an abstract signal.
 
         Raises:
-            SignalError: there is no such actuator signal, or the value has another size or type, or a NaN.
+            SignalError: There is no such actuator signal, or the value has another size or type, or a NaN.
         """
         if name not in self._actuators:
             raise SignalError(f"the interface has no actuator signal {name!r}; it has: {', '.join(self._actuators)}")

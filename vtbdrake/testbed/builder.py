@@ -207,10 +207,10 @@ class VirtualTestbedBuilder:
 
         Args:
             target: address of the simulated variable.
-            of: addresses of the estimates.
-            by: makes the target's value of theirs; left out, the one estimate is the value.
-            age: how long ago it was so, in seconds, when the DPS was given the sensor values that say so; a sensor that
-                is sampled, and shows its state, is a period late. Whoever predicts from the belief needs it.
+            of: Addresses of the estimates.
+            by: Function of the estimates that returns the target's value; by default the value of the one estimate.
+            age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
+                sensor, which shows its state, is one period late. Predictions from the belief need the age.
         """
         self.beliefs.append(Belief(target, tuple(of), by, age))
 
@@ -224,11 +224,13 @@ class VirtualTestbedBuilder:
         """Put the switches between the parts and build the Diagram.
 
         Args:
-            mode: where the switches stand at first: sim, shadow, real or twin.
-            meshcat: draws the simulated world while it runs, under ``prefix``.
+            mode: Initial position of the switches: ``sim``, ``shadow``, ``real`` or ``twin``.
+            scenario: The scenario that the testbed is built from, if any.
+            meshcat: Draws the simulated world while it runs.
+            prefix: Path in Meshcat under which the world is drawn; ``visualizer`` by default.
 
         Raises:
-            SignalError: a signal of the interface is missing on one side.
+            SignalError: A signal of the interface is missing on one side.
         """
         check_mode(mode)
         if self._dps is None:

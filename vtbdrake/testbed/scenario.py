@@ -139,12 +139,13 @@ class Scenario(ABC):
         """Build a new testbed.
 
         Args:
-            mode: initial position of the switches: ``sim``, ``shadow``, ``real`` or ``twin``.
-            meshcat: draws the simulated world while it runs, under ``prefix``.
+            mode: Initial position of the switches: ``sim``, ``shadow``, ``real`` or ``twin``.
+            meshcat: Draws the simulated world while it runs.
+            prefix: Path in Meshcat under which the world is drawn; ``visualizer`` by default.
 
         Raises:
-            ScenarioError: a field has a value with which no testbed can be built.
-            SignalError: the signals of DPS and world do not match.
+            ScenarioError: A field has a value with which no testbed can be built.
+            SignalError: The signals of DPS and world do not match.
         """
         self.validate()
         own = copy.deepcopy(self)  # The caller may change this one afterwards.
@@ -162,7 +163,9 @@ class Scenario(ABC):
     def deploy(
         self, url: str, *, record: str | os.PathLike[str] | None = None, **options: Any
     ) -> AbstractContextManager[Runtime]:
-        """Connect the DPS to its machine, for the time of a ``with`` block::
+        """Connect the DPS to its machine, for the time of a ``with`` block.
+
+        For example::
 
             with scenario.deploy("tcpq://127.0.0.1:7700", record="arm.lcm") as runtime:
                 runtime.take_over()

@@ -161,8 +161,9 @@ class Progress:
         return next((work for work in self.under_way if work.tick == tick), None)
 
     def having(self, tick: int, arrays: Arrays) -> Progress:
-        """Return the progress with a result: its memory, and its outputs if they are waited for; without outputs, it is
-        missing.
+        """Return the progress with the result of sample number ``tick``.
+
+        Its memory counts in any case, its outputs if they are awaited. A result without outputs is missing.
         """
         memory, outputs = split_memory(arrays)
         result = Work(tick, DONE if outputs else MISSING, outputs)
@@ -358,10 +359,10 @@ class SlowPart(LeafSystem):
         return self.offset + self.latency - _EARLY + tick * self.period
 
     def waiting(self, context: Context) -> dict[int, Arrays]:
-        """Return the samples whose results are neither there nor declared missing, by tick, in order.
+        """Return the samples whose results have neither arrived nor been declared missing, by tick, in order.
 
         Args:
-            context: of the whole Diagram; so in `memory` and `deliver`.
+            context: A root context of the whole Diagram.
         """
         progress = self._read(self.GetMyContextFromRoot(context))
         return {work.tick: work.arrays for work in progress.under_way if work.status == WAITING}
@@ -371,14 +372,18 @@ class SlowPart(LeafSystem):
         return self._read(self.GetMyContextFromRoot(context)).memory
 
     def deliver(self, context: Context, tick: int, arrays: Arrays) -> None:
-        """Hand in the result of sample number ``tick``: it will be shown when it is due, and its memory counts at once.
-        Of a result that is not waited for, only the memory is taken.
+        """Deliver the result of sample number ``tick``: it is shown when it is due, and its memory counts at once.
+
+        If the result is not awaited, only its memory is used.
 
         Args:
-            arrays: what `function` returned; its memory alone; or nothing, which declares the result missing.
+            context: A root context of the whole Diagram.
+            tick: The number of the sample.
+            arrays: The arrays that `function` returned, or its memory alone; an empty mapping declares the result
+                missing.
 
         Raises:
-            SlowPartError: they are neither.
+            SlowPartError: The arrays are none of these.
         """
         self._check_result(arrays)
         own = self.GetMyMutableContextFromRoot(context)

@@ -37,11 +37,11 @@ T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
 
 @TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
 def SwitchBoard_(T: type) -> type:
-    """The state of all switches, the commands u, and the constants that an actuator gets while the DPS does not command
-    it.
+    """Make the class `SwitchBoard` for the scalar type ``T``.
 
-    Every system of a Diagram costs time in each step of a simulation, whether it computes or not: so there is one for
-    all of them, and its ports show its state, which needs no Python while time runs.
+    A switch board holds the state of all switches, the commands u, and the constants that an actuator gets while the
+    DPS does not command it. Every system of a Diagram costs time in each step of a simulation, even if it computes
+    nothing: so one system holds all of these. Its ports show its state, which needs no Python while time runs.
 
     .. pydrake_system::
 

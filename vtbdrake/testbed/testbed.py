@@ -45,11 +45,10 @@ class Belief:
             raise ValueError(f"the belief about {self.target} is of {len(self.of)} estimates: say with by= how")
 
     def check(self, variables: Variables) -> None:
-        """Raise a ValueError if an address does not exist, the target is not simulated, or an estimate is not the
-        DPS's.
+        """Check the addresses of the belief.
 
         Raises:
-            ValueError: an address does not exist, the target is not simulated, or an estimate is not the DPS's.
+            ValueError: An address does not exist, the target is not simulated, or an estimate is not part of the DPS.
         """
         variables[self.target]
         for address in self.of:
@@ -150,14 +149,16 @@ class VirtualTestbed(AddressedDiagram):
         """Throw switches, at any time.
 
         Args:
-            mode: all together: ``sim``, ``real``, ``shadow`` (sense real, act sim: the DPS listens to reality and acts
-                on nothing real) or ``twin`` (both real, and the simulated actuators get the commands too).
+            context: A root context of this testbed.
+            mode: Position of all switches: ``sim``, ``real``, ``shadow`` (sense real, act sim: the DPS reads the real
+                sensors and commands no real actuator) or ``twin`` (both real, and the simulated actuators get the
+                actuator commands too).
             sense: ``sim`` or ``real`` for all sensor signals, or by signal.
             act: ``sim``, ``real`` or ``twin`` for all actuator signals, or by signal.
 
         Raises:
-            ValueError: a mode, position or signal is unknown, or nothing feeds a sensor signal that would become
-                real, or what feeds it is NaN or does not fit. No switch has been thrown then.
+            ValueError: A mode, position or signal is unknown, or a sensor signal that would become real has no value,
+                or its value is NaN or does not fit. Then no switch has been thrown.
         """
         self.check_context(context)
         if mode is not None:

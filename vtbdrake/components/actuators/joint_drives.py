@@ -75,14 +75,21 @@ class JointDrives(LeafSystem):
         """Declare the drives of ``joints``.
 
         Args:
-            period: T in seconds.
-            initial: the torque that was commanded, and reached, before the first sample, in N m.
-            limit, rate: of the torque, in N m and N m/s; scalars or one per joint, like the three of friction.
-            time_constant: of the current loop, in seconds.
-            viscous, coulomb, coulomb_velocity: of the friction, in N m s/rad, N m and rad/s.
+            plant: The plant of the joints.
+            joints: The n joints; each has exactly one velocity.
+            period: The sample period T in seconds.
+            limit: The largest torque in N m; a scalar or shape (n,).
+            rate: The largest change of the torque in N m/s; a scalar or shape (n,).
+            time_constant: Time constant of the current loop in seconds.
+            viscous: Viscous friction in N m s/rad; a scalar or shape (n,).
+            coulomb: Coulomb friction in N m; a scalar or shape (n,).
+            coulomb_velocity: Velocity scale of the Coulomb friction in rad/s; a scalar or shape (n,).
+            delay: Delay of the command in whole periods.
+            max_delay: The largest delay that can be set in the Context, in whole periods; at least ``delay``.
+            initial: The torque in N m before the first sample, both commanded and reached; a scalar or shape (n,).
 
         Raises:
-            ValueError: a value that no drive can have.
+            ValueError: A value is out of range, or a joint has more than one velocity or none.
         """
         super().__init__()
         for joint in joints:
@@ -108,7 +115,7 @@ class JointDrives(LeafSystem):
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
         torque = self.DeclareDiscreteState(before)
         self.DeclareStateOutputPort("torque", torque)
-        # One group for all that nobody else reads: every group costs more than the arithmetic.
+        # One group for all internal state: every group costs more than the arithmetic.
         memory = self.DeclareDiscreteState(np.tile(before, 2 + self._max_delay))
         values = [*np.concatenate(list(entries.values())), float(time_constant), float(delay)]
         parameters = self.DeclareNumericParameter(BasicVector(values))

@@ -16,28 +16,36 @@ def handler(
     compute: Callable[[Sequence[ArrayLike]], Any],
     deliver: Callable[[Any, Any], None] | None,
 ) -> Callable[[Any, Any], None]:
-    """What Drake calls with a context and a vector, or the discrete state if it ``updates`` that: it hands the blocks
-    that are told here to ``compute`` and the result to ``deliver``, which writes to the vector or the state.
+    """Return a calculation for Drake: a function of a context and of the vector or discrete state to write.
+
+    It collects blocks of numbers from the context (groups of discrete state, the time, the parameters, the inputs, in
+    this order), calls ``compute`` with them, and writes the result by ``deliver``.
 
     Args:
-        states: the numbers of the groups of discrete state, each a block, read by ``state_value``.
-        updates: whether the state is what is written to.
-        clock: whether the time is a block.
-        parameters: gives a context's group of numeric parameters, which is a block, read by ``vector_value``; or None.
-        inputs: each gives a block from the context.
-        deliver: None writes the result into the blocks of state, which are views of what is updated.
+        states: Indices of the groups of discrete state; each is a block.
+        updates: True for a discrete update, False for an output.
+        clock: True if the time is a block.
+        parameters: Function of (context, index) that returns the group of numeric parameters; None without parameters.
+        inputs: One function per input port, which returns its block from a context.
+        state_value: Function of (discrete state, index) that returns the numbers of a group.
+        vector_value: Function that returns the numbers of a group of parameters.
+        compute: Function of the blocks that returns the result.
+        deliver: Function of (vector or state, result) that writes the result. None writes it into the blocks of state,
+            which are views of the state to update.
     """
 
 def evaluator(buffers: Any) -> Callable[[Sequence[ArrayLike]], NDArray[np.float64]]:
-    """What gathers blocks in z, evaluates and returns y, of ``buffers.parts``: z, what evaluates, y."""
+    """Return a function that gathers blocks in z, evaluates and returns y; ``buffers.parts`` is (z, evaluate, y)."""
 
 def gather(blocks: Sequence[ArrayLike], z: NDArray[np.float64]) -> None:
-    """The blocks one after the other, of floats of shape (n_i,), into z of shape (n,): as `numpy.concatenate`, which
-    does what is no array like that."""
+    """Copy the blocks, arrays of floats of shape (n_i,), one after the other into z of shape (n,).
+
+    Blocks of another kind are left to `numpy.concatenate`.
+    """
 
 def scatter(y: NDArray[np.float64], blocks: list[NDArray[np.float64]]) -> None:
-    """y of shape (n,) into the blocks of shape (n_i,), one after the other: the reverse of `gather`.
+    """Copy y of shape (n,) into the blocks of shape (n_i,), one after the other: the reverse of `gather`.
 
     Raises:
-        ValueError: y or a block is no contiguous array of floats, a block is read-only, or y has too few.
+        ValueError: y or a block is not a contiguous array of floats, a block is read-only, or y has too few entries.
     """

@@ -1,4 +1,4 @@
-"""What Drake calls in every step, compiled."""
+"""The calculations that Drake calls in every step of a `CasadiSystem`, compiled."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def handler(
     def handle(context, target):
         cdef list blocks = []
         if groups:
-            # What is to be updated comes with the values that it has in the context, and is at hand.
+            # The state to update already holds the values of the context.
             state = target if updates else context.get_discrete_state()
             for i in states:
                 blocks.append(state_value(state, i))
@@ -34,7 +34,7 @@ def handler(
             blocks.append(vector_value(parameters(context, 0)))
         for read in inputs:
             blocks.append(read(context))
-        # All has been read before the kernel's arrays are touched: an input may evaluate this system too.
+        # Read everything before the kernel's arrays are touched: an input may evaluate this system too.
         result = compute(blocks or [()])
         if deliver is None:
             scatter(result, blocks[:groups])

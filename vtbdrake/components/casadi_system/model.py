@@ -1,4 +1,4 @@
-"""What the arguments and the results of casadi.Functions are to a system: ports, state, parameters, time."""
+"""The mapping of the arguments and results of casadi.Functions to ports, state, parameters and time of a system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies between a quantity and its reading: bias, drift, quantization, latency and drop-out."""
+"""Measurement errors of sensors: bias, drift, quantization, latency and drop-out."""
 
 from __future__ import annotations
 
@@ -133,8 +133,17 @@ class ErrorStage:
         period: float,
         unit: str,
     ) -> None:
-        """Declare state and parameters in ``sensor``; ``noise`` as in `SampledSensor`, ``output`` is the discrete state
-        that it shows.
+        """Declare the state and parameters of the errors in ``sensor``.
+
+        Args:
+            sensor: The sensor to declare them in.
+            model: The initial values; None declares white noise only.
+            noise: As in `SampledSensor`.
+            stream: Number of the random stream.
+            default: The reading before the first sample, shape (n,).
+            output: Index of the discrete state that the sensor shows.
+            period: Sample period in seconds.
+            unit: Unit of the reading.
         """
         self._n, self._output, self._period, self._stream = default.size, output, period, stream
         self._counts = [count for count, _ in noise.values()]

@@ -1,4 +1,4 @@
-"""What all sensors share: they are sampled, and their output is their own state."""
+"""The base class of all sensors: they are sampled, and their output is their own state."""
 
 from __future__ import annotations
 
@@ -41,8 +41,20 @@ class SampledSensor(LeafSystem):
         stream: int = 0,
         errors: ErrorModel | None = None,
     ) -> None:
-        """Declare the sensor; ``noise`` names the standard deviations (0 without ``errors``): for how many entries of
-        y, and their unit.
+        """Declare the sensor.
+
+        Args:
+            signal: Name of the output port.
+            default: The reading before the first sample, shape (n,).
+            period: Sample period in seconds.
+            unit: Unit of the reading.
+            noise: Name of a standard deviation -> (number of entries of y that it applies to, unit). It is 0 without
+                ``errors``.
+            stream: Number of the random stream, which makes the noise of several sensors independent.
+            errors: The measurement errors; None for an exact sensor.
+
+        Raises:
+            ValueError: The period is not positive, or ``errors`` has noise and the sensor has none.
         """
         super().__init__()
         noise = noise or {}

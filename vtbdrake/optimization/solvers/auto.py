@@ -32,7 +32,7 @@ LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
 
 
 class Auto(Solver):
-    """A solver that chooses its methods by the problem:
+    """A solver that chooses its methods by the problem.
 
     * whole and categorical parameters only, with no more combinations than the budget (256 without one), and one
       objective: a grid;
@@ -46,7 +46,7 @@ class Auto(Solver):
 
     CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
-    Then it starts anew at a random point with twice the population (IPOP); every third start is differential evolution.
+    Then it restarts at a random point with twice the population (IPOP); every third start is differential evolution.
     After five starts in a row without such an improvement the solver ends, with success. Last, if the best point is
     better than that of the model, a tenth of the budget at most goes into another local search, and the rest into
     Bayesian optimization.
@@ -71,7 +71,7 @@ class Auto(Solver):
         self._held: Point | None = None
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
-        # The evaluations of the first stages: what a new model is told.
+        # The evaluations of the first stages; a new model is fitted to them.
         self._before: list[Evaluation] = []
         self._plan = self._stages()
         next(self._plan)
