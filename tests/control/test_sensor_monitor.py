@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.kernels import check_all
 from vtbdrake.control.limits import Bounds
 from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
+from vtbdrake.control.staleness import check_all
 from vtbdrake.testbed import Signal
 
 

@@ -9,7 +9,7 @@ from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.control.kernels import ReceivedSignal
+from vtbdrake.control.staleness import ReceivedSignal
 
 if TYPE_CHECKING:
     # So that a process that only listens on a bus need not load Drake.

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
-from vtbdrake.control.kernels import check_all
 from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
 from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
+from vtbdrake.control.staleness import check_all
 from vtbdrake.testbed import Interface, Signal
 
 _log = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.bridge import ReceivedSignal
-from vtbdrake.control.kernels import StalenessMonitor
 from vtbdrake.control.limits import Bounds, JumpBounds
+from vtbdrake.control.staleness import StalenessMonitor
 from vtbdrake.testbed import Signal
 
 _DRIFT = 500e-6  # Largest drift between the clocks of two computers, in s per s: NTP's largest correction.

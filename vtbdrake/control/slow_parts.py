@@ -11,11 +11,11 @@ from typing import Any
 
 from pydrake.systems.framework import Context
 
+from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.clock import Clock
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, pack, supervise, unpack
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import RESULT as CHANGE
-from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
 
@@ -153,7 +153,7 @@ class _Part:
         self._last_failure = ""
         self._answers: list[bytes] = []
         name = f"the supervisor of the slow part {path}"
-        self._supervisor = WorkerProcess(supervise, function, part.patience * part.latency, path, name=name)
+        self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
 
     def receive(self, end: float) -> None:
         answers, self._answers = self._answers + self._supervisor.take(), []

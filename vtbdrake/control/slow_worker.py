@@ -14,7 +14,7 @@ import traceback
 from math import inf
 from typing import Any
 
-from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
+from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 
 # The kinds of messages to the loop, which are pairs of a kind and its content.
 READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
@@ -34,7 +34,7 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
     """
     while True:
         begin = time.monotonic()
-        worker = WorkerProcess(compute, function, name=f"the worker of the slow part {name}")
+        worker = BackgroundProcess(compute, function, name=f"the worker of the slow part {name}")
         try:
             reason = _forward(loop, worker, patience)
         finally:
@@ -48,7 +48,7 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
                 continue
 
 
-def _forward(loop: FrameConnection, worker: WorkerProcess, patience: float) -> str:
+def _forward(loop: FrameConnection, worker: BackgroundProcess, patience: float) -> str:
     """Forward requests and answers until the worker is lost; return the reason."""
     deadline = inf
     while True:

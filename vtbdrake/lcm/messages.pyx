@@ -10,7 +10,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.control.kernels cimport entries_of, zeros
+from vtbdrake.control.staleness cimport entries_of, zeros
 from vtbdrake.lcm.byte_order cimport (
     get_double,
     get_float,

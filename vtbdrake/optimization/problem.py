@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization.casadi_function import ProblemFunction
     from vtbdrake.optimization.study import Study
-    from vtbdrake.rollout.check import Check
+    from vtbdrake.rollout.repeatability import Check
     from vtbdrake.visualization import Scene
 
 Condition = Mapping[str, Any]
@@ -279,7 +279,7 @@ class Problem:
         Raises:
             QualityError: f raises, is negative or NaN.
         """
-        from vtbdrake.rollout.check import check_rollouts
+        from vtbdrake.rollout.repeatability import check_rollouts
 
         ends = [{p.address: p.ends[k] for p in self.parameters if not p.is_field} for k in (0, -1)]
         points = [{**split(self.conditions[k])[1], **ends[k]} for k in (0, -1)]

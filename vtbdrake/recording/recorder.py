@@ -14,9 +14,9 @@ from typing import Any, Self
 
 from pydrake.systems.framework import Context
 
+from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
-from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
@@ -120,7 +120,7 @@ class Recorder:
             self.path.open("wb" if overwrite else "xb").close()
         except FileExistsError:
             raise FileExistsError(f"{self.path} exists: record to another file, or with overwrite=True") from None
-        self._worker = WorkerProcess(
+        self._worker = BackgroundProcess(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
         self._worker.post(*first_events)

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.testbed.alone import DpsAlone, WorldAlone
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.parts import DpsAlone, WorldAlone
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
 from vtbdrake.testbed.scenario_file import load_scenario
 from vtbdrake.testbed.signal import Interface, Signal, SignalError

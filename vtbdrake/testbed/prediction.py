@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams
 
-from vtbdrake.testbed.alone import WorldAlone
+from vtbdrake.testbed.parts import WorldAlone
 from vtbdrake.testbed.testbed import Belief
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
+from vtbdrake.control.background_process import FrameConnection
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.control.worker_process import FrameConnection
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.monitoring.live.messages import (
     ANSWER,

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.control.worker_process import WorkerProcess
 from vtbdrake.monitoring.live.messages import ReadRequest, Request, SetRequest
 from vtbdrake.monitoring.live.server import VALUES, outcome_frame, serve, values_record
 
@@ -60,7 +60,7 @@ class LiveService:
         self._records: list[bytes] = []
         self._flush_at = -inf
         self._pause = pause
-        self._worker = WorkerProcess(serve, url, addresses, name="the live service")
+        self._worker = BackgroundProcess(serve, url, addresses, name="the live service")
         runtime.watch(self)
 
     @property

@@ -13,9 +13,9 @@ from typing import Self
 
 import numpy as np
 
+from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import SWITCH, Cycle
-from vtbdrake.control.worker_process import FrameConnection, WorkerProcess
 from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, calibrate
 from vtbdrake.monitoring.residuals.comparison import (
     INDEX,
@@ -104,11 +104,11 @@ class ResidualMonitor:
         self.history: deque[Window] = deque(maxlen=memory)
         self.skipped = self.failed = 0
         self.error = ""
-        self._worker: WorkerProcess | None = None
+        self._worker: BackgroundProcess | None = None
         self._comparison: Comparison | None = None
         self._detector = None if learn else AlarmDetector(self.places, config, calibration)
         if worker:
-            self._worker = WorkerProcess(_serve, scenario, config, mode, self._detector, name="residuals")
+            self._worker = BackgroundProcess(_serve, scenario, config, mode, self._detector, name="residuals")
             estimates = self._await_estimates(self._worker)
         else:
             predictor = Predictor(scenario, period=config.period, values=config.values)
@@ -126,7 +126,7 @@ class ResidualMonitor:
         runtime.watch(self)
 
     @staticmethod
-    def _await_estimates(worker: WorkerProcess) -> dict[int, tuple[str, ...]]:
+    def _await_estimates(worker: BackgroundProcess) -> dict[int, tuple[str, ...]]:
         select.select((worker,), (), (), _START_TIMEOUT)
         frames = worker.take()
         if not frames:
@@ -168,7 +168,7 @@ class ResidualMonitor:
             self._take_reports(self._worker)
         self._begin_block()
 
-    def _take_reports(self, worker: WorkerProcess) -> None:
+    def _take_reports(self, worker: BackgroundProcess) -> None:
         for frame in worker.take():
             self._take_report(pickle.loads(frame))
 

@@ -1,4 +1,4 @@
-"""Worker processes, to which the control loop hands over what takes long, without ever waiting for them."""
+"""Processes beside the control loop that do what takes long or may block; the loop never waits for them."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class FrameConnection:
         self._socket.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
 
-class WorkerProcess:
+class BackgroundProcess:
     """A child process that runs ``function(connection, *arguments)``, with a `FrameConnection`.
 
     No call waits for the worker, except `drain` and `close`; to start one takes some milliseconds. It has ordinary
@@ -225,7 +225,7 @@ class WorkerProcess:
 
 
 def _serve(connection: socket.socket, function: Callable[..., None], arguments: Sequence[Any]) -> None:
-    """Run the child process of a `WorkerProcess`."""
+    """Run the child process of a `BackgroundProcess`."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     # The loop may be confined to processors of its own, where nothing else should work.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))

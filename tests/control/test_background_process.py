@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from vtbdrake.control.worker_process import WorkerProcess
+from vtbdrake.control.background_process import BackgroundProcess
 
 TIMEOUT = 30.0
 
@@ -52,7 +52,7 @@ def taken(worker, count):
 def test_frames_return_whole_and_in_order():
     random = np.random.default_rng(0)
     sent = [random.bytes(int(size)) for size in random.integers(0, 300_000, 60)]
-    worker = WorkerProcess(echo, name="echo")
+    worker = BackgroundProcess(echo, name="echo")
     try:
         back = []
         for frame in sent:
@@ -65,7 +65,7 @@ def test_frames_return_whole_and_in_order():
 
 
 def test_close_sends_what_waits():
-    worker = WorkerProcess(sum_up, name="sum", backlog=1 << 26)
+    worker = BackgroundProcess(sum_up, name="sum", backlog=1 << 26)
     for _ in range(100):
         assert worker.post(bytes(100_000))
     assert worker.close() == 0
@@ -73,7 +73,7 @@ def test_close_sends_what_waits():
 
 
 def test_close_receives_what_a_blocked_worker_sends():
-    worker = WorkerProcess(echo, name="echo", backlog=1 << 26)
+    worker = BackgroundProcess(echo, name="echo", backlog=1 << 26)
     frames = [bytes([k]) * 100_000 for k in range(100)]
     for frame in frames:
         assert worker.post(frame)
@@ -82,7 +82,7 @@ def test_close_receives_what_a_blocked_worker_sends():
 
 
 def test_long_frames_are_sent_in_pieces():
-    worker = WorkerProcess(sum_up, name="sum")
+    worker = BackgroundProcess(sum_up, name="sum")
     waiting = []
     worker.post(bytes(1 << 20))
     while worker.unsent:
@@ -94,7 +94,7 @@ def test_long_frames_are_sent_in_pieces():
 
 
 def test_full_backlog_drops_frames_without_waiting():
-    worker = WorkerProcess(fall_asleep, name="sleeper", backlog=1 << 20)
+    worker = BackgroundProcess(fall_asleep, name="sleeper", backlog=1 << 20)
     accepted = [worker.post(bytes(1 << 16)) for _ in range(200)]
     worker.kill()
     assert worker.dropped == accepted.count(False) > 0
@@ -102,7 +102,7 @@ def test_full_backlog_drops_frames_without_waiting():
 
 
 def test_killed_worker_is_noticed_and_drops_are_counted():
-    worker = WorkerProcess(echo, name="victim")
+    worker = BackgroundProcess(echo, name="victim")
     worker.post(b"hello")
     assert taken(worker, 1) == [b"hello"]
     os.kill(worker.pid, signal.SIGKILL)
@@ -113,7 +113,7 @@ def test_killed_worker_is_noticed_and_drops_are_counted():
 
 
 def test_end_of_the_worker_is_logged_once(caplog):
-    worker = WorkerProcess(fail, 3, name="failure")
+    worker = BackgroundProcess(fail, 3, name="failure")
     select.select((worker,), (), (), TIMEOUT)
     assert worker.take() == worker.take() == [] and not worker.alive
     assert caplog.text.count(f"failure (process {worker.pid}) is lost: ") == 1
@@ -121,25 +121,25 @@ def test_end_of_the_worker_is_logged_once(caplog):
 
 
 def test_close_and_kill_are_not_logged(caplog):
-    WorkerProcess(echo, name="echo").close()
-    WorkerProcess(fall_asleep, name="sleeper").kill()
+    BackgroundProcess(echo, name="echo").close()
+    BackgroundProcess(fall_asleep, name="sleeper").kill()
     assert not caplog.text
 
 
 def test_worker_that_does_not_end_is_killed():
-    worker = WorkerProcess(fall_asleep, name="sleeper")
+    worker = BackgroundProcess(fall_asleep, name="sleeper")
     assert worker.close(timeout=1.0) == -signal.SIGKILL
 
 
 def test_close_returns_the_exit_code():
-    assert WorkerProcess(fail, 3, name="failure").close() == 3
+    assert BackgroundProcess(fail, 3, name="failure").close() == 3
 
 
 def test_worker_has_ordinary_scheduling_and_all_processors():
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(processors)})
     try:
-        worker = WorkerProcess(tell_scheduling, name="teller")
+        worker = BackgroundProcess(tell_scheduling, name="teller")
         assert taken(worker, 1) == [f"{os.SCHED_OTHER} {len(processors)}".encode()]
         worker.close()
     finally:

@@ -1,4 +1,4 @@
-"""The record of a received signal, compiled, and the check of its age in every cycle."""
+"""Detection of stale sensor signals, compiled: the newest value of each signal, and the check of its age in every cycle."""
 
 from cpython.mem cimport PyMem_Calloc
 from libc.math cimport INFINITY, NAN

@@ -1,4 +1,4 @@
-"""Finds problems of executors: memory outside the Context, and values that cannot be sent to workers."""
+"""The check that rollouts repeat in every executor: memory outside the Context, and values that workers cannot get."""
 
 from __future__ import annotations
 
