@@ -11,7 +11,7 @@ from typing import Any
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
 
-    Its stub ``__init__.pyi`` tells the names, to editors and type checkers as well: it contains nothing but imports
+    Its stub ``__init__.pyi`` lists the names, also for editors and type checkers: it contains nothing but imports
     such as ``from vtbdrake.control.runtime import Runtime as Runtime``.
 
     Args:

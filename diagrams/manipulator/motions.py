@@ -3,7 +3,7 @@ r"""The predefined motions, as references for the control laws.
     0 follow   the reference is where the arm is: it can be led by hand
     1 home     in joint space to the home pose, and waits there
     2 swing    in joint space to another pose and back
-    3 press    the tip moves straight ahead, waits, and comes back
+    3 press    the tip moves straight ahead, waits, and returns
     4 circle   the tip moves on a circle across the tool's axis
 
 All start and end at rest, where the one before ended: whatever the command, the reference is continuous with its first

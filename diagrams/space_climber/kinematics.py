@@ -39,7 +39,7 @@ class LegKinematics:
         """Return the joint angles, (6, 3), that put the feet at p_BF, (6, 3).
 
         A target out of reach is replaced by the point of the leg plane's reach in its direction from the basal joint.
-        Joint ranges are not looked at.
+        Joint ranges are ignored.
         """
         return np.array(self.angles(np.asarray(p_BF, dtype=float).tolist())).reshape(len(LEGS), 3)
 

@@ -84,7 +84,7 @@ class Morphology:
     # Twice that for a stroke's lever and for acceleration, rounded up.
     joint_torque: float = 60.0
 
-    # [A] Position servo of each joint. Under the 25 N m above it gives way by 1.4 deg; well damped for a leg's inertia.
+    # [A] Position servo of each joint. Under the 25 N m above it deflects by 1.4 deg; well damped for a leg's inertia.
     joint_stiffness: float = 1000.0  # N m/rad
     joint_damping: float = 30.0  # N m s/rad
 

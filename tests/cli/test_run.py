@@ -159,11 +159,11 @@ def test_a_second_publisher_is_waited_for_before_the_switch_and_an_alarm_after_i
         with intruder(hub.url):
             program = stack.enter_context(start(SERVO, *options))
             assert program.stderr is not None
-            blocked = f"waiting: somebody else publishes commands on {COMMAND}: only one may command a machine"
+            blocked = f"waiting: another client publishes commands on {COMMAND}: only one may command a machine"
             assert any(blocked in line for line in program.stderr)
         assert any("the DPS commands" in line for line in program.stderr)
         with intruder(hub.url):
-            assert any(f"ALARM: somebody else publishes commands on {COMMAND}" in line for line in program.stderr)
+            assert any(f"ALARM: another client publishes commands on {COMMAND}" in line for line in program.stderr)
         program.send_signal(signal.SIGINT)
         output, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 0, errors
@@ -267,7 +267,7 @@ def test_a_frozen_owner_of_the_commands_is_succeeded_only_on_request() -> None:
             return errors.splitlines()[-1]
 
         # On a computer that is busy, the hub may say so only after the first wait.
-        assert any(f"the hub protects {COMMAND} for somebody else" in refusal(wait) for wait in (1.0, 10.0, PATIENCE))
+        assert any(f"the hub protects {COMMAND} for another client" in refusal(wait) for wait in (1.0, 10.0, PATIENCE))
         ear = Ear(hub.url)
         with MachineProcess(ServoMachineScenario(), hub.url), start(SERVO, *options, "--take-over") as program:
             ear.listen(lambda: len(ear.torques) >= 40)

@@ -240,7 +240,7 @@ def test_outdated_preparation_is_refused():
     runtime.cycle()
     preparation = runtime.prepare("real")
     runtime.run(cycles=2)
-    with pytest.raises(SwitchRefusedError, match="2 cycles ago: prepare it anew"):
+    with pytest.raises(SwitchRefusedError, match="2 cycles ago: prepare it again"):
         runtime.perform(preparation)
     assert runtime.active == ()
 

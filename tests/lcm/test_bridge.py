@@ -299,7 +299,7 @@ def test_competing_publisher_is_reported_for_a_while(hub: Hub) -> None:
         assert (arm.foreign, arm.competing_publisher) == (0, None)
         peer.lcm.publish("IIWA_COMMAND", b"foreign")
         assert wait(arm, lambda: arm.foreign == 1)
-        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
+        assert "another client publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
         assert wait(arm, lambda: arm.competing_publisher is None)
         assert arm.foreign == 1
 
@@ -316,7 +316,7 @@ def test_publisher_refused_by_the_hub_is_reported() -> None:
             return arm.foreign > 0
 
         assert wait(arm, is_noticed)
-        assert "somebody else publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
+        assert "another client publishes commands on IIWA_COMMAND" in (arm.competing_publisher or "")
         assert [data for channel, data in intruder.heard if channel == "IIWA_COMMAND"].count(b"foreign") == 0
         assert wait(arm, lambda: arm.competing_publisher is None)
         assert arm.blocked_reason is None
@@ -452,7 +452,7 @@ def test_commands_refused_by_the_hub_are_counted_and_logged(caplog: pytest.LogCa
         assert wait(second, both_publish)
         assert first.sent["position"].withheld == {}
         assert first.blocked_reason is None
-        assert second.blocked_reason == "the hub protects IIWA_COMMAND for somebody else"
+        assert second.blocked_reason == "the hub protects IIWA_COMMAND for another client"
         [record] = [record for record in caplog.records if "refused by the hub" in record.message]
         assert hub.statistics().protected["IIWA_COMMAND"].owner in record.message
 

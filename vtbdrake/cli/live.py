@@ -65,8 +65,8 @@ def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
 def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
     """Print variables and output ports of a DPS that runs by vtbdrake run, until Ctrl-C or its end.
 
-    Each line is a JSON object with the time of the DPS in seconds and the values by address. null stands for a value
-    that is not finite.
+    Each line is a JSON object with the time of the DPS in seconds and the values by address. A value that is not
+    finite is null.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""Processes beside the control loop that do what takes long or may block; the loop never waits for them."""
+"""Background processes for slow or blocking tasks of the control loop, which never waits for them."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ class Guards:
         return reasons
 
     def _activate(self, names: tuple[str, ...]) -> None:
-        """Record which signals are on real; one that no longer is has to start anew."""
+        """Record which signals are on real; reset the limiters of signals that have left it."""
         if names != self._active:
             for name in set(self._active) - set(names):
                 self.limiters[name].release()
@@ -290,7 +290,7 @@ class Guards:
     def _depart_anew(
         self, now: float, received: Mapping[str, ReceivedSignal], others: Mapping[str, ReceivedSignal]
     ) -> list[Fault]:
-        """Start the limiters anew from what is measured where the machine may have moved; return the faults."""
+        """Restart the limiters from the measured values where the machine may have moved; return the faults."""
         pause = 0.0 if self._last is None else now - self._last
         if pause > self._longest_pause:
             self._departing |= {

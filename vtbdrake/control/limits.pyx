@@ -207,7 +207,7 @@ cdef class RateLimiter:
         self.has_start = True
 
     def release(self):
-        """Forget what was sent: from now on somebody else commands."""
+        """Forget the last actuator command: from now on another controller commands."""
         self.has_start = False
 
     def take_back(self):

@@ -233,7 +233,7 @@ def _no_collection() -> Iterator[None]:
     try:
         yield
     finally:
-        # Python unfreezes all or nothing: objects that somebody else froze must stay frozen.
+        # Python unfreezes all or nothing: objects frozen by other code must stay frozen.
         if not was_frozen:
             gc.unfreeze()
         if was_enabled:

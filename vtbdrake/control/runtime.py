@@ -314,7 +314,7 @@ class Runtime(Stepped):
         """
         if preparation.cycle != self.cycles:
             age = self.cycles - preparation.cycle
-            raise SwitchRefusedError(f"the switch was prepared {age} cycles ago: prepare it anew")
+            raise SwitchRefusedError(f"the switch was prepared {age} cycles ago: prepare it again")
         if preparation.reasons:
             raise SwitchRefusedError("; ".join(preparation.reasons))
         perform(self, preparation.sense, preparation.act)

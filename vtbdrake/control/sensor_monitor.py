@@ -137,7 +137,7 @@ class SensorMonitor(StalenessMonitor):
     def accept_steady(self) -> None:
         """Accept the level that the signal has jumped to, if it is steady there.
 
-        Call it when somebody takes the responsibility (a reset by hand), or when nothing depends on the signal.
+        Call it when an operator takes the responsibility (a reset by hand), or when nothing depends on the signal.
         """
         if self.steady:
             self.accept(self._rejected, self._rejected_at)

@@ -157,7 +157,7 @@ class Stepped:
     ) -> None:
         for name in bridge.commands:
             if f"{COMMAND}{name}" not in target.variables():
-                raise ValueError(f"the command {name} comes from inside the testbed, the bridge cannot give it as well")
+                raise ValueError(f"the command {name} is connected inside the testbed: the bridge cannot provide it")
         self.target = target
         self.bridge = bridge
         self.period = period

@@ -53,7 +53,7 @@ def prepare(
 
     A sensor signal that becomes real must be fresh and plausible. If an actuator signal is to be on real, so must all
     sensor signals on real, and the one that its command departs from. The command of an actuator signal that becomes
-    real must continue what is measured. The machine must be ready and connected, and commanded by nobody else.
+    real must continue what is measured. The machine must be ready and connected, and have no other commander.
 
     Args:
         runtime: the loop.

@@ -136,7 +136,7 @@ class LcmBridge(Bridge):
     def blocked_reason(self) -> str | None:
         if not self._foreign.blocked:
             return None
-        return f"the hub protects {', '.join(sorted(self._foreign.blocked))} for somebody else"
+        return f"the hub protects {', '.join(sorted(self._foreign.blocked))} for another client"
 
     @property
     def foreign(self) -> int:
@@ -147,7 +147,7 @@ class LcmBridge(Bridge):
         found = self._foreign.recent(FOREIGN_TIMEOUT)
         if not found:
             return None
-        return f"somebody else publishes commands on {', '.join(sorted(found))}: only one may command a machine"
+        return f"another client publishes commands on {', '.join(sorted(found))}: only one may command a machine"
 
     def open(self) -> None:
         self.link.open()
@@ -294,8 +294,8 @@ class SentSignal:
         count: how many actuator commands were sent.
         withheld: how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its
             message needs another signal), ``companion`` (another signal of its message was at fault), ``encode``,
-            ``no bus`` (lost, or it takes nothing at present), ``refused`` (the hub protects the channel for somebody
-            else; counted from when the hub has said so).
+            ``no bus`` (lost, or it takes nothing at present), ``refused`` (the hub protects the channel for another
+            client; counted from the hub's first message about it).
     """
 
     count: int = 0
@@ -360,9 +360,9 @@ class ForeignCommands:
     unique. A copy of one is foreign. A protected channel lets only its owner's messages pass.
 
     Attributes:
-        heard: by channel, how many messages of others were heard.
-        refused: how many messages of others a hub has refused on channels that are ours.
-        blocked: the channels that a hub protects for somebody else; it says so within 10 ms of the first refusal.
+        heard: By channel, the number of messages received from other clients.
+        refused: The number of messages of other clients that a hub has refused on the channels of this client.
+        blocked: The channels that a hub protects for another client; it reports them within 10 ms of the first refusal.
     """
 
     _MEMORY = 4096  # own messages on their way per channel: some seconds of a hub that stands still
@@ -440,9 +440,9 @@ class ForeignCommands:
         self.blocked = frozenset(blocked)
 
     def recent(self, seconds: float) -> set[str]:
-        """Return the channels on which somebody else has published within the last seconds.
+        """Return the channels on which another client has published within the last ``seconds``.
 
-        For a protected channel that means that somebody else was refused there while it was ours.
+        On a protected channel of this client, the attempt counts: the hub has refused the message.
         """
         since = time.monotonic() - seconds
         heard = {channel for channel, at in self._heard_at.items() if at > since}

@@ -123,7 +123,7 @@ class TcpqConnection(Connection):
 
     liblcm's client is not used because it blocks: it sends a message in five parts, waits in the middle of a message
     for as long as the hub does, and reconnects (and waits) in any call after a loss, even in its destructor. It also
-    believes any length that it is told.
+    accepts any message length without a check.
 
     Args:
         url: ``tcpq://host:port``; both have defaults.

@@ -28,7 +28,7 @@ DIED = 70
 
 _BURST = 200  # messages to take at a time
 _SLICE = 0.005  # s to wait for commands before looking at requests
-_REPEAT = 0.2  # s after which a state is sent again, in lock-step on a bus where nobody has commanded yet
+_REPEAT = 0.2  # s after which a state is sent again, in lock-step on a bus without commands so far
 _CATCH_UP = 0.05  # s
 
 

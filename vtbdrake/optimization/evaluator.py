@@ -29,9 +29,9 @@ class Evaluator:
     """An evaluator of batches of points, by rollouts that are known or are run.
 
     Args:
-        problem: what is asked.
-        known: the outcomes known so far; ``run`` adds to them.
-        run: runs the rollouts of some keys.
+        problem: The problem to evaluate.
+        known: The outcomes known so far; ``run`` adds to them.
+        run: Function that runs the rollouts of the given keys.
         racing: drop a point as soon as it can no longer be better than the best one, whatever the conditions that have
             not run would give. The winner is never dropped: the risk does not fall when a quality rises, and a quality
             is at most `Quality.upper` (a cost at least 0). Under the mean, say, a quality without ``upper`` can be
@@ -207,7 +207,7 @@ class Gradients:
         self._runners = [runners[id(testbed)] for _, testbed in placed]
 
     def at(self, point: Point) -> tuple[float, ...]:
-        """Return the gradient of the value that a solver is told (larger is better), shape (n,)."""
+        """Return the gradient of the value that a solver maximizes, shape (n,)."""
         problem = self._problem
         sign = -1.0 if problem.objectives[0].minimize else 1.0
         values, slopes = [], []

@@ -90,8 +90,9 @@ def _code(function: Callable[..., Any]) -> str:
 def _text(value: Any, seen: set[int] | None = None) -> str:
     """Return a text of a value that is the same in every process.
 
-    Plain data is written out; functions and classes are given by their source and by what they use: closure, default
-    values, and the constants, functions and classes of the user's modules; all else by its type and its plain data.
+    Plain data is written out; functions and classes are given by their source and by everything they refer to:
+    closure, default values, and the constants, functions and classes of the user's modules. Everything else is given
+    by its type and its plain data.
     """
     seen = set() if seen is None else seen
     if isinstance(value, np.generic | np.ndarray):

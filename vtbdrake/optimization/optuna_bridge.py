@@ -212,7 +212,7 @@ def _frozen(
         params=dict(params),
         distributions=dict(distributions),
         user_attrs=attributes,
-        # The dashboard reads a list only; Optuna reads it as well as its newer form, one attribute each.
+        # The dashboard reads only a list; Optuna reads the list and its newer form, one attribute each.
         system_attrs={} if failed or not trial.violations else {"constraints": list(trial.violations)},
     )
     return frozen

@@ -42,12 +42,12 @@ class Study:
     """The rollouts and points of one problem, in one file or in memory.
 
     `Problem.study` begins a study, or resumes the one in a file. `open` opens a file for reading and for giving points,
-    also while another process runs the study. Properties read the file anew each time.
+    also while another process runs the study. Properties read the file each time.
 
     Which points are examined depends on the problem, the solver, the seed and the budget that the solver was made for,
-    and not on the executor. A study is resumed by a new solver that is told what is known, so that it goes on as if it
-    had not been interrupted. For a larger budget than before, the solver is made anew; what it asks for again is known,
-    and takes no rollouts.
+    and not on the executor. To resume a study, a new solver is told the recorded evaluations, so that it continues as
+    if it had not been interrupted. For a larger budget, a new solver starts from the beginning; the points that it asks
+    for again are known, and take no rollouts.
 
     Attributes:
         reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
@@ -256,8 +256,8 @@ class Study:
     def add(self, *points: Any) -> None:
         """Give points by hand, each a mapping address -> value or values in the order of the parameters.
 
-        They are evaluated before anything else that the study asks for next, in whatever process runs it, and the
-        solver is told of them.
+        They are evaluated before the next points of the solver, in the process that runs the study, and the solver
+        learns from them.
 
         Raises:
             ValueError: a point has other entries than the study, or one lies outside its range.
@@ -284,7 +284,7 @@ class Study:
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
-        """Set an attribute of the study, or of a point: who ran it, why the point looks odd. It changes no result.
+        """Set an attribute of the study, or of a point: for example an operator or a remark. It changes no result.
 
         Args:
             key: its name; an attribute of the same name is replaced.

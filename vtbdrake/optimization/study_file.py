@@ -521,7 +521,7 @@ def _sqlite_name(path: Path | None, *, new: bool) -> str:
     unfinished = any(log.exists() and log.stat().st_size > 0 for log in beside)
     if new or unfinished or os.access(path.parent, os.W_OK, effective_ids=True):
         return str(path)
-    # SQLite creates files beside one with a write-ahead log even to read it, unless it is told that nobody writes.
+    # With a write-ahead log, SQLite creates files even to read, unless the database is declared immutable.
     return f"{path.as_uri()}?immutable=1"
 
 

@@ -43,12 +43,12 @@ class _RunEnd(Exception):  # noqa: N818
 
 
 class StudyRun:
-    """One run of a study in its file. What the file holds is told to the solver first, batch by batch as it was found.
+    """One run of a study in its file. The solver is first told the recorded evaluations, batch by batch.
 
     Args:
-        file: of the study; this process has claimed it.
-        problem: what is asked.
-        solver: made for the budget that the file names.
+        file: The file of the study; this process has claimed it.
+        problem: The problem to solve.
+        solver: A new solver for the budget that is recorded in the file.
         executor: runs the rollouts.
         racing: see `Evaluator`.
         catch: whether a failed quality function fails its rollout only; see `RolloutTask`.
@@ -155,10 +155,10 @@ class StudyRun:
         return bool(given or asked)
 
     def _roll_out_queue(self) -> None:
-        """Run the points given by hand before a solver that was made anew comes to what is new.
+        """Run the points given by hand before a new solver, which repeats known points, reaches new ones.
 
-        It is told of them where the study goes on. Until then it would ask for known points and, in the same batch, for
-        more than the budget allows.
+        The solver learns of these points where the study continues. Before that, it would ask for known points and, in
+        the same batch, for more than the budget allows.
         """
         points = [tuple(point.values()) for point in self._file.queue().values()]
         keys = [(point, condition) for point in points for condition in range(len(self._problem.conditions))]

@@ -234,7 +234,7 @@ class Recorder:
         code = self._worker.close()
         self._take_losses()
         if code or self.lost:
-            # Bytes on their way to a process that died are lost as well: count what has arrived in the file.
+            # Bytes on their way to a process that died are lost, too: count the cycles that arrived in the file.
             self._missing = self._recorded - self._num_arrived()
         if self.lost:
             _log.error("%d of %d cycles are not in %s", self.lost, self._recorded, self.path)

@@ -191,7 +191,7 @@ class _Replay:
         _restore(log, target, context)
         target.write(context, values)
         self._simulator = self._new_simulator()
-        # Keep alive: stops pydrake from wrapping the parameters anew in every step.
+        # Keep alive: stops pydrake from re-wrapping the parameters in every step.
         self._parameters = numeric_parameters(target.diagram, context)
         self._ports = RealPorts(target, context)
         self._slow_parts = slow_parts(target.diagram)
@@ -392,7 +392,7 @@ def _restore(log: ControlLog, target: Target, context: Context) -> None:
 
 
 def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> None:
-    """Restore the DPS and its commands u; the simulated world begins anew."""
+    """Restore the DPS and its commands u; the simulated world restarts."""
     own = testbed.snapshot(context)
     groups = {key: value for key, value in start.groups.items() if key.partition("/")[0].split(".")[0] == "dps"}
     values = {address: value for address, value in start.values.items() if address.startswith("dps.")}

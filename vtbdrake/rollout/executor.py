@@ -190,7 +190,7 @@ def run_rollouts(
 ) -> list[RolloutResult | None]:
     """Return one result per point, in the order of ``points``, and show a progress bar.
 
-    Ctrl-C ends the rollouts that run and hands out no more; the list then has None where there is no result.
+    Ctrl-C ends the running rollouts and starts no more; the list then has None where there is no result.
 
     Raises:
         QualityError: f raises, is negative or NaN.
@@ -213,5 +213,5 @@ def run_rollouts(
 
 
 def watched() -> bool:
-    """Return whether somebody watches the output: in a terminal or a notebook."""
+    """Return whether the output goes to a terminal or a notebook."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

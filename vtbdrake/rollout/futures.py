@@ -24,7 +24,7 @@ _Future = concurrent.futures.Future[bytes]
 
 
 class FuturesExecutor(Executor):
-    """Rollouts on a `concurrent.futures.Executor` of the user, who also closes it.
+    """Rollouts on a `concurrent.futures.Executor` of the user; it is not closed.
 
     Each of its processes builds a testbed once and keeps it; each of its threads has a Context. A pool breaks when one
     of its processes is killed, and does not say by which rollout. If its processes run on this computer (the standard

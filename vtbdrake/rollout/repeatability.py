@@ -34,8 +34,8 @@ class Check:
 
     Attributes:
         findings: one sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
-        seconds: how much simulated time of a rollout was looked at.
-        failure: how that rollout fails then, so that no more of it could be looked at; empty if it does not.
+        seconds: The simulated time of the checked part of a rollout.
+        failure: The reason for which that rollout fails and cannot be checked further; empty if it does not fail.
     """
 
     findings: tuple[str, ...]

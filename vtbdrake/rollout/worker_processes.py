@@ -1,4 +1,4 @@
-"""Rollouts in worker processes, which keep their testbeds: how workers are fed, timed and restarted; what they run."""
+"""Rollouts in worker processes, which keep their testbeds: jobs, time limits and restarts."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class ProcessExecutor(Executor):
                 if error is not None:
                     raise error
         finally:
-            # After an error or an interruption, nobody needs the rollouts under way.
+            # After an error or an interruption, the rollouts under way are not needed.
             for worker in [worker for worker in self._workers if worker.jobs]:
                 self._workers.remove(worker)
                 worker.kill()

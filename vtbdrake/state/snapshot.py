@@ -236,7 +236,7 @@ class StateCopier:
     """Copies time, state and parameters leaf by leaf.
 
     SceneGraph and cameras are left out: they hold ids that differ from build to build, and copying them makes Drake
-    compute anew what has not changed. What is hidden there is copied by address, and only where it differs.
+    recompute unchanged values. Their hidden state is copied by address, and only where it differs.
 
     Args:
         source, target: the Diagrams; they may be the same one.

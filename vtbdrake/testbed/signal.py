@@ -182,7 +182,7 @@ class Signal:
                 )
 
 
-# An image of no size stands for those of any size.
+# An image of size zero accepts images of any size.
 _ANY_SIZE = "0 x 0 pixels"
 
 
@@ -240,7 +240,7 @@ class Interface:
 
 
 class Feed:
-    """Input ports of one context, by signal, which carry what they were given last.
+    """The input ports of one context, by signal, which hold the last value.
 
     After the first time, a value is changed in place, which takes one or two microseconds. `GetMutableData` must be
     called before each change, to invalidate caches; the view of a vector's numbers can be kept.

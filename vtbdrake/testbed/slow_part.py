@@ -215,13 +215,13 @@ class SlowPart(LeafSystem):
         - valid (1 if the result that was due last was there, else 0)
         - missed (how many were not)
 
-    At t_k = offset + k period it samples its inputs. From t_k + latency on, its outputs show ``function`` of them: what
-    is updated at that instant sees it already. Until the first result they show ``initial``.
+    At t_k = offset + k period it samples its inputs. From t_k + latency on, its outputs show ``function`` of them,
+    also to systems that are updated at that very instant. Until the first result they show ``initial``.
 
-    In a simulation, the function is computed when its result is due. A runtime has it computed in another process, and
-    hands the result in with `deliver` at any time before. A result that is declared missing is left out: the outputs
-    stay as they are. What has neither come nor been declared missing is computed here: so a copy of a running context
-    goes on by itself.
+    In a simulation, the function is computed when its result is due. A runtime computes it in another process, and
+    delivers the result with `deliver` at any time before. If a result is declared missing, the outputs stay unchanged.
+    A result that has neither arrived nor been declared missing is computed here, so that a copy of a running context
+    can continue without a runtime.
 
     All its memory lies in its context, as arrays: the samples and results under way, latency / period of them, and
     the memory.

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization import Motion
 
-# Colours that are told apart by everyone (Okabe and Ito).
+# Colours for all kinds of colour vision (Okabe and Ito).
 _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 # Of the primaries of sRGB, to the eye.
@@ -255,7 +255,7 @@ class _Actor:
     def _paint_over(self, color: Rgba) -> Rgba:
         rgb = np.array([color.r(), color.g(), color.b()])
         if self._tint is not None:
-            # The old colour's brightness stays, so that the parts of a robot are told apart.
+            # The old colour's brightness stays, so that the parts of a robot can be distinguished.
             rgb = 0.75 * np.array(self._tint) + 0.25 * rgb @ _BRIGHTNESS
         return Rgba(*rgb, color.a() * self._opacity)
 

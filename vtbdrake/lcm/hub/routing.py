@@ -144,7 +144,7 @@ class ProtectedChannel:
 class _Route(NamedTuple):
     channel: str
     subscribers: tuple[ClientConnection, ...]
-    protected: ProtectedChannel | None  # decides who may publish; None if every client may
+    protected: ProtectedChannel | None  # decides which client may publish; None if every client may
     reserved: bool  # whether the channel is the hub's own: nothing is relayed
 
 

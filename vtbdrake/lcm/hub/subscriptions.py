@@ -91,8 +91,8 @@ _EVERYTHING = Pattern(lambda channel: True, 0)
 class Subscriptions:
     """The subscriptions of one client.
 
-    Every client filters again what it receives. So a pattern that cannot be matched here in linear time, or that
-    exceeds the client's budget, stands for all channels. To decide whether a client receives a channel takes one
+    Every client filters its messages once more. So a pattern that cannot be matched here in linear time, or that
+    exceeds the client's budget, subscribes to all channels. To decide whether a client receives a channel takes one
     lookup and at most `MAX_COST` steps for each character of the channel.
     """
 

@@ -56,7 +56,7 @@ _SEND_BUFFER = 4 * 1024 * 1024
 _NETLINK_SOCK_DIAG = 4
 _SOCK_DIAG_BY_FAMILY = 20
 _NLM_F_REQUEST = 1
-_DIAG_REQUEST = struct.Struct("=IHHII BBBBI HH16s16s III")  # header; what is asked; addresses; interface, cookie
+_DIAG_REQUEST = struct.Struct("=IHHII BBBBI HH16s16s III")  # header; requested data; addresses; interface, cookie
 _DIAG_ANSWER = struct.Struct("=IHHII BBBB48s III II")  # header; state, addresses; timer, queues; user, inode
 
 
@@ -131,7 +131,7 @@ def connect_shortcut(host: str, port: int) -> socket.socket | None:
         sock.close()
         return None
     # While no hub holds the name, any user can take it and imitate a hub; the kernel tells which user listens. This
-    # user could as well end the hub and take its port; another user could not.
+    # user could also end the hub and take its port; another user could not.
     if user not in (0, os.geteuid()):
         sock.close()
         _log.warning("using TCP: the Unix socket %r belongs to user %s, neither to this user nor to root", name, user)
@@ -166,5 +166,5 @@ def _tcp_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
     with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, _NETLINK_SOCK_DIAG) as kernel:
         kernel.send(request)  # The kernel answers before it returns.
         _, kind, *_, user, inode = _DIAG_ANSWER.unpack_from(kernel.recv(4096))
-    # A socket that its process has closed belongs to nobody; the kernel may report root as its user.
+    # A socket that its process has closed has no owner; the kernel may report root as its user.
     return int(user) if kind == _SOCK_DIAG_BY_FAMILY and inode else None

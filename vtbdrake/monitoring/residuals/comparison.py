@@ -33,7 +33,7 @@ class ResidualConfig:
         scenario: scenario of the predicted world; by default that of the loop's target. It has the latencies of the
             sensors, but no random errors.
         period: period of the machine's cycles and the DPS's, in seconds.
-        horizon: length of a prediction in periods, after which it begins anew from the belief.
+        horizon: length of a prediction in periods, after which it restarts from the belief.
         delay: periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
             where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on.
         settle: windows that are predicted but not used at first and after a gap, while state that the belief does not
@@ -236,7 +236,7 @@ class Comparison:
         try:
             differences, whole = self._compare(s)
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            _log.warning("a prediction failed and begins anew: %s", error)
+            _log.warning("a prediction failed and restarts: %s", error)
             self.failed += 1
             self.error = f"{type(error).__name__}: {error}"
             self._predictor.reset()

@@ -51,7 +51,7 @@ class ResidualMonitor:
     the rows once per window; a worker process does the rest. If that is too slow, windows are skipped and counted; if
     it dies, the loop goes on, `running` becomes False, and an error is logged.
 
-    While a sensor signal is not on real, nothing is predicted; the prediction begins anew afterwards.
+    While a sensor signal is not on real, nothing is predicted; the prediction restarts afterwards.
 
     Args:
         runtime: The loop, which does not run yet.
@@ -435,7 +435,7 @@ def _serve(
             report.windows = pending.windows + report.windows
             report.skipped += dropped
             pending = report
-            # Windows without a result are reported as well.
+            # Windows without a result are reported, too.
             without = report.skipped + report.failed
             if report.alarms or len(report.windows) + without - reported >= _REPORT_WINDOWS:
                 connection.send(pickle.dumps(report))

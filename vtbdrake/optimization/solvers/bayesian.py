@@ -229,8 +229,8 @@ class Bayesian(Solver):
                 continue
             if isinstance(parameter, Choice):
                 moved[:, i] = units[:, i]
-            anew = self._rng.random(len(units)) < 0.2
-            moved[anew, i] = self._rng.random(int(anew.sum()))
+            redrawn = self._rng.random(len(units)) < 0.2
+            moved[redrawn, i] = self._rng.random(int(redrawn.sum()))
         return self._snapped(moved)
 
     def _snapped(self, units: np.ndarray) -> np.ndarray:

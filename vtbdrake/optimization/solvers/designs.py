@@ -90,7 +90,7 @@ class Listed(Design):
 class Sobol(Design):
     """A Sobol sequence, scrambled by the seed: quasi-random points, more even than random ones.
 
-    Its first points are the same however many are asked for. Numbers of points that are a power of two are balanced.
+    Its first points do not depend on the number of points. Numbers of points that are a power of two are balanced.
 
     Args:
         search: what is searched.

@@ -31,7 +31,7 @@ ONE_OBJECTIVE = frozenset({"QMC"})
 class OptunaSolver(Solver):
     """A sampler of Optuna: continuous, whole and categorical parameters, several objectives, constraints.
 
-    It asks until its budget is spent. A failed simulation is told as a failed trial, without a value. Points given by
+    It asks until its budget is spent. A failed simulation is a failed trial, without a value. Points given by
     hand are added to the study from which it learns.
 
     Args:

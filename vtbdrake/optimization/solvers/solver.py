@@ -1,4 +1,4 @@
-"""The interface of all solvers of problem (18): a solver asks for points, and is told how good they are."""
+"""The ask-and-tell interface of all solvers of problem (18)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PointValues:
 
 @dataclass(frozen=True)
 class Evaluation(PointValues):
-    """The record of a point that a solver is told.
+    """The evaluation of a point, from which a solver learns.
 
     Attributes:
         point: s^0.
@@ -225,15 +225,15 @@ class Search:
 
 
 class Solver(ABC):
-    """A method that asks for batches of points, and is told of each batch before it asks for the next.
+    """A method that asks for batches of points, and gets the evaluations of each batch before it asks for the next.
 
-    What it asks for depends on its seed and on what it was told, and on nothing else: neither on the number of workers
-    nor on time. So a study is the same in series and in parallel, and is resumed by telling a new solver again.
+    The points depend only on the seed and on the evaluations so far, not on the number of workers or on time. So a
+    study is the same in series and in parallel, and is resumed by telling a new solver the recorded evaluations.
 
     A solver asks until its evaluations have taken ``search.budget``. Each point is charged in full when it is asked
-    for; what it did not take (`Evaluation.effort`) is given back when it is told, and points given by hand are charged
-    then. A batch that exceeds the budget is cut; the rest follows if budget comes back, and the method learns when the
-    batch is complete.
+    for; the unused part (see `Evaluation.effort`) is refunded with the evaluation. Points given by hand are charged
+    with their evaluation. A batch that exceeds the budget is cut; the rest follows if budget is refunded, and the
+    method learns when the batch is complete.
 
     A subclass implements `_next` and `_learn`.
 
