@@ -124,10 +124,10 @@ def test_take_over_starts_from_the_first_measurement() -> None:
 
 
 def test_take_over_waits_until_the_machine_is_ready() -> None:
-    def ready(bridge: Bridge) -> str | None:
+    def blocked_by(bridge: Bridge) -> str | None:
         return None if bridge.sensed["position"].count > 2500 else "its brakes are on"
 
-    machine = Machine(Deployment(continuity=CONTINUITY, ready=ready))
+    machine = Machine(Deployment(continuity=CONTINUITY, blocked_by=blocked_by))
     machine.take_over()
     assert machine.clock.now() == pytest.approx(2.5, abs=2 * PERIOD)
     # At first, and then once per second.
@@ -135,7 +135,7 @@ def test_take_over_waits_until_the_machine_is_ready() -> None:
 
 
 def test_take_over_gives_up_after_its_timeout() -> None:
-    machine = Machine(Deployment(continuity=CONTINUITY, ready=lambda bridge: "its brakes are on"))
+    machine = Machine(Deployment(continuity=CONTINUITY, blocked_by=lambda bridge: "its brakes are on"))
     with pytest.raises(SwitchRefusedError, match=r"after 1\.5 s: the machine is not ready: its brakes are on"):
         machine.take_over(timeout=1.5)
     assert machine.bridge.sent == []

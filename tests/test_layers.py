@@ -29,12 +29,13 @@ BELOW: dict[str, set[str]] = {
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
-# Modules that need neither Drake nor the layers: how other processes start, how objects travel to them, and when the
-# names of a package are imported.
+# Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
+# travel to them, and when the names of a package are imported.
 for _layers in BELOW.values():
-    _layers.update({"child_process", "lazy", "pickling"})
+    _layers.update({"argument_checks", "child_process", "lazy", "pickling"})
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
+BELOW["argument_checks"] = set()
 BELOW["lazy"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)

@@ -30,7 +30,7 @@ class DeploymentError(ValueError):
     """A deployment is missing, unsafe, or does not fit the signals of its scenario."""
 
 
-def _ready(bridge: Bridge) -> str | None:
+def _not_blocked(bridge: Bridge) -> str | None:
     return None
 
 
@@ -56,7 +56,7 @@ class Deployment:
         guards: Options of `Guards`, such as ``fallback`` and ``max_missed``.
         continuity: Actuator signal -> (sensor signal, largest difference): where actuator commands start from, see
             `Runtime`. Required for each actuator signal whose rate or acceleration is limited.
-        ready: Returns why the machine behind a bridge must not be commanded yet, or None.
+        blocked_by: Returns why the machine behind a bridge must not be commanded yet, or None.
         pace: The sensor signal whose messages begin the cycles. If empty, the clock does.
         patience: The number of periods without such a message after which the clock begins a cycle.
         check_age: False accepts sensor values of any age, for a machine whose time stops between two messages.
@@ -67,7 +67,7 @@ class Deployment:
     period: float = 1e-3
     guards: Mapping[str, Any] = field(default_factory=dict)
     continuity: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    ready: Callable[[Bridge], str | None] = _ready
+    blocked_by: Callable[[Bridge], str | None] = _not_blocked
     pace: str = ""
     patience: float = 3.0
     check_age: bool = True
@@ -139,7 +139,7 @@ class Deployment:
             period=self.period,
             guards=self._guards(target.interface),
             continuity=self.continuity,
-            ready=lambda: self.ready(bridge),
+            blocked_by=lambda: self.blocked_by(bridge),
             pace=self.pace or None,
             patience=self.patience,
             **options,
@@ -175,7 +175,7 @@ def deploy(
         bridge.open()
         stack.callback(bridge.close)
         if claim:
-            bridge.take_over()
+            bridge.claim()
         if live:
             from vtbdrake.monitoring.live.service import LiveService
 

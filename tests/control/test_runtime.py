@@ -228,7 +228,7 @@ def test_unknown_switches_are_rejected_without_change(asked, message):
 
 
 def test_switch_to_unconnected_or_unready_machine_is_refused():
-    runtime, bridge, _ = make(rate=0.0, ready=lambda: "its brakes are closed")
+    runtime, bridge, _ = make(rate=0.0, blocked_by=lambda: "its brakes are closed")
     runtime.cycle()
     bridge.up = False
     reasons = refusal(runtime)

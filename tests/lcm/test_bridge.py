@@ -423,7 +423,7 @@ def test_frozen_owner_is_replaced_only_on_request() -> None:
             second.publish({"position": np.full(7, 2.0)})
             end = time.monotonic() + PATIENCE
             while len(peer.heard) < 3 and time.monotonic() < end:
-                second.take_over()
+                second.claim()
                 second.publish({"position": np.full(7, 3.0)})
                 peer.lcm.handle_timeout(20)
             positions = [command(data)[0][0] for channel, data in peer.heard if channel == "IIWA_COMMAND"]
@@ -465,9 +465,9 @@ def test_invalid_hub_status_is_logged_and_ignored(status: bytes, caplog: pytest.
     assert "no status" in caplog.text
 
 
-def test_take_over_needs_a_hub() -> None:
+def test_claim_needs_a_hub() -> None:
     with pytest.raises(ValueError, match="only a hub protects channels"):
-        bridge("memq://").take_over()
+        bridge("memq://").claim()
 
 
 def test_commands_u_arrive_over_lcm(hub: Hub, user_types: ModuleType) -> None:

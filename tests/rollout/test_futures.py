@@ -218,5 +218,5 @@ def test_no_rollouts_in_flight_is_refused():
 
 def test_make_executor_refuses_options_of_the_pool():
     testbed = AcrobotScenario().build()
-    with pytest.raises(ValueError, match="a pool that is there already has its own settings: workers=2"):
+    with pytest.raises(ValueError, match="an existing pool has its own settings: workers=2"):
         make_executor(ThreadPoolExecutor(1), testbed=testbed, rollouts=2, workers=2)

@@ -37,7 +37,7 @@ from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.rollout.choice import NAMES
+from vtbdrake.rollout.executor import NAMES
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 

@@ -67,7 +67,7 @@ class Runtime(Stepped):
             cycles.
         continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more. Commands depart from that sensor signal, also after a time in which none left.
-        ready: returns why the machine is not ready to be commanded, or None.
+        blocked_by: returns the blocked reason of the machine (why it must not be commanded yet), or None.
         statistics: statistics of the loop's timing, made for the same period.
         watchers: called with every `Cycle`. One that raises is removed, and the loop goes on.
 
@@ -91,7 +91,7 @@ class Runtime(Stepped):
         pace: str | None = None,
         patience: float = 3.0,
         continuity: Mapping[str, tuple[str, float]] | None = None,
-        ready: Callable[[], str | None] = lambda: None,
+        blocked_by: Callable[[], str | None] = lambda: None,
         statistics: LoopStatistics | None = None,
         watchers: tuple[Callable[[Cycle], None], ...] = (),
     ) -> None:
@@ -109,7 +109,7 @@ class Runtime(Stepped):
         self.statistics = statistics or LoopStatistics(period)
         _check_fit(self.guards, self.statistics, target.interface, period)
         self.guards.measured_by = {name: sensor for name, (sensor, _) in self.continuity.items()}
-        self.ready = ready
+        self.blocked_by = blocked_by
         self.cycles = 0
         self.pace = pace
         self._patience = patience * period
@@ -293,7 +293,7 @@ class Runtime(Stepped):
 
     def blocked_reason(self) -> str | None:
         """Return why the machine is not to be commanded now (not ready, commands do not reach it), or None."""
-        return self.bridge.blocked_reason or self.ready()
+        return self.bridge.blocked_reason or self.blocked_by()
 
     # -- switches
 

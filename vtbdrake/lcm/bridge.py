@@ -204,14 +204,14 @@ class LcmBridge(Bridge):
 
         return take
 
-    def take_over(self) -> None:
-        """Ask a hub for the actuator channels that it protects; it grants those whose owner has fallen silent.
+    def claim(self) -> None:
+        """Claim the protected actuator channels at the hub, which grants those whose owner has fallen silent.
 
         Raises:
             ValueError: the bus has no hub.
         """
         if not self.url.startswith(_HUB):
-            raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to take over")
+            raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to claim")
         self.link.publish(*[(TAKE_PREFIX + writer.channel, b"") for writer in self._writers])
 
 

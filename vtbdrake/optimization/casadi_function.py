@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import casadi
 import numpy as np
 
+from vtbdrake.argument_checks import as_number
 from vtbdrake.optimization.evaluator import Evaluator, Gradients
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.study_file import Outcome, RolloutKey
 from vtbdrake.rollout import Executor, make_executor
-from vtbdrake.rollout.arguments import as_number
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.problem import Problem

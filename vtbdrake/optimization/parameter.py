@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.rollout.arguments import all_of, as_number
+from vtbdrake.argument_checks import all_of, as_number
 from vtbdrake.rollout.runner import FIELD
 from vtbdrake.state import Variable, Variables
 

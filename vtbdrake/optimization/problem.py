@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.argument_checks import all_of, as_number, as_whole
 from vtbdrake.optimization.boundary import Boundary, search_boundary
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, borrowed, grid, make_sweep, numeric, roll_out
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, RolloutRunner, RolloutTask
-from vtbdrake.rollout.arguments import all_of, as_number, as_whole
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
 from vtbdrake.rollout.runner import Testbeds, split

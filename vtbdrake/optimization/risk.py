@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vtbdrake.rollout.arguments import as_number
+from vtbdrake.argument_checks import as_number
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.study_file import Outcome

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from vtbdrake.argument_checks import as_whole
 from vtbdrake.optimization.identity import (
     code_changes,
     describe,
@@ -24,7 +25,6 @@ from vtbdrake.optimization.solvers import Solver, make_solver
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
-from vtbdrake.rollout.arguments import as_whole
 
 if TYPE_CHECKING:
     import optuna

@@ -12,12 +12,12 @@ from queue import Empty, SimpleQueue
 
 from tqdm.auto import tqdm
 
+from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.evaluator import Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyFile, Trial
 from vtbdrake.rollout import Executor
-from vtbdrake.rollout.arguments import as_number, as_whole
 from vtbdrake.rollout.executor import watched
 from vtbdrake.rollout.task import QUALITY_FAILED
 from vtbdrake.testbed.interrupt import Interruptible

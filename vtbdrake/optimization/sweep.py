@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.argument_checks import all_of, as_whole
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
 from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
-from vtbdrake.rollout.arguments import all_of, as_whole
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.state.archive import read_archive, write_archive
 

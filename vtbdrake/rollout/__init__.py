@@ -1,7 +1,13 @@
 """Gamma: one rollout, and many side by side."""
 
-from vtbdrake.rollout.choice import choose_executor, make_executor
-from vtbdrake.rollout.executor import Executor, SerialExecutor, ThreadExecutor, WorkerError
+from vtbdrake.rollout.executor import (
+    Executor,
+    SerialExecutor,
+    ThreadExecutor,
+    WorkerError,
+    choose_executor,
+    make_executor,
+)
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 from vtbdrake.rollout.runner import RolloutRunner

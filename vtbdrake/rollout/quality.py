@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.rollout.arguments import as_addresses, as_number
+from vtbdrake.argument_checks import as_addresses, as_number
 
 # (times, samples, True if larger samples are better) -> (time, number)
 Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[float, float]]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from vtbdrake.rollout.arguments import as_addresses, as_number
+from vtbdrake.argument_checks import as_addresses, as_number
 from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario

@@ -15,8 +15,8 @@ from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from vtbdrake.argument_checks import as_number
 from vtbdrake.child_process import ChildProcess, StartError, report_ready
-from vtbdrake.rollout.arguments import as_number
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, unpack
 from vtbdrake.rollout.runner import KEPT, Runners, Testbeds, failed

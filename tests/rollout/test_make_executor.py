@@ -71,9 +71,9 @@ def test_an_executor_or_a_pool_that_is_there_is_taken(pendulum):
         ("processes", {"time_limit": 0.0}, "time limit must be positive, not 0.0 s"),
         ("processes", {"workers": 0}, "at least one worker, not 0"),
         ("threads", {"workers": 0}, "at least one worker, not 0"),
-        (SerialExecutor(), {"time_limit": 2.0}, "already has its own settings: time_limit=2.0"),
-        (ThreadPoolExecutor(1), {"time_limit": 2.0}, "a pool that is there already has its own settings: time_limit"),
-        (ThreadPoolExecutor(1), {"workers": 2}, "a pool that is there already has its own settings: workers=2"),
+        (SerialExecutor(), {"time_limit": 2.0}, "an existing Executor has its own settings: time_limit=2.0"),
+        (ThreadPoolExecutor(1), {"time_limit": 2.0}, "an existing pool has its own settings: time_limit"),
+        (ThreadPoolExecutor(1), {"workers": 2}, "an existing pool has its own settings: workers=2"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(executor, options, message, pendulum):
