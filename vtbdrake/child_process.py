@@ -113,7 +113,7 @@ class ChildProcess:
             StartError: the child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
         """
         try:
-            reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: what follows is for others to read.
+            reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: the rest is left to other readers.
         except BaseException as error:
             self.kill()
             self.connection.close()
@@ -173,7 +173,7 @@ class ChildProcess:
             return self.kill()
 
     def kill(self) -> int:
-        """Kill the child (SIGKILL) and return its exit code. What it has sent can still be read from the connection."""
+        """Kill the child (SIGKILL) and return its exit code. Its sent data can still be read from the connection."""
         self._process.kill()
         return self._process.wait()
 

@@ -33,7 +33,7 @@ LAWS = ("cartesian_impedance", "admittance")
 # Masses, friction and other parameters of the machine differ from those of the DPS by up to this fraction.
 PERTURB, SEED = 0.05, 7
 
-# Consecutive missed deadlines after which the arm floats in place; the machine brakes by itself after 100.
+# Consecutive missed deadlines after which the arm floats in place; the machine brakes after 100.
 MAX_MISSED = 50
 
 # With more latches than this, the figures of a trial mean nothing: the motions were interrupted too often.

@@ -67,7 +67,7 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
 
     Args:
         phases: start phases of the gait, in cycles.
-        stride: period of the gait in seconds; the robot walks for as many strides, whatever it is.
+        stride: period of the gait in seconds; the number of strides does not depend on it.
         environment: fields of the scenario.
     """
     return vtb.Problem(

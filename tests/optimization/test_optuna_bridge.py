@@ -202,7 +202,7 @@ def test_another_study_of_that_name_is_left_alone(url):
 def test_the_study_itself_is_no_storage_for_optuna(tmp_path):
     path = tmp_path / "swing.study"
     study = run(pendulum_problem().study(path, solver="sobol"), 4)
-    with pytest.raises(StudyError, match="is the study itself: give Optuna a file of its own"):
+    with pytest.raises(StudyError, match="is the study itself: give Optuna another file"):
         study.to_optuna(f"sqlite:///{path}", "swing")
     study.close()
     assert len(Study.open(path)) == 4

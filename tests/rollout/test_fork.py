@@ -81,5 +81,5 @@ def test_a_simulator_of_another_testbed_is_refused():
     testbed, other = PendulumScenario().build(), PendulumScenario().build()
     with pytest.raises(ValueError, match=r"make it by testbed.simulator\(\)"):
         testbed.fork(other.simulator())
-    with pytest.raises(ValueError, match="what is forked is a simulator, .* not None"):
+    with pytest.raises(ValueError, match="fork a simulator made by .* not None"):
         testbed.fork(None)

@@ -237,7 +237,7 @@ def test_cameras_that_are_sampled_by_a_composite_come_back():
         ),
         (
             lambda: LcmSubscriberSystem.Make("X", lcmt_iiwa_command, pydrake.lcm.DrakeLcm("memq://")),
-            "LcmSubscriberSystem, which listens to what is outside the Diagram: feed the DPS by a real port",
+            "LcmSubscriberSystem, which receives data from outside the Diagram: feed the DPS by a real port",
         ),
         (
             lambda: ZeroOrderHold(PERIOD, Value([1, 2])),

@@ -1,4 +1,4 @@
-"""The command line: the program ``vtbdrake``, and what becomes of errors in its commands."""
+"""The command line: the program ``vtbdrake``, and the error handling of its commands."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
     type=click.Choice(["recorded", "dps", "testbed"]),
     default="recorded",
     show_default=True,
-    help="Replay with what was recorded, the DPS alone or the whole testbed.",
+    help="Replay the recorded system: the DPS alone, or the whole testbed.",
 )
 @set_option
 @click.option("--record", multiple=True, metavar="ADDRESS", help="Read ADDRESS after every cycle. May be repeated.")

@@ -1,4 +1,4 @@
-"""``vtbdrake machine``: simulate the physical robot of a scenario in a process of its own."""
+"""``vtbdrake machine``: simulate the physical robot of a scenario in a separate process."""
 
 from __future__ import annotations
 

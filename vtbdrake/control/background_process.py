@@ -136,7 +136,7 @@ class BackgroundProcess:
                 self._unsent_bytes += len(piece)
 
     def flush(self) -> None:
-        """Send what waits as far as the socket has room, at most 256 KiB, so that it takes little time."""
+        """Send waiting data as far as the socket has room, at most 256 KiB, so that it takes little time."""
         left = _CHUNK
         while self._unsent and left > 0 and not self._lost:
             first = self._unsent[0]
@@ -216,7 +216,7 @@ class BackgroundProcess:
         return self._child.close(max(0.0, end - time.monotonic()))
 
     def kill(self) -> None:
-        """End the worker at once; `take` still returns what it has sent."""
+        """End the worker at once; `take` still returns the data that it has sent."""
         self._closing = True
         self._child.kill()
         self._receive()
@@ -227,7 +227,7 @@ class BackgroundProcess:
 def _serve(connection: socket.socket, function: Callable[..., None], arguments: Sequence[Any]) -> None:
     """Run the child process of a `BackgroundProcess`."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    # The loop may be confined to processors of its own, where nothing else should work.
+    # The loop may have reserved processors, where nothing else should run.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     try:

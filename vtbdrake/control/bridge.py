@@ -1,4 +1,4 @@
-"""The bridge: what connects the real ports of a testbed with the machine."""
+"""The bridge, which connects the real ports of a testbed with the machine."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Bridge(ABC):
 
     @abstractmethod
     def poll(self, timeout: float = 0.0) -> int:
-        """Receive what has arrived, and return the number of messages; wait up to ``timeout`` seconds for the first.
+        """Receive all messages that have arrived, return their number; wait up to ``timeout`` seconds for the first.
 
         A bridge that has lost its connection tries to connect again here.
         """

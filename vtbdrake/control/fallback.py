@@ -1,4 +1,4 @@
-"""Fallbacks: what commands an actuator signal after a fault."""
+"""Fallbacks: sources of actuator commands after a fault."""
 
 from __future__ import annotations
 

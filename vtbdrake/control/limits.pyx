@@ -104,7 +104,7 @@ cdef class JumpBounds:
 
 
 class ActuationError(ValueError):
-    """An actuator command that cannot be sent, whatever the limits.
+    """An actuator command that cannot be sent under any limits.
 
     Attributes:
         kind: ``size``, ``not finite`` or ``not started``.
@@ -273,7 +273,7 @@ cdef class RateLimiter:
         return result
 
     cdef double _limited(self, double c, Py_ssize_t i) noexcept:
-        """Return one entry of what is sent."""
+        """Return one entry of the actuator command to send."""
         cdef double s = self.state[0, i], x = self.state[1, i], change = self.changes[i]
         cdef double w = c - s, sent, amount
         cdef int acted = NONE
@@ -304,7 +304,7 @@ cdef double _longest_step(double d, double a) noexcept:
 
 
 class PassThrough:
-    """Replaces `RateLimiter` for an abstract actuator signal: remembers what was sent, and limits nothing."""
+    """Replaces `RateLimiter` for an abstract actuator signal: remembers the last actuator command, and limits nothing."""
 
     needs_start = False
 
@@ -322,7 +322,7 @@ class PassThrough:
         self.last_sent = value
 
     def release(self):
-        """Forget what was sent."""
+        """Forget the last actuator command."""
         self.last_sent = None
 
     def take_back(self):

@@ -45,7 +45,7 @@ class Runtime(Stepped):
     A testbed starts with its switches as they stand in ``context``. The DPS alone starts idle: it is stepped, and
     commands, from its switch to ``real`` on.
 
-    The slow parts of the DPS run beside it, each in a process of its own, until `close` or the end of a ``with`` block.
+    The slow parts of the DPS run beside it, each in a separate process, until `close` or the end of a ``with`` block.
 
     If another publisher commands the same machine, that is an alarm: it is logged and counted in the statistics. No
     signal is switched to real while another publisher is heard. Guards cannot stop him; a hub can, by protected
@@ -190,7 +190,7 @@ class Runtime(Stepped):
     def _await(self, deadline: float) -> tuple[float, float]:
         """Wait for the next cycle; return when it was due and how late it is, in seconds."""
         if self.pace is None:
-            # Shortly before the deadline, what has arrived is received and fed already.
+            # Shortly before the deadline, messages that have arrived are received and fed already.
             return deadline, self.clock.wait_until(deadline, self._receive_early) - deadline
         paced = self.bridge.sensed[self.pace]
         count, limit = paced.count, self.clock.now() + self._patience
@@ -286,7 +286,7 @@ class Runtime(Stepped):
     def send_fallback(self, reason: str) -> None:
         """Latch the guards and send the fallback commands once, as the last commands of a loop that ends."""
         verdict = self.guards.latch(reason, self.clock.now(), self.watched)
-        # The verdict covers what was on real in the last cycle and has been commanded before.
+        # The verdict covers the signals that were on real in the last cycle and have been commanded before.
         last = {name: command for name, command in verdict.actuation.items() if name in self.active}
         if last:
             self.bridge.publish(last)

@@ -71,7 +71,7 @@ class LatencyMonitor:
 class SensorMonitor(StalenessMonitor):
     """Checks that one sensor signal is fresh and plausible; `check` returns the fault, if there is one.
 
-    A signal that has never arrived is stale, whatever its maximum age. A vector is plausible if it has the right size
+    A signal that has never arrived is stale, for any maximum age. A vector is plausible if it has the right size
     and all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
     Values that the bridge has checked against the same bounds are not checked again.
 
@@ -118,7 +118,7 @@ class SensorMonitor(StalenessMonitor):
         return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
 
     def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
-        """Return what is wrong with a new sample, or None."""
+        """Return the fault of a new sample, or None."""
         fault = None
         if self._bounds is not received.bounds:
             if self._bounds == received.bounds:

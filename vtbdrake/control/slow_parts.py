@@ -100,14 +100,14 @@ class SlowParts:
         return {part.path: part.statistics for part in self._parts}
 
     def receive(self) -> None:
-        """Deliver what has arrived, and declare missing what should have; called before a step."""
+        """Deliver the results that have arrived, and declare overdue ones missing; called before a step."""
         if self._parts:
             end = self._context.get_time() + self._step
             for part in self._parts:
                 part.receive(end)
 
     def send(self) -> None:
-        """Send what has been sampled; called after a step."""
+        """Send the new samples; called after a step."""
         for part in self._parts:
             part.send()
 

@@ -85,7 +85,7 @@ cdef class StalenessMonitor:
         self.arrived = -INFINITY
 
     cpdef check(self, double now, ReceivedSignal received):
-        """Return what is wrong with the signal at the time ``now``, in seconds; None if nothing is."""
+        """Return the fault of the signal at the time ``now``, in seconds; None if it has none."""
         if received is None:
             raise TypeError("check() takes the ReceivedSignal of the signal, not None")
         if now - received.arrived > self.max_age or not received.count:
@@ -102,7 +102,7 @@ cdef class StalenessMonitor:
         return self.fault
 
     def accept(self, value, double arrived):
-        """Accept a sample, whatever was found wrong with it."""
+        """Accept a sample, even if a check has rejected it."""
         self.value = value
         self.arrived = arrived
         self.fault = None

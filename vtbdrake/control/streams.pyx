@@ -1,4 +1,4 @@
-"""Compiled buffers that reassemble what arrives on sockets."""
+"""Compiled buffers that reassemble messages from sockets."""
 
 from cpython.bytes cimport PyBytes_FromStringAndSize
 from cpython.exc cimport PyErr_CheckSignals, PyErr_SetFromErrno

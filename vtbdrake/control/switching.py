@@ -27,7 +27,7 @@ class SwitchRefusedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Preparation:
-    """The first phase of a switch: what it changes, and the reasons against it.
+    """The first phase of a switch: the planned changes, and the reasons against them.
 
     Attributes:
         sense: new positions by sensor signal.
@@ -133,7 +133,7 @@ def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, f
 
 
 def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
-    """Return the reasons why commands of actuator signals would not continue what is measured."""
+    """Return the reasons why commands of actuator signals would not continue the measured values."""
     found = []
     for name in names:
         if name not in runtime.continuity:
@@ -165,7 +165,7 @@ def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]
     """Throw the switches of a preparation without reasons against it; `Runtime.perform` calls this."""
     for name, position in acts.items():
         if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
-            # The commands depart from what is measured; a signal that is commanded already goes on.
+            # The actuator commands start from the measured values; a signal that is commanded already goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
     runtime.note_change(
         SWITCH,

@@ -137,13 +137,13 @@ class TcpqConnection(Connection):
 
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
         self._handlers = {channel.encode(): (channel, handler) for channel, handler in handlers.items()}
-        # The hub's greeting is read below; what follows has the form of a client's records.
+        # The hub's greeting is read below; the rest has the form of a client's records.
         self._reader = TcpqReader(max_message=_LONGEST_MESSAGE, greeted=True)
         self._unsent = b""
         self._stamped = stamped
         parts = urlsplit(url)
         address = parts.hostname or "127.0.0.1", _DEFAULT_PORT if parts.port is None else parts.port
-        # The kernel does not stamp what comes by a Unix socket.
+        # The kernel does not time-stamp data from a Unix socket.
         shortcut = None if stamped else connect_shortcut(*address)
         self._socket = shortcut or socket.create_connection(address, timeout)
         try:
@@ -169,7 +169,7 @@ class TcpqConnection(Connection):
         if magic == MAGIC_REJECTION:
             raise RejectedError(self._receive_exactly(min(size, MAX_REJECTION)).decode(errors="replace"))
         if magic != MAGIC_SERVER:
-            raise ConnectionError("what listens there is no tcpq hub")
+            raise ConnectionError("the server at this address is not a tcpq hub")
 
     def _receive_exactly(self, size: int) -> bytes:
         data = b""
@@ -245,7 +245,7 @@ def _literally(channel: str) -> str:
 
 
 class _Search:
-    """Tries to connect until it succeeds or is cancelled; in a thread of its own, because connecting may take long."""
+    """Tries to connect until it succeeds or is cancelled, in a separate thread, because connecting may take long."""
 
     def __init__(self, connect: Callable[[], Connection]) -> None:
         self._connect = connect
@@ -275,7 +275,7 @@ class _Search:
             return None
 
     def cancel(self) -> None:
-        """End the search, and close what it has found."""
+        """End the search, and close the connection that it has found."""
         self._cancelled.set()
         if (found := self.result()) is not None:
             found.close()
@@ -350,7 +350,7 @@ class LcmLink:
 
     @property
     def sources(self) -> list[Connection]:
-        """Return what becomes readable when messages arrive, for `select`; empty while there is no bus."""
+        """Return the connections that `select` waits on for messages; empty while there is no bus."""
         connection = self._current()
         return [] if connection is None else [connection]
 

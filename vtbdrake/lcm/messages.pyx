@@ -79,7 +79,7 @@ cdef class MessageLayout:
             raise ValueError(f"a fingerprint has 8 bytes, not {len(fingerprint)}")
         self.fingerprint = fingerprint
         _flatten(fields, flat, None, True)
-        # Only what occurs exactly once in every message is a number of a signal, or a time.
+        # Only a number that occurs exactly once in every message can belong to a signal or be a time.
         cdef dict single = {field.path: i for i, (field, _, _, is_single) in enumerate(flat) if is_single}
         self.field_count = len(flat)
         self.fields = <Field*>zeros(len(flat), sizeof(Field))

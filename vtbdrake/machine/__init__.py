@@ -1,6 +1,6 @@
-"""The machine: a simulation of the physical robot in a process of its own.
+"""The machine: a simulation of the physical robot in a separate process.
 
-It knows the world and the LCM protocol of the scenario, and nothing of the controller. The maps of the
+It contains the world and the LCM protocol of the scenario, and nothing of the controller. The maps of the
 `vtbdrake.lcm.protocol.Protocol` make the bridge of the controller and, read in the other direction, the machine.
 
 * **Cycles.** At the time k periods it sends its state: one message per channel of ``Protocol.sense``, with the time

@@ -1,4 +1,4 @@
-"""Injected faults: what goes wrong, on request, with the messages between a machine and its controller."""
+"""Injected faults: errors, on request, of the messages between a machine and its controller."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ class MachineLoop:
         self._arrived.add(channel)
         self.machine.receive(channel, data)
 
-    # -- what it sends
+    # -- sending
 
     def _send_state(self) -> None:
         # Before they leave: a controller that preempts this process answers before `_publish` returns. A state without

@@ -242,13 +242,13 @@ class Machine:
             self._accepted[name], self._commands[name] = self.cycle, received.value
 
     def _apply(self, name: str, value: Any) -> None:
-        # Every message makes a new object: what is the same object has not changed.
+        # Every message makes a new object: the same object has not changed.
         if self._actuation[name] is not value:
             self._actuation[name] = value
             self._feed(name, value)
 
     def messages(self) -> list[tuple[str, bytes]]:
-        """Measure the present state, and return channel and bytes of what arrives at the controller now, in order."""
+        """Measure the present state; return channel and bytes of the messages that arrive at the controller now."""
         line = self._lines[SENSE]
         for packet in self._sensors.packets(self._context, self.cycle, self._message_time):
             line.send(packet)

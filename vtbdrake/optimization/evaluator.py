@@ -187,7 +187,7 @@ class Evaluator:
 class Gradients:
     """Derivatives of a problem's first quality, over all conditions, by its parameters.
 
-    A gradient takes one simulation with AutoDiffXd under each condition, whatever the number of parameters.
+    A gradient takes one simulation with AutoDiffXd per condition, for any number of parameters.
 
     Raises:
         SolverError: a parameter is not continuous, or is a field of the scenario, which needs another diagram.

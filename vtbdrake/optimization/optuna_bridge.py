@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization.study import Study
 
-# What identifies a study beside its problem: the same one may be exported again.
+# Identifies a study besides its problem: the same one may be exported again.
 _IDENTITY = ("solver", "seed", "options")
 
 # Importances need at least so many points.
@@ -132,7 +132,7 @@ def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseS
         database = make_url(storage).database
         # Optuna would put its tables beside ours.
         if but is not None and database and Path(database).resolve() == but.resolve():
-            raise StudyError(f"{but} is the study itself: give Optuna a file of its own")
+            raise StudyError(f"{but} is the study itself: give Optuna another file")
         opened: BaseStorage = optuna.storages.RDBStorage(storage)
     except SQLAlchemyError as error:
         reason = str(error).partition("\n")[0]

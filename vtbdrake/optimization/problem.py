@@ -47,7 +47,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ProblemRollout(RolloutResult):
-    """A rollout that knows its problem, so that it can be shown.
+    """A rollout with a reference to its problem, so that it can be shown.
 
     Attributes:
         problem: the problem of which it is a rollout.
@@ -271,7 +271,7 @@ class Problem:
         return replace(task, scenario=scenario), self._testbeds.get(scenario)
 
     def check(self) -> Check:
-        """Find what does not work in executors: memory outside the Context, values that do not travel to workers.
+        """Find obstacles to parallel rollouts: memory outside the Context, values that cannot be sent to workers.
 
         It takes about a second: the first part of a rollout is simulated four times, with equal results: twice in a
         row, beside another rollout on the same Diagram, and in another process. Print what it returns.
@@ -304,7 +304,7 @@ class Problem:
         run_on: bool = False,
         progress: bool = True,
     ) -> Sweep:
-        """Run a rollout at every point, under every condition. Ctrl-C keeps what is finished.
+        """Run a rollout at every point, under every condition. Ctrl-C keeps the finished rollouts.
 
         Args:
             points: the numbers of points of an equally spaced grid over one or two parameters: one for all or each.

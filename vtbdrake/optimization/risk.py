@@ -80,7 +80,7 @@ class CVaR(_Level):
         worst = np.sort(h)
         count = self.level * worst.size
         weights = np.clip(count - np.arange(worst.size), 0.0, 1.0)
-        counted = weights > 0.0  # What does not count may be infinite.
+        counted = weights > 0.0  # Values of weight zero may be infinite.
         return float(worst[counted] @ weights[counted] / count)
 
 

@@ -309,7 +309,7 @@ class Study:
         """Return the attributes of the study, see `set_attribute`; those of a point are `Trial.attributes`."""
         return self._file.attributes().get(None, {})
 
-    # -- what it is about
+    # -- description
 
     @property
     def path(self) -> Path | None:
@@ -345,10 +345,10 @@ class Study:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Return what describes the study: problem, solver, seed, versions, git revision, allowed code ``changes``."""
+        """Return the identity of the study: problem, solver, seed, versions, git revision, allowed code ``changes``."""
         return dict(self._meta)
 
-    # -- what it has found
+    # -- results
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -427,7 +427,7 @@ class Study:
         return pandas.DataFrame(self.to_dict(), index=pandas.RangeIndex(len(self.trials), name="number"))
 
     def summary(self) -> str:
-        """Return a text: what was done, what was found, and what went wrong."""
+        """Return a text with the progress, the results and the errors."""
         trials, outcomes = self.trials, self.rollouts
         methods = Counter(trial.method for trial in trials)
         lines = [

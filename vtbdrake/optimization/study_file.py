@@ -29,7 +29,7 @@ _APPLICATION = 0x56544253  # "VTBS"
 # Each table also has a last column, ``checksum``.
 _TABLES = {
     "meta": "key TEXT PRIMARY KEY, value TEXT",
-    # A rollout is there once, whatever asked for it, and how often.
+    # A rollout is stored once, even if several points ask for it.
     "rollouts": "point TEXT, condition INTEGER, h REAL, value REAL, measures TEXT, t_star REAL, end TEXT, "
     "message TEXT, wall_time REAL, finished TEXT",
     # Trials at positions below meta's ``first_position`` (0 if missing) were made by an earlier solver.
@@ -67,7 +67,7 @@ class Outcome:
 
     @classmethod
     def of(cls, result: RolloutResult) -> Outcome:
-        """Return what is kept of a result: everything but its trajectories."""
+        """Return the part of a result that is stored: everything but its trajectories."""
         return cls(**{field.name: getattr(result, field.name) for field in fields(cls)})
 
 
@@ -201,7 +201,7 @@ class StudyFile:
             try:
                 yield
             except BaseException:
-                if self._db.in_transaction:  # On a full disk SQLite has ended it by itself.
+                if self._db.in_transaction:  # On a full disk SQLite has already ended it.
                     self._db.execute("ROLLBACK")
                 raise
             self._db.execute("COMMIT")
@@ -258,7 +258,7 @@ class StudyFile:
                 with self._transaction():
                     self._insert("sessions", [(*begun, _now(), "; ".join(reason), *about)], instead="REPLACE")
 
-    # -- what is in it
+    # -- contents
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -529,7 +529,7 @@ def _sqlite_name(path: Path | None, *, new: bool) -> str:
 def _claim(path: Path | None) -> Iterator[None]:
     """Hold the lock of a study; the system releases it when the process dies.
 
-    The lock is a file of its own: closing any handle of the study itself would release SQLite's locks on it.
+    The lock is a separate file: closing any handle of the study itself would release SQLite's locks on it.
     """
     if path is None:
         yield

@@ -208,7 +208,7 @@ def find_events(content not None):
 
     Returns:
         By channel (bytes), the events in the order of the file as integers of shape (n, 4): number, time in
-        microseconds, begin and end of the data. And offset and kind of whatever is not an event.
+        microseconds, begin and end of the data. And offset and kind of all bytes that are not events.
     """
     cdef const unsigned char[::1] view = content
     cdef int64_t size = view.shape[0], at = 0, begin, end, following
@@ -230,7 +230,7 @@ def find_events(content not None):
             good = end <= size
         if not good or (end < size and (size - end < 4 or get_uint32(data + end) != _SYNC)):
             following = content.find(sync, at + 1)
-            # If an event lies within this one, its length is wrong; otherwise what follows it is damaged.
+            # If an event lies within this one, its length is wrong; otherwise the bytes after it are damaged.
             if not good or 0 <= following < end:
                 torn = following < 0 and (not whole or get_uint32(&header.sync) == _SYNC)
                 if len(damages) < MAX_DAMAGES:

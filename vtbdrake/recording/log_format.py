@@ -52,7 +52,7 @@ _MAX_COUNT = 1 << 52
 
 
 class LogError(ValueError):
-    """A file that is not a log of a control loop, or a log that does not fit what it is used for."""
+    """A file that is not a log of a control loop, or a log that does not fit its use."""
 
 
 def event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
@@ -158,7 +158,7 @@ def installed_versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class LogHeader:
-    """The first event of a log: what was recorded, and how it can be built again.
+    """The first event of a log: a description of the recorded loop, from which it can be built again.
 
     Attributes:
         version: version of the format.

@@ -53,7 +53,7 @@ _NO_EVENTS = np.empty((0, 4), np.int64)
 
 
 class Damage(NamedTuple):
-    """Unreadable bytes of a file: their offset, and what is wrong with them."""
+    """Unreadable bytes of a file: their offset and the kind of damage."""
 
     offset: int
     what: str
@@ -85,7 +85,7 @@ class LogEvents:
     """The events of an LCM log, damaged or not.
 
     Attributes:
-        damages: offset and kind of whatever is not an event.
+        damages: Offset and kind of all bytes that are not events.
         content: bytes of the file.
 
     Raises:
@@ -352,7 +352,7 @@ def _decoded(
 
 
 def _last_numbers(events: LogEvents, damages: list[Damage]) -> list[int]:
-    """Return the number of the last cycle that was recorded or lost, where the end of the log says so."""
+    """Return the number of the last cycle that was recorded or lost, if the end of the log is intact."""
     ends = [message for _, message in _decoded(events, END, lcmt_vtb_end, damages, events.places(END))]
     whole = [end.number for end in ends if zlib.crc32(end.encode()[:-4]) == end.crc & 0xFFFFFFFF]
     if len(whole) < len(ends):

@@ -114,7 +114,7 @@ class Recorder:
             self._message_event(STATE, lcmt_vtb_state(), **fields),
         ]
         if overwrite and self.path.is_file():
-            # A new file: whoever has mapped the old one keeps it.
+            # A new file: processes that have mapped the old one keep it.
             self.path.unlink()
         try:
             self.path.open("wb" if overwrite else "xb").close()
@@ -213,7 +213,7 @@ class Recorder:
     # -- begin and end
 
     def close(self) -> None:
-        """End the recording: write what is pending and count what is lost.
+        """End the recording: write the pending events and count the lost ones.
 
         Call it in the loop's thread, or after the loop.
         """

@@ -1,4 +1,4 @@
-"""Replay of a log: the DPS repeats, bit for bit, what it did when it was recorded."""
+"""Replay of a log: the DPS repeats its recorded behaviour bit for bit."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class ReplayReport:
         max_difference: largest absolute difference by vector actuator signal; inf where an actuator command is missing
             on one side or not finite.
         digests: number of digests of the DPS's state that were compared.
-        versions: whatever runs here in another version than was recorded; bits may differ for that reason.
+        versions: The software whose version differs from the recorded one; results may differ for that reason.
         times: times of the DPS at the ends of the cycles, in seconds, (n,).
         actuation: actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
         errors: exceptions of the DPS, by the number of the cycle.
@@ -202,7 +202,7 @@ class _Replay:
         self._handlers: dict[str, Callable[[Mapping[str, Any]], None]] = {
             WRITE: self._write,
             SWITCH: self._switch,
-            RESET: lambda values: None,  # The guards are not replayed: what was sent is in the log.
+            RESET: lambda values: None,  # The guards are not replayed: the sent actuator commands are in the log.
             RESULT: self._deliver,
         }
         self.count = n = int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)

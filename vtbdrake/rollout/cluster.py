@@ -201,7 +201,7 @@ class _Children:
     """The child processes that run the rollouts of this Dask worker, one for each of its threads.
 
     Attributes:
-        users: the number of tasks that the worker knows.
+        users: The number of tasks that the worker holds.
     """
 
     def __init__(self) -> None:

@@ -99,7 +99,7 @@ class _Job:
 
 
 class ThreadExecutor(Executor):
-    """Threads that share one Diagram, each with a Context of its own.
+    """Threads that share one Diagram, each with its own Context.
 
     The fastest where all systems are Drake's: a system in Python makes the threads wait for each other.
 

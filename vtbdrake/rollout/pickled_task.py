@@ -82,7 +82,7 @@ def pack(point: Mapping[str, Any]) -> bytes:
 
 
 def unpack(content: bytes) -> Any:
-    """Return what was pickled in another process.
+    """Return an object that was pickled in another process.
 
     Raises:
         WorkerError: this process cannot import what the content needs.

@@ -202,7 +202,7 @@ def _terminated(status: SimulatorStatus | None) -> bool:
 
 
 class _FailuresAsOutcomes:
-    """Turns what comes out of a simulation that goes wrong into SimulationError.
+    """A context manager that turns the exceptions of a failing simulation into SimulationError.
 
     A failed assertion inside Drake arrives as SystemExit.
     """

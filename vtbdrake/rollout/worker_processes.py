@@ -121,7 +121,7 @@ class ProcessExecutor(Executor):
                     else:
                         error = error or reply
                 if error is None:
-                    # Workers go on while the caller uses what is finished.
+                    # Workers go on while the caller uses the finished results.
                     self._hand_out(task, waiting, points)
                 left -= len(finished)
                 yield from finished

@@ -135,7 +135,7 @@ def _check_entries(archive: zipfile.ZipFile) -> None:
 
 
 def _array(data: bytes) -> np.ndarray:
-    """Return the array of an entry, unless its data are not what its header declares.
+    """Return the array of an entry, after a check of its data against its header.
 
     Raises:
         ValueError: the data are not the array that their header declares.

@@ -278,7 +278,7 @@ class DelayState(AbstractState):
         arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
             parts = self._encode(index, self._system.get_output_port().Eval(own))
-            # The next step overwrites what is shown.
+            # The next step overwrites the array.
             arrays |= {name: np.array(array) for name, array in parts.items()}
             self._step(own)
         return arrays

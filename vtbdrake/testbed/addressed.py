@@ -42,7 +42,7 @@ class _CenicSimulator(Simulator):
 
 
 class AddressedDiagram:
-    """A Diagram, what lies in its Context by address, and how it is simulated.
+    """A Diagram with addresses for the contents of its Context, and with the settings of its simulation.
 
     Attributes:
         diagram: the input and output ports of it carry the DPS's signals.
@@ -134,7 +134,7 @@ class AddressedDiagram:
         simulator.set_target_realtime_rate(pace)
 
     def fork(self, simulator: Simulator) -> Snapshot:
-        """Return s(t) of a running simulation so that what is simulated from it is exactly what follows.
+        """Return s(t) of a running simulation, from which a new simulation continues exactly as the running one.
 
         An integrator with error control remembers its last step, which no snapshot can hold: rollouts from a plain
         `snapshot` begin with a first step of another size, and differ by about the accuracy asked for, more where
@@ -151,7 +151,7 @@ class AddressedDiagram:
             ValueError: it is no Simulator, or one of another Diagram.
         """
         if not isinstance(simulator, Simulator):
-            raise ValueError(f"what is forked is a simulator, made by testbed.simulator(), not {simulator!r}")
+            raise ValueError(f"fork a simulator made by testbed.simulator(), not {simulator!r}")
         if simulator.get_system() is not self.diagram:
             raise ValueError("the simulator to be forked is one of another Diagram: make it by testbed.simulator()")
         snapshot = self.snapshot(simulator.get_context())

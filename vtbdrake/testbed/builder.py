@@ -27,7 +27,7 @@ S = TypeVar("S", bound=System)
 
 
 # Systems of Drake that copies of a context cannot continue, and what to use instead.
-_LISTENS = "which listens to what is outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
+_LISTENS = "which receives data from outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
 _REFUSED = {
     "RandomSource": "whose generator no copy can continue: compute noise from (seed, stream, tick), as the sensors in "
     "vtbdrake.components do",
@@ -98,7 +98,7 @@ class VirtualTestbedBuilder:
             scene_graph_config: Drake's defaults if left out.
         """
         if self.plant is not None:
-            raise ValueError("the testbed has a plant already: add what is to touch its bodies to that one")
+            raise ValueError("the testbed has a plant already: add bodies in contact with its bodies to that plant")
         from pydrake.geometry import SceneGraphConfig
         from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 
@@ -272,7 +272,7 @@ class VirtualTestbedBuilder:
         paths: set[str] = set()
         for path, system in leaves(diagram):
             if path in paths:
-                raise ValueError(f"two systems of the testbed have the path {path}: rename one, or what it is part of")
+                raise ValueError(f"two systems of the testbed have the path {path}: rename one, or its parent")
             paths.add(path)
             kind = class_name(system)
             if kind in _REFUSED:

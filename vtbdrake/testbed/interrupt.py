@@ -43,7 +43,7 @@ class Interruptible:
             raise
 
     def check(self) -> None:
-        """Raise what the handler has raised, if anything: to be called from time to time in what takes long."""
+        """Raise the exception of the signal handler, if any; long operations call this from time to time."""
         if self._raised is not None:
             raise self._raised
 

@@ -79,7 +79,7 @@ class Predictor:
 
     def set_time(self, step: int) -> None:
         """Go on from the present state at the beginning of step ``step``, counted from 0."""
-        # A multiple of the period, as on the machine: a rounding error would miss what is due at that instant.
+        # A multiple of the period, as on the machine: a rounding error would miss the events of that instant.
         self._context.SetTime(step * self._period)
         # Initialization events belong to the beginning of a world.
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))

@@ -203,7 +203,7 @@ class Scenario(ABC):
         return class_name(type(self))
 
     def record(self) -> dict[str, Any]:
-        """Return what identifies the scenario, as plain data: its name and all fields, nested ones by dotted names."""
+        """Return the identity of the scenario as plain data: its name and all fields, nested ones by dotted names."""
         values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items()}
         flat = {key: value for key, value in _flat(values) if key not in _NO_IDENTITY}
         return {"scenario": self.name(), **flat}
@@ -315,7 +315,7 @@ _SCALARS: dict[str, type] = {"bool": bool, "int": int, "float": float, "str": st
 
 
 def _scalar_fields(owner: Any, prefix: str = "") -> Iterator[tuple[str, Any, tuple[type, ...]]]:
-    """Yield (dotted name, owner, types) of every field of a plain type, in ``owner`` and in what it holds."""
+    """Yield (dotted name, owner, types) of every field of a plain type, in ``owner`` and in its nested dataclasses."""
     for name, declared in field_types(owner).items():
         value = getattr(owner, name)
         if field_types(value):

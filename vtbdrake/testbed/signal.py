@@ -48,7 +48,7 @@ class Signal:
     default: ArrayLike | None = None
 
     def __repr__(self) -> str:
-        """Show what differs from the defaults."""
+        """Show the fields that differ from the defaults."""
         shown = [repr(self.name)]
         for item in fields(self)[1:]:
             value = getattr(self, item.name)

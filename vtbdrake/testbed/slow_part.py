@@ -28,7 +28,7 @@ class SlowPartError(ValueError):
 
 @dataclass(frozen=True)
 class SlowFunction:
-    """A slow part's function with what turns its arguments and results into arrays.
+    """A slow part's function with the codecs that turn its arguments and results into arrays.
 
     The arrays of a value are named ``<name>`` or, where its codec makes several, ``<name>.<part>``.
 

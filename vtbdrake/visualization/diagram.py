@@ -75,7 +75,7 @@ def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Str
         dps_parts=tuple(str(s.get_name()) for s in dps.GetSystems()) if isinstance(dps, Diagram) else (),
         world=_world(testbed),
         sense=tuple(
-            # Input 0 of a switch is its selector, input 1 what it takes while it stands on sim.
+            # Input 0 of a switch is its selector, input 1 its input in position sim.
             Wire(s, positions["sense"][s.name], ends.source(f"{T_SENSE}{s.name}", 1))
             for s in interface.sense
         ),

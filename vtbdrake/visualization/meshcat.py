@@ -235,7 +235,7 @@ class _Actor:
             visualizer.ForcedPublish(visible)
 
     def _paint(self, testbed: VirtualTestbed, plant: MultibodyPlant) -> None:
-        # This testbed serves nothing but the recording: what its SceneGraph hands to new contexts may be changed.
+        # This testbed serves nothing but the recording: the default geometry of its SceneGraph may be changed.
         scene_graph = testbed.scene_graph
         assert scene_graph is not None
         inspector, source = scene_graph.model_inspector(), plant.get_source_id()

@@ -459,7 +459,7 @@ def plot_history(study: Study) -> Figure:
         if points.kept:
             numbers = np.array([trial.number for trial in points.kept])
             best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.kept, quality))
-            # What was best at the end stays so up to the last point.
+            # The last best value holds up to the last point.
             axes.plot(
                 [*numbers, trials[-1].number],
                 [*best, best[-1]],

@@ -1,4 +1,4 @@
-"""Simulated actuators: what lies between a command and the torque that a joint feels."""
+"""Simulated actuators, which turn an actuator command into the torque on a joint."""
 
 from vtbdrake.components.actuators.joint_drives import JointDrives
 

@@ -77,7 +77,7 @@ def _compile(source: str, command: tuple[str, ...], library: Path) -> None:
             f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc), name "
             "yours in the environment variable CC, or leave out compile=True."
         )
-    # Nobody else may write there: what lies in the folder is going to be executed.
+    # No other user may write there: the files in the folder are executed.
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, whole_file(library) as partial:
         c_file = Path(folder) / "function.c"

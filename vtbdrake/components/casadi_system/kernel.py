@@ -30,7 +30,7 @@ class Kernel:
     """y(z), for z of shape (n,) and y of shape (m,).
 
     CasADi gives up the interpreter lock while it evaluates, and a system is evaluated in several threads at once: so
-    every thread has arrays of its own.
+    every thread has its own arrays.
 
     Attributes:
         value: y where z is the blocks one after the other. The thread's next call overwrites it.

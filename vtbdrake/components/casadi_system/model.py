@@ -42,7 +42,7 @@ class Result:
 
 
 class Model:
-    """The functions of a system, whatever its scalar type.
+    """The functions of a system, independent of its scalar type.
 
     Attributes:
         shapes: (rows, columns) of every argument and state.
@@ -156,7 +156,7 @@ class Model:
         always: tuple[str, ...] = (),
     ) -> Result:
         """Return ``y`` as a kernel of the arguments that occur in it and of those in ``always``."""
-        # Which symbols occur, not Function.jac_sparsity: that leaves out what has no derivative, such as an index.
+        # Which symbols occur, not Function.jac_sparsity: it leaves out symbols without a derivative, such as an index.
         names = {f"a{k}": name for k, name in enumerate(symbols)}
         # Of a vector a1, the entries are a1_0, a1_1, ...
         used = {*always, *(names[symbol.name().partition("_")[0]] for symbol in casadi.symvar(y))}

@@ -18,7 +18,7 @@ _KEPT = 128
 def normal_noise(size: int, *, seed: int, stream: int, tick: int, channel: int = 0) -> NDArray[np.float64]:
     """Return ``size`` independent samples of N(0, 1), read-only.
 
-    Every ``channel`` of a stream has noise of its own, and so has every ``size``.
+    Every ``channel`` and every ``size`` of a stream has different noise.
 
     The generator is Philox 4x64, a function of a key and a counter (Salmon et al., "Parallel Random Numbers: As Easy as
     1, 2, 3", 2011). The key is (seed, stream). Ticks are drawn in batches, whose number is the counter's second word,

@@ -1,4 +1,4 @@
-"""Sensors of what joints transmit: force/torque sensors, and torque sensors in the joints."""
+"""Sensors of the forces in joints: force/torque sensors, and torque sensors in the joints."""
 
 from __future__ import annotations
 

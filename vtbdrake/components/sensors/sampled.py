@@ -93,7 +93,7 @@ class SampledSensor(LeafSystem):
 
     @abstractmethod
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        """Return the measurement without noise. ``state`` takes what has to be remembered until the next one."""
+        """Return the measurement without noise. Write memory for the next measurement to ``state``."""
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)

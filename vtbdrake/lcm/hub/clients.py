@@ -63,7 +63,7 @@ class ClientConnection:
         return self.queued + self.reader.held
 
     def acknowledge(self) -> None:
-        """Acknowledge what was received at once.
+        """Acknowledge the received data at once.
 
         liblcm writes a message in five pieces with Nagle's algorithm, which holds back the second piece until the
         first is acknowledged (40 ms later by default). The kernel resets the option, so every piece needs a call.

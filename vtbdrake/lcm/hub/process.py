@@ -1,4 +1,4 @@
-"""A hub in a process of its own."""
+"""A hub in a separate process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class HubError(RuntimeError):
 
 
 class Hub:
-    """A hub in a process of its own, which ends with `close`, or with the process that started it.
+    """A hub in a separate process, which ends with `close`, or with the process that started it.
 
     ::
 

@@ -417,7 +417,7 @@ class HubServer:
             self._router.remove(client, reason)
 
     def _discount(self, seconds: float) -> None:
-        """Shift all time limits by a delay of the hub, during which it did not read what clients sent."""
+        """Shift all time limits by a delay of the hub, during which it did not read from clients."""
         self._router.extend_leases(seconds)
         for client in self._clients.values():
             client.connected_at += seconds

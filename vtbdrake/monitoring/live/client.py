@@ -238,7 +238,7 @@ def _samples(
 
 
 class LiveWatch:
-    """Keeps the newest watched values for plotting; a thread of its own receives them.
+    """A buffer of the newest watched values for plotting; a separate thread receives them.
 
     ::
 

@@ -1,4 +1,4 @@
-"""The server of live values: it talks to the clients on the bus, in a worker process of the loop.
+"""The server of live values: it communicates with the clients on the bus, in a worker process of the loop.
 
 The loop sends frames of two kinds: `VALUES`, many and quick, and pickled outcomes of requests. The server sends it
 pickled requests.

@@ -1,4 +1,4 @@
-"""The service of live values in the loop's process: it sets and reads what clients ask for, a little in every cycle."""
+"""The service of live values in the loop's process: it answers the requests of clients, a few in every cycle."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class LiveService:
         with LiveService(runtime, "tcpq://127.0.0.1:7700"):
             runtime.run()
 
-    A worker process talks to the bus (see `messages`). The loop takes at most one valid request per cycle, after the
-    actuator commands have left; values that are set take effect in the next cycle, as by `Runtime.write`. Values are
-    read immediately, for ``budget`` seconds of computing at most; the rest waits for the next cycle. Reading changes
-    nothing of what the DPS does.
+    A worker process is connected to the bus (see `messages`). The loop takes at most one valid request per cycle, after
+    the actuator commands have been sent; values that are set take effect in the next cycle, as by `Runtime.write`.
+    Values are read immediately, for ``budget`` seconds of computing at most; the rest waits for the next cycle. Reading
+    does not change the behaviour of the DPS.
 
     Args:
         runtime: The loop; the service becomes one of its watchers.
@@ -85,7 +85,7 @@ class LiveService:
         self.close()
 
     def __call__(self, cycle: Cycle) -> None:
-        """Take one request and read what is due, as a watcher of the runtime."""
+        """Take one request and read the values that are due; the runtime calls it in every cycle."""
         self._requests += self._worker.take()
         if self._requests:
             self._begin(*pickle.loads(self._requests.popleft()))

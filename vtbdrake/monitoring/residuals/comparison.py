@@ -1,4 +1,4 @@
-"""Comparison of what a machine measures with what its model predicts, window by window."""
+"""Comparison of the measurements of a machine with the predictions of its model, window by window."""
 
 from __future__ import annotations
 

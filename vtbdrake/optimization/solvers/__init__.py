@@ -59,7 +59,7 @@ def make_solver(
         objectives: how many values an evaluation has.
         constraints: how many violations an evaluation has.
         seed: of the solver's random numbers, in [0, 2^32).
-        budget: how many evaluations it may ask for; None: until it ends by itself, if it does.
+        budget: The largest number of evaluations; None: until the solver converges, if it does.
         start: where a local method starts; None: in the middle of the ranges.
         options: of the solver, as its class says.
 

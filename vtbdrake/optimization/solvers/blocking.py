@@ -27,7 +27,7 @@ class Stopped(Exception):  # noqa: N818
 
 
 class BlockingSolver(Solver):
-    """A method that runs from start to end in one call (`_solve`), in a thread of its own.
+    """A method that runs from start to end in one call (`_solve`), in a separate thread.
 
     Method and driver take turns, so that the points asked for do not depend on timing. When the solver is closed
     early, the callback raises `Stopped`, which SNOPT, IPOPT, NLopt and SciPy all survive: they clean up and return, and

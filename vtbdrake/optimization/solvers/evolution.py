@@ -70,7 +70,7 @@ class CmaEs(Solver):
             self._end(self._found, "converged" if self._found else "no point was found whose simulation succeeds")
             return []
         drawn = [self._strategy.ask() for _ in range(self.population)]
-        # With margin, each is a pair: the point to evaluate, and what was drawn before its integers were rounded.
+        # With margin, each is a pair: the point to evaluate, and the drawn point before its integers were rounded.
         pairs = drawn if self._counts.any() else [(x, x) for x in drawn]
         self._drawn = [raw for _, raw in pairs]
         return [self.search.point(self._decode(x)) for x, _ in pairs]

@@ -54,7 +54,7 @@ class Evaluation(PointValues):
 
     Attributes:
         point: s^0.
-        values: one number per objective, larger is better whatever the user's direction (a cost is negated); NaN if a
+        values: One number per objective; larger is better in every case (a cost is negated). NaN if a
             simulation failed.
         violations: one number per constraint, at most 0 where it holds; NaN if a simulation failed.
         gradient: of the first value, shape (n,), if the solver wants it.
@@ -256,7 +256,7 @@ class Solver(ABC):
         self.message = ""
         self._asked: list[Point] = []
         self._budget: float | None = search.budget
-        # Of the method's present batch: the points to be asked for yet, and what was told.
+        # The remaining points of the method's present batch, and the evaluations received for it.
         self._rest: list[Point] = []
         self._told: list[Evaluation] = []
         self._given: list[Evaluation] = []
@@ -293,7 +293,7 @@ class Solver(ABC):
 
         Raises:
             SolverError: the solver was not told yet of the points that it asked for before.
-            Exception: whatever the method itself raised.
+            Exception: Any error of the method.
         """
         if self._asked:
             raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
