@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.runtime import Runtime
+from vtbdrake.control import Runtime, SimulatedClock
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake_diagrams.answers import Answer
@@ -88,66 +87,55 @@ def control(full: bool) -> Answer:
 def _trials(law: str, full: bool) -> Trials:
     scenario = trial_scenario(law)
     testbed, alone = scenario.build(), DpsAlone(scenario)
-    context = testbed.default_context()
-    testbed.write(context, DURATIONS)
+    by_the_clock = replace(scenario.deployment(), pace="")
+    sent_by_testbed: list[NDArray[np.float64]] = []
+    sent_by_dps: list[NDArray[np.float64]] = []
     with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
-        bridge = _bridge(scenario, hub)
-        simulation = Runtime(testbed, bridge, context=context, clock=SimulatedClock())
-        simulated = run_trial(simulation)
-        bridge.close()
+        with scenario.deploy(
+            hub.url, target=testbed, values=DURATIONS, deployment=by_the_clock, clock=SimulatedClock()
+        ) as simulation:
+            simulated = run_trial(simulation)
         stripped = alone.continue_from(testbed, simulation.context)
-        with _Real(scenario, hub, testbed, simulation.context) as whole:
-            whole.loop.run(until=Trial(whole.loop, PROGRAM), cycles=None if full else COMPARED)
-        with _Real(scenario, hub, alone, stripped) as real:
-            track = run_trial(real.loop)
-    compared = min(len(whole.commands), len(real.commands))
+        with _commanding(scenario, hub, testbed, simulation.context, sent_by_testbed) as loop:
+            loop.run(until=Trial(loop, PROGRAM), cycles=None if full else COMPARED)
+            latched = loop.guards.latched
+        with _commanding(scenario, hub, alone, stripped, sent_by_dps) as loop:
+            track = run_trial(loop)
+            latched += loop.guards.latched
+    compared = min(len(sent_by_testbed), len(sent_by_dps))
     return Trials(
         simulated,
         track,
         compared,
-        np.array_equal(whole.commands[:compared], real.commands[:compared]),
-        "; ".join(fault.reason for fault in (*whole.loop.guards.latched, *real.loop.guards.latched)),
+        np.array_equal(sent_by_testbed[:compared], sent_by_dps[:compared]),
+        "; ".join(fault.reason for fault in latched),
     )
 
 
-def _bridge(scenario: ManipulatorScenario, hub: Hub) -> Bridge:
-    bridge = protocol_of(scenario).bridge(scenario.interface(), hub.url)
-    bridge.open()
-    return bridge
+@contextmanager
+def _commanding(
+    scenario: ManipulatorScenario,
+    hub: Hub,
+    target: VirtualTestbed | DpsAlone,
+    context: Context,
+    sent: list[NDArray[np.float64]],
+) -> Iterator[Runtime]:
+    """Start a machine and a loop in lock-step with it, on real; collect the torques in ``sent``, shape (7,) each."""
 
+    def collect(cycle: Cycle) -> None:
+        sent.append(cycle.verdict.actuation["joint_torque"].copy())
 
-class _Real:
-    """A machine and a loop in lock-step with it, whose switches are on real.
-
-    Attributes:
-        loop: The loop; the machine waits for its next actuator command.
-        commands: All torques that were sent, shape (7,) each.
-    """
-
-    def __init__(
-        self, scenario: ManipulatorScenario, hub: Hub, target: VirtualTestbed | DpsAlone, context: Context
-    ) -> None:
-        self.commands: list[NDArray[np.float64]] = []
-        self._bridge = _bridge(scenario, hub)
-        self._machine = MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED)
-        deployment = scenario.deployment().in_lock_step("wrench", wait=PATIENCE)
-        self.loop = deployment.runtime(target, self._bridge, context=context, watchers=(self._collect,))
-
-    def __enter__(self) -> _Real:
-        self._machine.start()
+    deployment = scenario.deployment().in_lock_step("wrench", wait=PATIENCE)
+    with (
+        scenario.deploy(hub.url, target=target, context=context, deployment=deployment, watchers=(collect,)) as loop,
+        MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED),
+    ):
         deadline = time.monotonic() + PATIENCE
-        while not all(received.count for received in self._bridge.sensed.values()):
+        while not all(received.count for received in loop.bridge.sensed.values()):
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the machine has not sent its state within {PATIENCE:g} s")
-            self._bridge.poll(1.0)
-        self.loop.switch("real")
+            loop.bridge.poll(1.0)
+        loop.switch("real")
         # The first actuator command begins the exchange.
-        self.loop.cycle()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._machine.close()
-        self._bridge.close()
-
-    def _collect(self, cycle: Cycle) -> None:
-        self.commands.append(cycle.verdict.actuation["joint_torque"].copy())
+        loop.cycle()
+        yield loop

@@ -13,11 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from vtbdrake.cli.output import table
-from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.realtime import RealTime
-from vtbdrake.control.runtime import Runtime
+from vtbdrake.control import RealTime, Runtime, SimulatedClock, SwitchRefusedError
 from vtbdrake.control.stepping import Cycle
-from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub

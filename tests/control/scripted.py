@@ -22,6 +22,8 @@ PERIOD = 0.001
 class ScriptedBridge(Bridge):
     """Delivers what ``sensors(t)`` says at every poll, and keeps what is published, with the time."""
 
+    real_time = False
+
     def __init__(self, interface: Interface, clock: Clock, sensors: Callable[[float], Mapping[str, Any]]) -> None:
         self.interface = interface
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}

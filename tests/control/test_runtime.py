@@ -566,6 +566,19 @@ def test_invalid_settings_are_rejected(settings, message):
         Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)
 
 
+def test_paced_loop_on_simulated_clock_is_rejected():
+    class Network(ScriptedBridge):
+        real_time = True
+
+    scenario, clock = ServoScenario(), SimulatedClock()
+    bridge = Network(scenario.interface(), clock, still)
+    with pytest.raises(
+        ValueError, match=r'SimulatedClock stands still: let the clock begin .* \(Deployment\(pace=""\)'
+    ):
+        Runtime(scenario.build(), bridge, clock=clock, pace="position")
+    assert Runtime(scenario.build(), bridge, clock=clock).pace is None
+
+
 def test_nan_as_duration_is_rejected():
     runtime, _, _ = make()
     with pytest.raises(ValueError, match="a number of seconds, not for nan"):

@@ -8,7 +8,7 @@ import pytest
 
 from tests.rollout.scenarios import HANG, KILL, TreacherousScenario
 from tests.testbeds import PendulumScenario
-from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, processes
+from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, worker_processes
 
 THETA = "sim.sys.Pendulum.theta.position"
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -19,7 +19,7 @@ TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
 @pytest.fixture
 def always(monkeypatch):
     """However long rollouts take on this computer."""
-    monkeypatch.setattr(processes, "_BRIEF", inf)
+    monkeypatch.setattr(worker_processes, "_BRIEF", inf)
 
 
 def _watched(executor, task, points):
@@ -45,7 +45,7 @@ def test_a_worker_has_its_next_rollout_before_it_has_finished_the_last(always):
 
 
 def test_long_rollouts_go_to_whoever_is_free(monkeypatch):
-    monkeypatch.setattr(processes, "_BRIEF", 0.0)
+    monkeypatch.setattr(worker_processes, "_BRIEF", 0.0)
     with ProcessExecutor(1) as executor:
         assert _watched(executor, TASK, _points(5))[1] == 1
 

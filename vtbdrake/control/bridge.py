@@ -36,6 +36,7 @@ class Bridge(ABC):
         reported: for the actuator signals that the machine reports: the received command that acts there, by name.
         tap: called with channel and bytes of every message that was received or sent, by a bridge that has channels. It
             must not raise, and costs the loop's time.
+        real_time: whether `poll` waits in real time; False for a bridge of tests that advances a `SimulatedClock`.
     """
 
     interface: Interface
@@ -44,6 +45,7 @@ class Bridge(ABC):
     reported: Mapping[str, ReceivedSignal] = MappingProxyType({})
     channels: Mapping[str, str] = MappingProxyType({})
     tap: Callable[[str, bytes], None] | None = None
+    real_time: bool = True
 
     @abstractmethod
     def open(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Self
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.clock import Clock, WallClock
+from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
@@ -76,7 +76,7 @@ class Runtime(Stepped):
         slow_parts: the slow parts of the DPS, with their statistics.
 
     Raises:
-        ValueError: an argument does not fit the target or the period.
+        ValueError: an argument does not fit the target or the period, or a paced loop has a `SimulatedClock`.
     """
 
     def __init__(
@@ -101,6 +101,11 @@ class Runtime(Stepped):
             raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
         if not (0.0 < patience < inf):
             raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {patience}")
+        if pace is not None and bridge.real_time and isinstance(clock, SimulatedClock):
+            raise ValueError(
+                f"a loop paced by {pace!r} waits in real time, while a SimulatedClock stands still: "
+                'let the clock begin the cycles (Deployment(pace="") or Runtime(pace=None)), or use a WallClock'
+            )
         self.continuity = dict(continuity or {})
         check_continuity(target.interface, self.continuity)
         super().__init__(target, bridge, period=period, context=context)
