@@ -291,7 +291,7 @@ def _bobyqa(record: _Record, case: Case, seed: int, budget: int) -> None:
 
 
 def _cmaes(record: _Record, case: Case, seed: int, budget: int) -> None:
-    """The package cmaes; where it has converged, it starts anew at a random point with twice the population."""
+    """The package cmaes; where it has converged, it restarts at a random point with twice the population."""
     from cmaes import CMA
 
     size = len(case.space)

@@ -94,7 +94,7 @@ def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: i
 
 
 def _round_trips(turn: Callable[[], None], messages: int) -> list[float]:
-    """Seconds that turns take, each a publication and what comes back, one after another."""
+    """Return the durations of consecutive round trips in seconds."""
     times = []
     for _ in range(messages):
         begin = time.perf_counter()
@@ -116,7 +116,7 @@ def _turn(bus: lcm.LCM, channel: str) -> Callable[[], None]:
 @contextlib.contextmanager
 def _own_client(url: str) -> Iterator[Callable[[], None]]:
     with contextlib.closing(TcpqConnection(url, {url: lambda *_: None}, 1e-3 * TIMEOUT_MS)) as connection:
-        messages = [(url, bytes(SIZE))]  # a channel that nobody else hears
+        messages = [(url, bytes(SIZE))]  # a channel without another subscriber
 
         def turn() -> None:
             connection.publish(messages)

@@ -84,7 +84,7 @@ def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
     """Missed deadlines of our loop, n, and of a bare one in C at the same priority, m, in turns, while hub and machine
     run: (n + 1) / (m + 1), both for 10,000 cycles.
 
-    The 1 stands for the miss that may just not have been seen, and keeps the ratio finite; two loops without any miss
+    The 1 accounts for a miss that was just not observed, and keeps the ratio finite; two loops without any miss
     come out at 1. By the rule of both, a deadline is missed if it passes before the cycle of an earlier one has ended.
     For ours that is wake-up, step and all the rest; the C loop only wakes up.
     """
@@ -208,9 +208,9 @@ def _echo(url: str) -> Iterator[lcm.LCM]:
     with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:
         try:
             _await(bus)
-            # It stands for a machine, which has another processor than the controller that starts it.
+            # It represents a machine, which has another processor than the controller that starts it.
             os.sched_setaffinity(process.pid, range(os.cpu_count() or 1))
-            with suppress(PermissionError):  # Then nobody has it; `Rig.granted` tells.
+            with suppress(PermissionError):  # Then it is not granted; see `Rig.granted`.
                 os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
             yield bus
         finally:

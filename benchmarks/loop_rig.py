@@ -42,7 +42,7 @@ class TimedRuntime(Runtime):
     Attributes:
         overheads: of each cycle, from its call to its return, less the DPS's step, in seconds.
         commanded: from each cycle's deadline until its commands had left, in seconds.
-        lateness: from each cycle's deadline to its end, when all who watch had their turn, in seconds.
+        lateness: from each cycle's deadline to its end, after all watchers were called, in seconds.
         worked: processor time of the loop's thread in all those cycles, and while it waited for them, in seconds.
     """
 
@@ -106,12 +106,12 @@ class Rig:
         return runtime.statistics.misses - missed
 
     def drain(self) -> None:
-        """Takes in what came while somebody else had his turn, until no more comes than the machine tells now."""
+        """Receive messages until none arrives for a quarter of a period."""
         while self.bridge.poll(PERIOD / 4):
             pass
 
     def granted(self) -> str:
-        """Who runs at which priority, to be read."""
+        """Return a text with the scheduling priorities of hub, machine and controller."""
         pids = {"hub": self.hub.pid, "machine": self.machine.pid, "controller": 0}
         refused = [grant.request for grant in self.real_time.grants if not grant.granted]
         priorities = ", ".join(f"{name} {_priority(pid)}" for name, pid in pids.items())

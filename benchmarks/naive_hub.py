@@ -14,7 +14,7 @@ U32 = struct.Struct(">I")
 
 
 class NaiveHub:
-    """Relays to everybody who subscribed, one after another."""
+    """A hub that relays a message to its subscribers one after another."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))

@@ -20,7 +20,7 @@ from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
 
 WATCHED = ("dps.impl.torque", "dps.env.joint_position", "dps.env.contact_wrench")
-PATIENCE = 30.0  # s, until somebody watches
+PATIENCE = 30.0  # s, to wait for a watcher
 
 _WATCH = """
 import sys
@@ -99,7 +99,7 @@ def _watch_and_record(stack: ExitStack, rig: Rig, runtime: Runtime, path: Path) 
     # Who asks is answered by a loop that runs.
     runtime.run(until=lambda: service.watches > 0, seconds=PATIENCE)
     if not service.watches:
-        raise TimeoutError(f"nobody watches after {PATIENCE} s")
+        raise TimeoutError(f"no watcher after {PATIENCE} s")
     recorder = stack.enter_context(Recorder(runtime, path))
     stack.callback(_check_complete, recorder)
 

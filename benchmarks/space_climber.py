@@ -23,7 +23,7 @@ def testbed_overhead(repeats: int = 20, chunk: float = 0.5) -> Benchmark:
     """The testbed against the same systems wired by hand in plain Drake, same integrator, 15 s of walking.
 
     The machine's speed drifts within a rollout: both walk side by side, in turns of ``chunk`` simulated seconds, and
-    each turn is held against its neighbour. Where their memory happens to lie counts for a percent: both are built anew
+    each turn is held against its neighbour. Where their memory happens to lie counts for a percent: both are rebuilt
     for every rollout, the one or the other first.
     """
     scenario = SpaceClimberScenario()

@@ -49,7 +49,7 @@ def _overhead(name: str, executor: Executor, *, rollouts: int, repeats: int) -> 
     not drowned. Both do the same points, one rollout at a time: two workers would hide the one's overhead behind the
     other's rollout. A process still hides some: it has its next point before it has finished the last, and what this
     process does meanwhile costs no time if there is a core for it. Points that are asked for one by one gain nothing
-    from that; what the executor adds to one of them is told, too.
+    from that; the overhead of the executor for one of them is printed, too.
 
     The points are a Sobol design; the time that the solver itself takes for them, asked and told as the study does it,
     is measured apart and subtracted. The executor has started its worker and built its testbed before. All that `run`
