@@ -19,13 +19,14 @@ _PROGRAM = "import time; begin = time.perf_counter(); {}; print(time.perf_counte
 EVERYTHING = "from vtbdrake import *"
 
 
-def import_time(repeats: int = 9, longer: int = 3) -> list[Benchmark]:
+def import_time(repeats: int = 9, longer: int = 3, warm_up: int = 1) -> list[Benchmark]:
     """``import vtbdrake`` against ``import pydrake``; and, printed only, all public names against the parts of pydrake
     that they stand on, and against ``import pydrake.all``.
 
     Args:
         repeats: of the first, which takes the shortest time.
         longer: repeats of the others.
+        warm_up: imports of each that are not counted.
     """
     parts = f"import {', '.join(pydrake_modules())}"
     comparisons = {
@@ -35,7 +36,7 @@ def import_time(repeats: int = 9, longer: int = 3) -> list[Benchmark]:
     }
     rows = []
     for name, (ours, theirs, goal, times) in comparisons.items():
-        a, b = interleaved_values(partial(timed, ours), partial(timed, theirs), repeats=times)
+        a, b = interleaved_values(partial(timed, ours), partial(timed, theirs), repeats=times, warm_up=warm_up)
         against = theirs if theirs != parts else "import of the modules of pydrake that vtbdrake loads"
         note = f"{ours}: {spread(a)}; {against}: {spread(b)}"
         rows.append(

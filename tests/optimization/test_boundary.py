@@ -227,7 +227,7 @@ def _swing(**changes):
         "scenario": PendulumScenario(),
         "parameters": [Parameter(OMEGA, 0.0, 8.0)],
         "quality": Quality(abs, THETA),
-        "horizon": 2.0,
+        "horizon": 1.0,
         "threshold": 1.0,
         "sample_period": 0.01,
         "conditions": [{DAMPING: 0.0}],

@@ -220,7 +220,7 @@ def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
     path = tmp_path / "killed.db"
     clock = random.Random(1)
     counts = [0]
-    for _ in range(5):
+    for _ in range(3):
         process = subprocess.Popen(
             [sys.executable, "-m", "tests.optimization.studies", str(path), executor],
             cwd=ROOT,
