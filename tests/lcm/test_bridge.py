@@ -230,7 +230,7 @@ def test_invalid_command_withholds_its_whole_message(hub: Hub, value: object, re
         heard = peer.hear(2)
     assert [command(data)[1].tolist() for _, data in heard[1:]] == [[1.0] * 7]
     assert arm.sent["position"].withheld == {reason: 1}
-    assert arm.sent["torque"].withheld == {"companion": 1}
+    assert arm.sent["torque"].withheld == {"same message": 1}
 
 
 def test_unknown_actuator_signal_is_an_error() -> None:

@@ -293,7 +293,7 @@ class SentSignal:
     Attributes:
         count: how many actuator commands were sent.
         withheld: how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its
-            message needs another signal), ``companion`` (another signal of its message was at fault), ``encode``,
+            message needs another signal), ``same message`` (another signal of its message was at fault), ``encode``,
             ``no bus`` (lost, or it takes nothing at present), ``refused`` (the hub protects the channel for another
             client; counted from the hub's first message about it).
     """
@@ -349,7 +349,7 @@ class ChannelWriter:
             except (Exception, SystemExit):
                 faults = dict.fromkeys(values, "encode")
         for name in values:
-            self._sent[name].record(faults.get(name, "companion"))
+            self._sent[name].record(faults.get(name, "same message"))
         return None
 
 
