@@ -41,8 +41,16 @@ def user_types(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
     finally:
         sys.path.remove(str(folder))
 
+
 # Files with few but long tests begin first, so that in the end no worker computes alone.
-LONG = ("test_docs.py", "test_controller.py", "test_payload.py", "test_packaging.py", "test_study.py", "test_cluster.py")
+LONG = (
+    "test_docs.py",
+    "test_controller.py",
+    "test_payload.py",
+    "test_packaging.py",
+    "test_study.py",
+    "test_cluster.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

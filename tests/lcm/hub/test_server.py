@@ -36,7 +36,7 @@ from tests.lcm.hub.clients import (
     wait_until,
 )
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.lcm.connections import LcmLink
+from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, HubConfig, server
 from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
@@ -528,3 +528,19 @@ def test_config_out_of_range_is_an_error(fields, message: str) -> None:
     with pytest.raises(ValueError) as error:
         HubConfig(**fields)
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize("stamped", [False, True], ids=["shortcut", "tcp"])
+def test_last_message_before_closing_arrives(hub: Hub, stamped: bool) -> None:
+    listener, flooder = Client(hub.url, "LAST"), Client(hub.url)
+    expected = [b"%d" % number for number in range(200)]
+    for data in expected:
+        # It closes with unread messages, as a controller does that ends; the hub may send before it reads.
+        connection = TcpqConnection(hub.url, {"FLOOD": lambda *_: None}, 30.0, stamped=stamped)
+        for _ in range(20):
+            flooder.publish("FLOOD")
+        connection.publish([("LAST", data)])
+        connection.close()
+        flooder.publish("FLOOD")
+    listener.wait(lambda: len(listener.received) == len(expected))
+    assert listener.data("LAST") == expected

@@ -41,6 +41,7 @@ class ClientConnection:
         self.awaits_room = False  # whether the hub waits until the socket accepts more
         self.queued = 0  # bytes of the backlog
         self.closed = False
+        self.reads_no_more = False  # it has closed, and what it had sent before is still to be read
         self._max_queue = max_queue
         self._queue: deque[bytes | bytearray] = deque()
         self._offset = 0  # bytes of the first queued message that have been sent
@@ -81,7 +82,7 @@ class ClientConnection:
             OSError: The connection is lost.
         """
         sent = 0
-        if not self._queue:
+        if not self._queue and not self.reads_no_more:
             data = messages[0] if len(messages) == 1 else b"".join(messages)
             sent = self._send(data)
             if sent == len(data):
@@ -93,6 +94,8 @@ class ClientConnection:
             messages = messages[complete:]
             self.progressed_at = now
             self._offset = sent
+        if self.reads_no_more:
+            return 0
         self._queue.extend(messages)
         self.queued += sum(map(len, messages)) - sent
         oldest = 1 if self._offset else 0  # a message that is partly sent must be completed
@@ -128,10 +131,18 @@ class ClientConnection:
             return self.socket.send(data if len(data) <= SLICE else memoryview(data)[:SLICE])
         except BlockingIOError:
             return 0
+        except (BrokenPipeError, ConnectionResetError):
+            # What the client sent before it closed is still to be read, such as the last command of a loop.
+            self.reads_no_more = True
+            self._discard_backlog()
+            return 0
+
+    def _discard_backlog(self) -> None:
+        self._queue.clear()
+        self.queued = self._offset = 0
 
     def close(self) -> None:
         """Close the socket and discard the backlog."""
         self.closed = True
-        self._queue.clear()
-        self.queued = 0
+        self._discard_backlog()
         self.socket.close()
