@@ -45,7 +45,7 @@ demo-control: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
 test: $(STAMP)
-	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .

@@ -40,18 +40,3 @@ def user_types(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
         return importlib.import_module("vtb_test_types")
     finally:
         sys.path.remove(str(folder))
-
-
-# Files with few but long tests begin first, so that in the end no worker computes alone.
-LONG = (
-    "test_docs.py",
-    "test_controller.py",
-    "test_payload.py",
-    "test_packaging.py",
-    "test_study.py",
-    "test_cluster.py",
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
