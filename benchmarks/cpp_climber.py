@@ -56,7 +56,7 @@ class CppClimberScenario(SpaceClimberScenario):
         return PiecewisePolynomial.FirstOrderHold(log.sample_times(), log.data())
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, scene_graph = builder.add_plant(self.plant)
+        plant, scene_graph = builder.add_plant(self.plant_config)
         climber = add_climber(plant)
         add_payload(plant, climber)
         friction = CoulombFriction(self.friction, self.friction)
