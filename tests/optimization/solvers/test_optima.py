@@ -183,3 +183,12 @@ def test_a_pareto_front_is_covered_better_than_by_chance(name):
     # The hypervolume of the front cannot be exceeded (1e-3: of the trapezoids).
     assert 0.9 * ideal < volumes[name] < ideal + 1e-3
     assert ideal - volumes[name] < 0.6 * (ideal - volumes["random"])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_front_much_smaller_than_the_costs_is_approached():
+    # Costs of up to 1000 above a front that is 0.001 wide: expected improvements below the smallest double.
+    made = make_solver("bayesian", SPHERE.space, objectives=2, budget=30, seed=0)
+    log = drive(made, lambda p: (1e3 * p[1] ** 2 + 1e-3 * p[0], 1e3 * p[1] ** 2 - 1e-3 * p[0]))
+    best = min(-e.values[0] for e in log)
+    assert best < 1.0 < min(-e.values[0] for e in log[:5])

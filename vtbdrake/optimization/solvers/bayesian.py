@@ -197,8 +197,10 @@ class Bayesian(Solver):
             means, deviations = zip(*(model.predict(places) for model in models), strict=True)
             drawn = [m[:, np.newaxis] + d[:, np.newaxis] * z for m, d, z in zip(means, deviations, draws, strict=True)]
             gains = np.maximum(best - weighed(drawn), 0.0)
-            # The small term leads to where a draw might improve, if none does.
-            return np.asarray(np.log(gains.mean(axis=1) + 1e-9 * np.exp(np.minimum(best - weighed(means), 0.0))))
+            with np.errstate(divide="ignore"):  # log(0) is -inf, as it should be.
+                expected = np.log(gains.mean(axis=1))
+            # The small term leads to where a draw might improve, if none does. It must not underflow far from there.
+            return np.asarray(np.logaddexp(expected, np.log(1e-9) + np.minimum(best - weighed(means), 0.0)))
 
         return improvement
 
