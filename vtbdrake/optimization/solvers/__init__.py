@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vtbdrake.optimization.parameter import Dimension
@@ -14,12 +14,13 @@ from vtbdrake.optimization.solvers.designs import Grid, LatinHypercube, RandomSe
 from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS, Ipopt, Nlopt, Snopt
 from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution
 from vtbdrake.optimization.solvers.optuna_samplers import SAMPLERS, OptunaSolver
+from vtbdrake.optimization.solvers.sampling import Cem, Mppi, PredictiveSampling
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 
-__all__ = ["CATALOGUE", "Evaluation", "Point", "Solver", "SolverError", "known_solvers", "make_solver"]
+__all__ = ["CATALOGUE", "Evaluation", "Point", "Solver", "SolverError", "known_solvers", "make_solver", "solver_type"]
 
 # All solvers by their names.
-CATALOGUE: Mapping[str, Callable[..., Solver]] = {
+CATALOGUE: Mapping[str, type[Solver]] = {
     "auto": Auto,
     "grid": Grid,
     "sobol": Sobol,
@@ -28,6 +29,9 @@ CATALOGUE: Mapping[str, Callable[..., Solver]] = {
     "bayesian": Bayesian,
     "CMA-ES": CmaEs,
     "differential-evolution": DifferentialEvolution,
+    "predictive-sampling": PredictiveSampling,
+    "CEM": Cem,
+    "MPPI": Mppi,
     **dict.fromkeys(SAMPLERS, OptunaSolver),
     "SNOPT": Snopt,
     "IPOPT": Ipopt,
@@ -40,8 +44,17 @@ def known_solvers() -> tuple[str, ...]:
     return tuple(CATALOGUE)
 
 
+def solver_type(method: str | type[Solver]) -> type[Solver]:
+    """Return the class of a solver that is given by its name, or itself.
+
+    Raises:
+        SolverError: there is no such solver.
+    """
+    return method if isinstance(method, type) and issubclass(method, Solver) else CATALOGUE[_find(method)]
+
+
 def make_solver(
-    name: str,
+    name: str | type[Solver],
     space: Sequence[Dimension],
     *,
     objectives: int = 1,
@@ -54,7 +67,7 @@ def make_solver(
     """Return a solver for a problem.
 
     Args:
-        name: one of `known_solvers`.
+        name: one of `known_solvers`, or a class of your own, derived from `Solver`.
         space: the parameters.
         objectives: how many values an evaluation has.
         constraints: how many violations an evaluation has.
@@ -67,8 +80,8 @@ def make_solver(
         SolverError: there is no such solver or option, or the solver cannot solve such a problem.
         ModuleNotFoundError: the solver needs a package that is not installed.
     """
-    canonical = _find(name)
-    factory = CATALOGUE[canonical]
+    factory = solver_type(name)
+    canonical = _find(name) if isinstance(name, str) else name.__name__
     allowed = [option for option in inspect.signature(factory).parameters if option not in ("search", "name")]
     for option in options:
         if option not in allowed:
@@ -81,7 +94,7 @@ def make_solver(
     return factory(search, name=canonical, **options)
 
 
-def _find(name: str) -> str:
+def _find(name: object) -> str:
     if not isinstance(name, str):
         raise SolverError(f"a solver is given by its name, one of {', '.join(CATALOGUE)}, not by {name!r}")
     names = {_plain(known): known for known in CATALOGUE}

@@ -24,6 +24,8 @@ class Design(Solver):
         as_budgeted: whether it goes on until the budget is spent; otherwise it ends with its points.
     """
 
+    takes_start = False
+
     def __init__(self, search: Search, *, name: str, as_budgeted: bool = False) -> None:
         super().__init__(search, name=name)
         search.require(name, no_start=True)

@@ -241,12 +241,14 @@ class Solver(ABC):
         name: as the catalogue spells it.
         search: what is searched.
         wants_gradient: whether `Evaluation.gradient` is to be filled.
+        takes_start: whether it starts at a point (`Search.start`).
         reproducible: False for the few algorithms whose library seeds its random numbers from the clock.
         success: whether it ended by its own criterion (converged, or its design is complete); None while it works.
         message: how it ended, in its own words.
     """
 
     wants_gradient: bool = False
+    takes_start: bool = True
     reproducible: bool = True
 
     def __init__(self, search: Search, *, name: str) -> None:

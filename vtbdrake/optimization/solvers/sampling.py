@@ -1,0 +1,187 @@
+"""Sampling-based predictive control as solvers: predictive sampling, the cross-entropy method, MPPI.
+
+All three draw each batch from a normal distribution over the unit cube, N(mu, diag(sigma)^2), clip it to the cube, and
+move mu to where points are good. They need few points per batch, no derivatives, and take noise and discontinuities.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from vtbdrake.optimization.solvers.evolution import default_population
+from vtbdrake.optimization.solvers.solver import (
+    Evaluation,
+    Point,
+    Search,
+    Solver,
+    SolverError,
+    best_of,
+    costs,
+    rank_key,
+)
+
+
+class SamplingSolver(Solver):
+    """A normal distribution over the unit cube, from which each batch is drawn; the first point of a batch is mu.
+
+    A batch does not depend on the budget: a larger one continues the same sequence. It ends with the budget only.
+
+    Args:
+        search: n numbers, one objective; mu begins at its start.
+        name: in the catalogue.
+        population: the number N of points per batch, at least 2; by default 2 (4 + floor(3 ln n)).
+        sigma: the standard deviation, as a part of the ranges; above 0.
+
+    Raises:
+        SolverError: an option is out of range, or the search has choices or several objectives.
+    """
+
+    def __init__(self, search: Search, *, name: str, population: int | None, sigma: float) -> None:
+        search.require(name, ordered=True, one_objective=True)
+        super().__init__(search, name=name)
+        self.population = 2 * default_population(search.size) if population is None else population
+        if self.population < 2:
+            raise SolverError(f"a batch of {name} has at least 2 points, not {population}")
+        if not sigma > 0.0:
+            raise SolverError(f"sigma is a part of the ranges, above 0, not {sigma}")
+        self._mu = search.start_unit()
+        self._sigma = np.full(search.size, float(sigma))
+        self._generator = np.random.default_rng(search.seed)
+        self._U = np.empty((0, search.size))
+
+    def _next(self) -> list[Point]:
+        noise = self._generator.standard_normal((self.population - 1, self.search.size))
+        self._U = np.clip(np.vstack([self._mu, self._mu + self._sigma * noise]), 0.0, 1.0)
+        return [self.search.point(u) for u in self._U]
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        if any(evaluation.usable for evaluation in asked):
+            self._move(self._U, asked)
+
+    @abstractmethod
+    def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
+        """Move the distribution.
+
+        Args:
+            U: the batch in the unit cube, shape (N, n).
+            evaluations: those of the batch, N; at least one did not fail.
+        """
+
+
+class PredictiveSampling(SamplingSolver):
+    """Predictive sampling: the best point so far, and normal noise around it.
+
+    mu <- argmax of f over {mu, clip(mu + sigma e_1), ..., clip(mu + sigma e_(N-1))}, e_i ~ N(0, I).
+
+    Args:
+        search: see `SamplingSolver`.
+        name: see `SamplingSolver`.
+        population: see `SamplingSolver`.
+        sigma: see `SamplingSolver`; it stays the same.
+
+    Howell, T. et al. (2022): Predictive Sampling: Real-time Behaviour Synthesis with MuJoCo, arXiv:2212.00541.
+    """
+
+    def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.15) -> None:
+        super().__init__(search, name=name, population=population, sigma=sigma)
+        self._best: Evaluation | None = None
+
+    def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
+        known = [] if self._best is None else [self._best]
+        best = best_of([*known, *evaluations])
+        if best is not None and best is not self._best:
+            # The first of equal points, as in `best_of`.
+            self._best, self._mu = best, U[evaluations.index(best)]
+
+
+class Cem(SamplingSolver):
+    """The cross-entropy method: the normal distribution of the best points of each batch.
+
+    Of the K best points (elites) of a batch, by Deb's rule, with their mean m and standard deviation s per coordinate:
+    mu <- (1 - a) mu + a m, sigma <- max((1 - a) sigma + a s, sigma_min).
+
+    Args:
+        search: see `SamplingSolver`.
+        name: see `SamplingSolver`.
+        population: see `SamplingSolver`.
+        sigma: the first standard deviation, as a part of the ranges.
+        elites: the part K / N of a batch that is elite, in (0, 1]; at least 2 points.
+        smoothing: a, in (0, 1]; less is slower and more careful.
+        sigma_min: the least standard deviation, as a part of the ranges.
+
+    Rubinstein, R. Y. and Kroese, D. P. (2004): The Cross-Entropy Method, Springer. Kobilarov, M. (2012): Cross-entropy
+    motion planning, Int. J. of Robotics Research 31.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        *,
+        name: str,
+        population: int | None = None,
+        sigma: float = 0.3,
+        elites: float = 0.25,
+        smoothing: float = 1.0,
+        sigma_min: float = 0.005,
+    ) -> None:
+        super().__init__(search, name=name, population=population, sigma=sigma)
+        for option, value in (("elites", elites), ("smoothing", smoothing)):
+            if not 0.0 < value <= 1.0:
+                raise SolverError(f"{option} of {name} lies in (0, 1], unlike {value}")
+        if not sigma_min >= 0.0:
+            raise SolverError(f"sigma_min is a part of the ranges, at least 0, not {sigma_min}")
+        self._elites = max(2, round(elites * self.population))
+        self._smoothing = smoothing
+        self._sigma_min = sigma_min
+
+    def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
+        order = sorted(range(len(evaluations)), key=lambda i: rank_key(evaluations[i]))
+        elite = U[[i for i in order if evaluations[i].usable][: self._elites]]
+        a = self._smoothing
+        self._mu = (1.0 - a) * self._mu + a * elite.mean(axis=0)
+        self._sigma = np.maximum((1.0 - a) * self._sigma + a * elite.std(axis=0), self._sigma_min)
+
+
+class Mppi(SamplingSolver):
+    """Model predictive path integral control: the mean of each batch, weighted by the exponential of its quality.
+
+    With costs c_i = -f(u_i): w_i = exp(-(c_i - min c) / lambda), mu <- sum w_i u_i / sum w_i; sigma stays the same. In
+    the paper lambda is in the unit of the cost. Here it is ``temperature`` times the standard deviation of the batch's
+    costs, so that one setting serves qualities of any unit. Where a constraint is violated, the costs are in the order
+    of Deb's rule; points that failed or were dropped have no weight.
+
+    Args:
+        search: see `SamplingSolver`.
+        name: see `SamplingSolver`.
+        population: see `SamplingSolver`.
+        sigma: see `SamplingSolver`; it stays the same.
+        temperature: lambda, in standard deviations of the batch's costs; above 0. Towards 0 only the best point counts.
+
+    Williams, G. et al. (2017): Information theoretic MPC for model-based reinforcement learning, ICRA.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        *,
+        name: str,
+        population: int | None = None,
+        sigma: float = 0.2,
+        temperature: float = 0.3,
+    ) -> None:
+        super().__init__(search, name=name, population=population, sigma=sigma)
+        if not temperature > 0.0:
+            raise SolverError(f"the temperature of {name} is above 0, not {temperature}")
+        self._temperature = temperature
+
+    def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
+        weighed = [i for i, evaluation in enumerate(evaluations) if evaluation.usable and evaluation.exact]
+        if not weighed:
+            return
+        c = np.array(costs([evaluations[i] for i in weighed]))
+        spread = float(c.std())
+        w = np.exp(-(c - c.min()) / (self._temperature * spread)) if spread > 0.0 else np.ones(c.size)
+        self._mu = w @ U[weighed] / w.sum()
