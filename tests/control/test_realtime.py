@@ -141,10 +141,12 @@ def test_nested_settings_restore_outer_ones() -> None:
 
 RUNAWAY = """
 import collections, itertools
+from dataclasses import replace
 import numpy as np
 import vtbdrake.control.realtime
 from tests.control.scripted import PERIOD, ScriptedBridge, Servo, ServoScenario
 from vtbdrake.control.clock import WallClock
+from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed import DpsAlone
@@ -156,12 +158,17 @@ class EndlessServo(Servo):
             END
 
 class EndlessScenario(ServoScenario):
+    def interface(self):
+        interface = super().interface()
+        return replace(interface, sense=[replace(signal, max_age=60.0) for signal in interface.sense])
+
     def make_dps(self):
         return EndlessServo()
 
 scenario, clock = EndlessScenario(rate=0.0), WallClock()
 bridge = ScriptedBridge(scenario.interface(), clock, lambda t: {"position": [0.0, 0.0], "speed": [0.0, 0.0]})
-runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock)
+guards = Guards(scenario.interface(), PERIOD, max_missed=60_000)
+runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock, guards=guards)
 runtime.write({"u.target": [0.2, 0.2]})
 runtime.cycle()
 runtime.switch("real")

@@ -190,7 +190,7 @@ def is_disconnected(sock: socket.socket) -> bool:
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
+    """Ask until the condition holds; every question waits for an answer of the hub or for a message."""
     deadline = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < deadline, "timeout"
-        time.sleep(0.01)

@@ -2,13 +2,15 @@
 
 import random
 import socket
+import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from pydrake.lcm import DrakeLcm
 
-from tests.lcm.hub.clients import Client, ClientProcess, stopped, wait_until
-from vtbdrake.lcm.hub import Hub, client_name
+from tests.lcm.hub.clients import Client, ClientProcess, wait_until
+from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, client_name, server
 from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.routing import ProtectedChannel
 
@@ -148,7 +150,7 @@ def short_lease():
         yield hub
 
 
-def state(hub: Hub):
+def state(hub: Hub | HubServer):
     return hub.statistics().protected["COMMAND"]
 
 
@@ -260,16 +262,24 @@ def test_active_owner_is_not_replaced(long_lease) -> None:
     assert (state(long_lease).owner, state(long_lease).refused) == (client_name(owner.bus.fileno()), 2)
 
 
-def test_delay_of_the_hub_extends_the_lease() -> None:
-    with Hub(port=0, protect=["COMMAND"], lease=2.0) as hub:
+def test_delay_of_the_hub_extends_the_lease(monkeypatch: pytest.MonkeyPatch) -> None:
+    delay = 0.0
+    monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + delay))
+    hub = HubServer(HubConfig(port=0, protect=["COMMAND"], lease=60.0))
+    thread = threading.Thread(target=hub.serve_forever)
+    thread.start()
+    try:
         owner, other = Client(hub.url), Client(hub.url)
         owner.publish("COMMAND")
         owner.sync()
-        with stopped(hub):
-            time.sleep(1.1 * hub.config.lease)
-            other.publish("VTB_HUB_TAKE/COMMAND")
+        delay = 1.1 * hub.config.lease
+        other.publish("VTB_HUB_TAKE/COMMAND")
         other.sync()
-        assert (state(hub).owner, state(hub).refused) == (client_name(owner.bus.fileno()), 1)
+        name = client_name(owner.bus.fileno())
+    finally:
+        hub.stop()
+        thread.join()
+    assert (state(hub).owner, state(hub).refused) == (name, 1)
 
 
 def test_free_channel_can_be_requested(long_lease) -> None:

@@ -417,12 +417,12 @@ def test_restarted_hub_is_found_by_the_shortcut() -> None:
         for losses in range(3):
             with Hub(port=port) as hub:
                 if losses:
-                    wait_until(lambda: link.connected)
+                    wait_until(lambda: bool(link.take(0.1, 1)) or link.connected)
                 else:
                     link.open()
                 assert is_local(link.name)
                 os.kill(hub.pid, 9)
-            wait_until(lambda: not link.connected or bool(link.take(0.0, 100)))
+            wait_until(lambda: not link.connected or bool(link.take(0.1, 100)))
             assert link.losses == losses + 1
         assert link.reconnections == 2
 

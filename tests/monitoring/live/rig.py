@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -55,13 +55,13 @@ class Rig:
             assert time.monotonic() < limit
             self.runtime.cycle()
             self.runtime.clock.wait_until(self.runtime.clock.now() + PERIOD)
-            time.sleep(1e-4)  # Others want the interpreter, too.
 
     def during(self, function: Callable[..., T], *arguments: Any, **options: Any) -> T:
         """Run cycles while another thread calls a function, and return its result."""
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(function, *arguments, **options)
-            self.until(future.done)
+            # Waiting for the future lets the other thread run.
+            self.until(lambda: bool(wait((future,), timeout=1e-4).done))
             return future.result()
 
 

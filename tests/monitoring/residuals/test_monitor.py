@@ -31,7 +31,6 @@ def wait_for_windows(monitor: ResidualMonitor, together: Together, count: int) -
     while len(monitor.history) < count:
         assert time.monotonic() < end, "no residuals come back"
         together.run(10)
-        time.sleep(0.02)
 
 
 def test_worker_process_gives_equal_results() -> None:
@@ -113,7 +112,6 @@ def test_skipped_windows_are_reported_while_running() -> None:
         while monitor.skipped < 20:
             assert time.monotonic() < end, "skipped windows are not reported"
             together.run(10)
-            time.sleep(0.02)
         assert not monitor.history
 
 
