@@ -131,12 +131,12 @@ def test_take_over_waits_until_the_machine_is_ready() -> None:
     machine.take_over()
     assert machine.clock.now() == pytest.approx(2.5, abs=2 * PERIOD)
     # At first, and then once per second.
-    assert machine.lines == ["the machine is not ready: its brakes are on"] * 3
+    assert machine.lines == ["the machine must not be commanded: its brakes are on"] * 3
 
 
 def test_take_over_gives_up_after_its_timeout() -> None:
     machine = Machine(Deployment(continuity=CONTINUITY, blocked_by=lambda bridge: "its brakes are on"))
-    with pytest.raises(SwitchRefusedError, match=r"after 1\.5 s: the machine is not ready: its brakes are on"):
+    with pytest.raises(SwitchRefusedError, match=r"after 1\.5 s: the machine must not be commanded: its brakes are on"):
         machine.take_over(timeout=1.5)
     assert machine.bridge.sent == []
 

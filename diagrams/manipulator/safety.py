@@ -58,7 +58,7 @@ class FloatInPlace(Fallback):
         self._gravity = function("gravity", {"q": q}, {"torque": model.inverse_dynamics(q, zero, zero)})
         gains = LAWS["joint_impedance"].parameters
         self._stiffness, self._damping = (np.array(gains[name][0]) for name in ("stiffness", "damping"))
-        self.take_over()
+        self.begin()
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense}
@@ -68,7 +68,7 @@ class FloatInPlace(Fallback):
                 f"size; it cannot command {signal.name} from {', '.join(sizes) or 'none'}"
             )
 
-    def take_over(self) -> None:
+    def begin(self) -> None:
         self._held: NDArray[np.float64] | None = None
         self._before: NDArray[np.float64] | None = None
         self._velocity = np.zeros(JOINTS)
@@ -78,7 +78,7 @@ class FloatInPlace(Fallback):
     ) -> NDArray[np.float64] | NoCommand:
         last = known.get(POSITION)
         if last is None or (POSITION not in sensed and last.age > CARRY):
-            self.take_over()
+            self.begin()
             return NO_COMMAND
         q: NDArray[np.float64] = last.value
         torque: NDArray[np.float64] = self._gravity(q).full().ravel()

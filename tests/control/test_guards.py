@@ -89,7 +89,7 @@ FAULTS: list[tuple[dict[str, Any], dict[str, Any], tuple[str | None, str]]] = [
     ({}, {"active": ["torque"]}, ("torque", "missing")),
     ({}, {"error": ZeroDivisionError("at cycle 2")}, (None, "raised")),
     ({"torque": [0.1, 0.1]}, {"missed": 11}, (None, "missed")),
-    ({"torque": [0.1, 0.1]}, {"blocked": "its brakes are closed"}, (None, "not ready")),
+    ({"torque": [0.1, 0.1]}, {"blocked": "its brakes are closed"}, (None, "blocked")),
 ]
 
 
@@ -212,7 +212,7 @@ def test_reset_returns_all_causes() -> None:
     loop.cycle({"torque": [0.0]}, missed=20, blocked="it is off")
     assert loop.reset() == (
         "20 deadlines were missed in a row, 10 are allowed",
-        "the machine is not ready: it is off",
+        "the machine must not be commanded: it is off",
         "the actuator command torque has the shape (1,) instead of (2,)",
         "sensor signal velocity has never arrived",
     )
@@ -481,11 +481,11 @@ def test_fallback_gets_elapsed_time() -> None:
     assert spans == pytest.approx([0.003, T, 0.006])
 
 
-def test_take_over_is_called_once_per_latch() -> None:
+def test_fallback_begins_once_per_latch() -> None:
     class Counting(Hold):
         times = 0
 
-        def take_over(self) -> None:
+        def begin(self) -> None:
             self.times += 1
 
     counting = Counting()

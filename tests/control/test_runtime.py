@@ -384,7 +384,7 @@ def test_blocked_machine_is_not_commanded_until_reset():
     bridge.blocked_reason = None
     runtime.run(cycles=2)
     assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True, True, False, False, False]
-    assert runtime.guards.latched[0].kind == "not ready"
+    assert runtime.guards.latched[0].kind == "blocked"
 
 
 def test_second_publisher_is_an_alarm_and_blocks_only_switches(caplog):

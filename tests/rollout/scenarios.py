@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,12 @@ from pathlib import Path
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
 
 KILL, STOP, HANG, KILL_PARENT = 1.0, 2.0, 3.0, 4.0
+
+
+def child_pids():
+    """Return the processes that this thread has started and that have not been waited for, the first first."""
+    listed = Path(f"/proc/self/task/{threading.get_native_id()}/children")
+    return [int(pid) for pid in listed.read_text().split()]
 
 
 @dataclass

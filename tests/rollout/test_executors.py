@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from io import StringIO
 from pathlib import Path
 from types import ModuleType
 
@@ -26,7 +27,7 @@ from vtbdrake.rollout import (
     WorkerError,
 )
 from vtbdrake.rollout.cluster import DaskExecutor
-from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.rollout.executor import run_rollouts, watched
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -70,6 +71,15 @@ def test_a_module_that_workers_do_not_have_is_named(monkeypatch):
         list(executor.run(task, [{}]))
 
 
+def test_progress_is_shown_in_a_kernel_only(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", StringIO())
+    pytest.importorskip("ipykernel.zmqshell")
+    assert not watched()
+    shell = sys.modules["ipykernel.zmqshell"].ZMQInteractiveShell
+    monkeypatch.setattr("IPython.get_ipython", lambda: shell)
+    assert watched()
+
+
 @pytest.mark.parametrize(("how", "kind"), [(KILL, "died"), (STOP, "time limit")])
 def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp_path, caplog):
     fuse = tmp_path / "fuse"
@@ -104,7 +114,7 @@ def test_a_script_without_a_main_guard_and_with_its_own_functions_uses_processes
             from dataclasses import dataclass
             from tests.testbeds import AcrobotScenario
             from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask
-            from vtbdrake.rollout.executor import run_rollouts
+            from vtbdrake.rollout.executor import run_rollouts, watched
 
             @dataclass
             class Mine(AcrobotScenario):

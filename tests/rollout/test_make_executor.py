@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from tests.rollout.scenarios import child_pids
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     FuturesExecutor,
@@ -93,7 +94,8 @@ def test_dask_without_its_package_names_the_extra(pendulum, monkeypatch):
 
 def test_workers_start_with_their_executor_and_end_with_it():
     testbed = PendulumScenario().build()
-    with make_executor("processes", testbed=testbed, rollouts=3, workers=5) as executor:
-        children = [worker.child for worker in executor._workers]
-        assert len(children) == 3 and all(child.alive for child in children)
-    assert not any(child.alive for child in children)
+    others = set(child_pids())
+    with make_executor("processes", testbed=testbed, rollouts=3, workers=5):
+        workers = set(child_pids()) - others
+        assert len(workers) == 3
+    assert not workers & set(child_pids())

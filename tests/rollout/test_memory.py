@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 
+from tests.rollout.scenarios import child_pids
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, ThreadExecutor
 
@@ -31,9 +32,10 @@ def _run(executor, count):
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
 def test_memory_stays_flat_over_ten_thousand_rollouts(make):
+    others = set(child_pids())
     with make() as executor:
         _run(executor, 1000)
-        processes = [os.getpid(), *(worker.child.pid for worker in getattr(executor, "_workers", []))]
+        processes = [os.getpid(), *(set(child_pids()) - others)]
         before = {process: _resident(process) for process in processes}
         _run(executor, 10_000)
         growth = {process: _resident(process) - before[process] for process in processes}

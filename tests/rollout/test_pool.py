@@ -13,7 +13,7 @@ from textwrap import dedent
 import numpy as np
 import pytest
 
-from tests.rollout.scenarios import GreedyScenario, RecordedScenario
+from tests.rollout.scenarios import GreedyScenario, RecordedScenario, child_pids
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
@@ -89,28 +89,24 @@ def test_executor_works_after_a_quality_error(make):
 
 
 def test_worker_that_died_while_idle_costs_nothing(caplog):
+    others = set(child_pids())
     with ProcessExecutor(2) as executor:
         _assert_right(executor, ANGLE, POINTS)
-        executor._workers[0].child.kill()
+        killed, kept = set(child_pids()) - others
+        os.kill(killed, signal.SIGKILL)
+        os.waitid(os.P_PID, killed, os.WEXITED | os.WNOWAIT)
         _assert_right(executor, OTHER, POINTS)
-        assert len(executor._workers) == 2
-        assert all(worker.child.alive for worker in executor._workers)
+        alive = set(child_pids()) - others
+        assert len(alive) == 2 and kept in alive and killed not in alive
     # No rollout was lost with it.
     assert caplog.text == ""
 
 
-def _children():
-    """The processes that this one has started and that have not ended, the first first."""
-    listed = f"/proc/self/task/{threading.get_native_id()}/children"
-    with open(listed) as file:
-        return [int(pid) for pid in file.read().split()]
-
-
 def test_worker_killed_while_starting_costs_nothing():
-    others = set(_children())
+    others = set(child_pids())
     with ProcessExecutor(2) as executor:
         executor.start(2)
-        for pid in set(_children()) - others:
+        for pid in set(child_pids()) - others:
             os.kill(pid, signal.SIGKILL)
         _assert_right(executor, ANGLE, POINTS)
 
@@ -125,12 +121,13 @@ def test_all_workers_killed_while_starting_is_an_error(monkeypatch, tmp_path):
 
 
 def test_closed_executor_leaves_no_processes():
+    others = set(child_pids())
     executor = ProcessExecutor(2)
     _assert_right(executor, ANGLE, POINTS[:2])
-    children = [worker.child for worker in executor._workers]
-    assert len(children) == 2
+    workers = set(child_pids()) - others
+    assert len(workers) == 2
     executor.close()
-    assert not any(child.alive for child in children)
+    assert not workers & set(child_pids())
 
 
 def test_error_in_a_thread_stops_the_others():
@@ -214,12 +211,12 @@ def test_workers_end_with_a_killed_main_process(tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     script = f"""
-        from tests.rollout.scenarios import HANG, TreacherousScenario
+        from tests.rollout.scenarios import HANG, TreacherousScenario, child_pids
         from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask
         executor = ProcessExecutor(1)
         task = RolloutTask(TreacherousScenario(fuse={str(fuse)!r}), 0.5, Quality(abs, {SHOULDER!r}))
         list(executor.run(task, [{{}}]))
-        print(executor._workers[0].child.pid, flush=True)
+        print(*child_pids(), flush=True)
         list(executor.run(task, [{{"dps.gain[0]": HANG}}]))
     """
     with subprocess.Popen([sys.executable, "-c", dedent(script)], stdout=subprocess.PIPE, text=True) as main:

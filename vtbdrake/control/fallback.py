@@ -52,7 +52,7 @@ class Fallback(ABC):
             ValueError: it cannot.
         """
 
-    def take_over(self) -> None:  # noqa: B027 - most remember nothing
+    def begin(self) -> None:  # noqa: B027 - most remember nothing
         """Forget earlier faults; called before the first command after a fault."""
 
     @abstractmethod

@@ -45,8 +45,8 @@ class Guards:
 
     In every cycle, `check` limits the commands of the actuator signals that are on real, unless there is a fault: a
     sensor signal that is stale or implausible; a DPS that raised; a command that is missing, not finite or of a wrong
-    size; too many missed deadlines in a row; a machine that is not ready. A fault *latches* in the same cycle: from
-    then on the fallbacks command all signals that are on real, until `reset`. While nothing is on real, faults are
+    size; too many missed deadlines in a row; a machine that must not be commanded. A fault *latches* in the same cycle:
+    from then on the fallbacks command all signals that are on real, until `reset`. While nothing is on real, faults are
     reported, but nothing latches.
 
     A signal with a limit of its rate or acceleration needs `start` before it is commanded. A signal that has neither a
@@ -284,7 +284,7 @@ class Guards:
             reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
             faults.append(Fault(now, None, "missed", reason))
         if blocked is not None:
-            faults.append(Fault(now, None, "not ready", f"the machine is not ready: {blocked}"))
+            faults.append(Fault(now, None, "blocked", f"the machine must not be commanded: {blocked}"))
         return faults
 
     def _depart_anew(
@@ -363,7 +363,7 @@ class Guards:
             try:
                 if fallback not in self._begun:
                     self._begun.add(fallback)
-                    fallback.take_over()
+                    fallback.begin()
                 command = fallback.command(last_sent, sensed, known, dt)
                 return command if command is NO_COMMAND else limiter.limit(command)
             except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.

@@ -297,7 +297,7 @@ class Runtime(Stepped):
             self.bridge.publish(last)
 
     def blocked_reason(self) -> str | None:
-        """Return why the machine is not to be commanded now (not ready, commands do not reach it), or None."""
+        """Return why the machine must not be commanded (it is not ready, or commands do not reach it), or None."""
         return self.bridge.blocked_reason or self.blocked_by()
 
     # -- switches

@@ -27,7 +27,7 @@ class Fault:
         time: time of detection on the loop's clock, in seconds.
         signal: name of the faulty signal; None if the fault concerns all.
         kind: of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``,
-            ``not finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``not ready``
+            ``not finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``blocked``
             or ``told``.
         reason: description in one sentence.
     """

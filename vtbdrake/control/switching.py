@@ -91,7 +91,7 @@ def prepare(
         reasons += [f"the guards are latched ({fault.reason}): reset them first" for fault in runtime.guards.latched]
         blocked = runtime.blocked_reason()
         if blocked is not None:
-            reasons.append(f"the machine is not ready: {blocked}")
+            reasons.append(f"the machine must not be commanded: {blocked}")
         competing = runtime.bridge.competing_publisher
         if becoming and competing is not None:
             reasons.append(competing)

@@ -218,7 +218,10 @@ def run_rollouts(
 
 def watched() -> bool:
     """Return whether the output goes to a terminal or a notebook."""
-    return sys.stderr.isatty() or "ipykernel" in sys.modules
+    # Only the shell of a notebook has a kernel. Programs that run notebooks import ipykernel, too.
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return sys.stderr.isatty() or hasattr(shell, "kernel")
 
 
 def choose_executor(testbed: VirtualTestbed) -> str:

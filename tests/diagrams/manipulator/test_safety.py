@@ -83,10 +83,10 @@ def test_weight_of_the_last_known_pose_is_carried_for_a_while_and_then_the_brake
     assert torque(floating, HOME, fresh=False, age=1.1 * CARRY) is NO_COMMAND
 
 
-def test_arm_is_held_where_it_was_when_this_took_over() -> None:
+def test_arm_is_held_where_the_fallback_began() -> None:
     floating = FloatInPlace()
     torque(floating, HOME)
-    floating.take_over()
+    floating.begin()
     moved = HOME + 0.3
     np.testing.assert_allclose(torque(floating, moved), gravity(moved), atol=1e-9)
 
