@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.child_process import ChildProcess, StartError, ending_signals, report_ready
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -224,3 +224,14 @@ def test_child_imports_what_its_parent_imports(changed: str, twice: Sequence[str
     )
     assert run.returncode == 0, run.stderr
     assert run.stdout == f"{directory / 'vtbdrake/__init__.py'} 0\n"
+
+
+def test_ending_signals_are_handled_in_the_block_only() -> None:
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.getsignal(number) for number in numbers]
+    received: list[int] = []
+    with ending_signals(lambda number, _: received.append(number)):
+        for number in numbers:
+            signal.raise_signal(number)
+    assert received == [*numbers]
+    assert [signal.getsignal(number) for number in numbers] == before

@@ -7,18 +7,22 @@ import logging
 import os
 import pickle
 import select
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, Self
 
 _log = logging.getLogger(__name__)
+
+_ANSWER_TIMEOUT = 10.0  # s for a service to answer, and to end
 
 _BOOTSTRAP = """\
 import signal, sys
@@ -176,6 +180,73 @@ class ChildProcess:
         """Kill the child (SIGKILL) and return its exit code. Its sent data can still be read from the connection."""
         self._process.kill()
         return self._process.wait()
+
+
+class ChildService:
+    """A service in a child process, as a context manager that starts it and ends it.
+
+    Attributes:
+        name: What errors call the service, such as "the hub"; set by the subclass.
+        error: The exception that its methods raise; set by the subclass.
+    """
+
+    name: str
+    error: type[Exception]
+    _child: ChildProcess | None = None
+
+    def start(self) -> None:
+        """Start the service, and wait until it is ready."""
+        raise NotImplementedError
+
+    def _start(self, function: Callable[..., object], *arguments: Any, **options: Any) -> None:
+        """Start the child, see `ChildProcess`, and wait until it is ready."""
+        child = ChildProcess(function, *arguments, name=self.name, **options)
+        try:
+            child.wait_until_ready()
+        except StartError as error:
+            raise self.error(str(error)) from error
+        self._child = child
+
+    def _running(self) -> ChildProcess:
+        if self._child is None:
+            raise self.error(f"{self.name} is not running: start it, or use it in a with statement")
+        return self._child
+
+    def _request(self, line: bytes) -> bytes:
+        try:
+            return self._running().request(line, timeout=_ANSWER_TIMEOUT)
+        except OSError as error:
+            raise self.error(f"{self.name} does not answer: {error}") from error
+
+    @property
+    def pid(self) -> int:
+        """Return the process id of the service; it is an error if it is not running."""
+        return self._running().pid
+
+    def close(self) -> None:
+        """End the service; it can be started again."""
+        if self._child is not None:
+            self._child.close(_ANSWER_TIMEOUT)
+        self._child = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def ending_signals(handler: Callable[[int, FrameType | None], Any]) -> Iterator[None]:
+    """Within the block, call ``handler`` at SIGTERM, and at SIGINT unless it is ignored. For the main thread."""
+    numbers = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def report_ready(connection: socket.socket) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 
+from vtbdrake.child_process import ending_signals
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
@@ -133,13 +134,12 @@ def run(
     scenario = scenario.with_fields(settings(fields))
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
-    # SIGTERM ends the loop as Ctrl-C does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     loop = scenario.deploy(
         url, start=snapshot, values=settings(values), deployment=deployment, claim=claim, live=live, record=record
     )
     try:
-        with _logs_in_a_thread(), loop as runtime:
+        # SIGTERM ends the loop as Ctrl-C does.
+        with ending_signals(signal.default_int_handler), _logs_in_a_thread(), loop as runtime:
             begin = runtime.clock.now()
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 click.echo(real_time)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import socket
 import threading
 import time
@@ -14,6 +13,7 @@ from contextlib import nullcontext
 from math import inf
 from typing import Any
 
+from vtbdrake.child_process import ending_signals
 from vtbdrake.control.clock import Clock, WallClock
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.control.statistics import Histogram, LoopStatistics
@@ -323,13 +323,10 @@ def serve(
     Raises:
         RuntimeError: the simulation failed.
     """
-    signal.signal(signal.SIGTERM, lambda *_: loop.stop())
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda *_: loop.stop())
     # Without a longest step: a simulation that cannot keep up computes without a pause.
     real_time = RealTime(priority=priority, longest_step=None) if priority else nullcontext()
     try:
-        with real_time:
+        with ending_signals(lambda *_: loop.stop()), real_time:
             if isinstance(real_time, RealTime):
                 _log.info("%s", real_time)
             loop.run(lock_step=lock_step, cycles=cycles, ready=ready)

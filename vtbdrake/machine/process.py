@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.child_process import ChildService, StartError, report_ready
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.machine.injected_faults import InjectedFault
 from vtbdrake.machine.loop import MachineLoop, epoch, serve
 from vtbdrake.machine.machine import Machine, MachineConfig, MachineStatus
 from vtbdrake.testbed import Scenario
-
-_ANSWER_TIMEOUT = 10.0
 
 
 class MachineError(RuntimeError):
@@ -45,7 +43,7 @@ class MachineStatistics:
     lost: float
 
 
-class MachineProcess:
+class MachineProcess(ChildService):
     """A machine in a child process, which ends with `close`, and with the process that started it.
 
         with Hub(port=0) as hub, MachineProcess(scenario, hub.url) as machine:
@@ -63,6 +61,8 @@ class MachineProcess:
         options: fields of the config, which replace those of ``config``.
     """
 
+    name, error = "the machine", MachineError
+
     def __init__(
         self,
         scenario: Scenario,
@@ -78,7 +78,6 @@ class MachineProcess:
         self.url = url
         self.config = replace(config or MachineConfig(), **options)
         self._run = {"lock_step": lock_step, "cycles": inf if cycles is None else cycles, "priority": priority}
-        self._child: ChildProcess | None = None
         self._paused = False
 
     def start(self) -> None:
@@ -90,26 +89,7 @@ class MachineProcess:
         if self.alive:
             raise MachineError("the machine runs already")
         self.close()
-        child = ChildProcess(_serve_child, self.scenario, self.url, self.config, self._run, name="the machine")
-        try:
-            child.wait_until_ready()
-        except StartError as error:
-            raise MachineError(str(error)) from error
-        self._child = child
-
-    def _running(self) -> ChildProcess:
-        if self._child is None:
-            raise MachineError("the machine does not run: start it, or use it in a with statement")
-        return self._child
-
-    @property
-    def pid(self) -> int:
-        """Return the process id of the machine.
-
-        Raises:
-            MachineError: it has not been started.
-        """
-        return self._running().pid
+        self._start(_serve_child, self.scenario, self.url, self.config, self._run)
 
     @property
     def alive(self) -> bool:
@@ -189,7 +169,7 @@ class MachineProcess:
         os.kill(self.pid, signal.SIGCONT)
         self._paused = False
 
-    def wait(self, timeout: float = _ANSWER_TIMEOUT) -> int:
+    def wait(self, timeout: float = 10.0) -> int:
         """Wait until the machine has ended, and return its exit code.
 
         Raises:
@@ -202,19 +182,10 @@ class MachineProcess:
 
     def close(self) -> None:
         """End the machine; it can be started again."""
-        if self._child is not None:
-            if self._paused:
-                self._child.kill()
-            self._child.close(_ANSWER_TIMEOUT)
-        self._child = None
+        if self._child is not None and self._paused:
+            self._child.kill()
+        super().close()
         self._paused = False
-
-    def __enter__(self) -> MachineProcess:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- requests
 
@@ -223,11 +194,7 @@ class MachineProcess:
         return MachineStatus(**{item.name: answer[item.name] for item in fields(MachineStatus)})
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        try:
-            line = self._running().request(_to_line(request), timeout=_ANSWER_TIMEOUT)
-        except OSError as error:
-            raise MachineError(f"the machine does not answer: {error}") from error
-        answer: dict[str, Any] = json.loads(line)
+        answer: dict[str, Any] = json.loads(self._request(_to_line(request)))
         if "error" in answer:
             raise MachineError(answer["error"])
         return answer

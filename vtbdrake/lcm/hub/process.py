@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import signal
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
-from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.child_process import ChildService, ending_signals, report_ready
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.lcm.hub.routing import HubStatistics
 from vtbdrake.lcm.hub.server import HubConfig, HubServer, listen
@@ -20,7 +19,6 @@ from vtbdrake.lcm.hub.tcpq import address_name
 
 _log = logging.getLogger(__name__)
 
-_ANSWER_TIMEOUT = 5.0
 _MAX_LOG = 1000
 
 
@@ -28,7 +26,7 @@ class HubError(RuntimeError):
     """The process of a hub does not start, or has ended."""
 
 
-class Hub:
+class Hub(ChildService):
     """A hub in a separate process, which ends with `close`, or with the process that started it.
 
     ::
@@ -44,9 +42,10 @@ class Hub:
         ValueError: A field is out of range.
     """
 
+    name, error = "the hub", HubError
+
     def __init__(self, config: HubConfig | None = None, **fields: Any) -> None:
         self.config = replace(config or HubConfig(), **fields)
-        self._child: ChildProcess | None = None
         self._url = ""
 
     def start(self) -> None:
@@ -59,17 +58,8 @@ class Hub:
         with contextlib.ExitStack() as stack:
             listeners = [stack.enter_context(listener) for listener in listen(self.config)]
             self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
-            child = ChildProcess(_serve_child, self.config, name="the hub", sockets=listeners)
-        try:
-            child.wait_until_ready()
-        except StartError as error:
-            raise HubError(str(error)) from error
-        self._child = child
-
-    def _running(self) -> ChildProcess:
-        if self._child is None:
-            raise HubError("the hub is not running; start it, or use it in a with statement")
-        return self._child
+            self.name = f"the hub at {self._url}"
+            self._start(_serve_child, self.config, sockets=listeners)
 
     @property
     def url(self) -> str:
@@ -81,38 +71,13 @@ class Hub:
         self._running()
         return self._url
 
-    @property
-    def pid(self) -> int:
-        """Return the process id of the hub.
-
-        Raises:
-            HubError: The hub is not running.
-        """
-        return self._running().pid
-
     def statistics(self) -> HubStatistics:
         """Return the present statistics.
 
         Raises:
             HubError: The hub does not answer.
         """
-        try:
-            return HubStatistics.from_json(self._running().request(b"?", timeout=_ANSWER_TIMEOUT))
-        except OSError as error:
-            raise HubError(f"the hub at {self._url} does not answer: {error}") from error
-
-    def close(self) -> None:
-        """End the hub; it can be started again."""
-        if self._child is not None:
-            self._child.close(_ANSWER_TIMEOUT)
-        self._child = None
-
-    def __enter__(self) -> Hub:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return HubStatistics.from_json(self._request(b"?"))
 
 
 def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
@@ -122,9 +87,6 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
         server: the hub.
         ready: called when processors and priority are set.
     """
-    signal.signal(signal.SIGTERM, lambda *_: server.stop())
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda *_: server.stop())
     config = server.config
     settings = RealTime(
         priority=config.priority or None,
@@ -134,7 +96,7 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
         switch_interval=None,
         longest_step=None,
     )
-    with settings, _logging_in_thread():
+    with ending_signals(lambda *_: server.stop()), settings, _logging_in_thread():
         for grant in settings.grants:
             if not grant.granted:
                 _log.warning("%s", grant)
