@@ -30,9 +30,10 @@ BELOW: dict[str, set[str]] = {
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
 # Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
-# travel to them, and when the names of a package are imported.
+# travel to them, when the names of a package are imported, and splines.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "child_process", "lazy", "pickling"})
+    _layers.update({"argument_checks", "child_process", "lazy", "pickling", "spline"})
+BELOW["spline"] = {"argument_checks"}
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
 BELOW["argument_checks"] = set()

@@ -1,0 +1,88 @@
+"""The part of a DPS that turns a plan, the knots of a spline, into a value over time."""
+
+from __future__ import annotations
+
+from math import inf, isfinite
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from vtbdrake.spline import Spline
+from vtbdrake.state import discrete_state
+from vtbdrake.state.declarations import NO_DICT
+
+# In seconds: a plan that begins at k * period begins at the sample of that number, however both are rounded.
+_ROUNDING = 1e-9
+
+
+class SplineCommand(LeafSystem):
+    """Follows a plan: a spline over time whose knots are decided while it runs.
+
+    .. pydrake_system::
+
+        name: SplineCommand
+        input_ports:
+        - plan
+        output_ports:
+        - value
+
+    ``plan`` = [t_begin, w_0, ..., w_{n-1}] has 1 + n m entries: the time at which the plan begins, in seconds, and n
+    knots of m entries each. At t = 0, T, 2 T, ... the system reads the plan, and its output, which is its state,
+    becomes the spline's value at t - t_begin. So one vector holds all that is decided, whether by an operator (a
+    command u), by a slow part or in a rollout; and a plan that arrives late is joined where it should be by then.
+
+    Before t_begin the value stays as it is. After the end of the plan it is the last one, or ``after``.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self, spline: Spline, *, period: float, size: int = 1, after: ArrayLike | None = None, unit: str = "1"
+    ) -> None:
+        """Declare the system.
+
+        Args:
+            spline: the curve that the knots define.
+            period: sample period T in seconds.
+            size: entries m of the value.
+            after: the value after the end of the plan, a scalar or shape (m,), for example a force of 0 if nobody
+                decides any more. None holds the last value of the plan.
+            unit: unit of the value.
+
+        Raises:
+            ValueError: the period or the size is not positive, or ``after`` is not finite or has another size.
+        """
+        super().__init__()
+        if not 0.0 < period < inf:
+            raise ValueError(f"SplineCommand: period is positive, in s, not {period}")
+        if size < 1:
+            raise ValueError(f"SplineCommand: a value has at least one entry, not {size}")
+        self._spline, self._size = spline, int(size)
+        self._after = None if after is None else _vector(after, self._size)
+        self._plan = self.DeclareVectorInputPort("plan", 1 + spline.knots * self._size)
+        value = self.DeclareDiscreteState(np.zeros(self._size))
+        self.DeclareStateOutputPort("value", value)
+        shape = () if self._size == 1 else (self._size,)
+        self.variables = (discrete_state("value", int(value), shape=shape, unit=unit),)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        plan, spline = self._plan.Eval(context), self._spline
+        if not isfinite(plan.sum()):
+            raise ValueError(f"SplineCommand: the plan is [t_begin, knots] in finite numbers, not {plan.tolist()}")
+        t = context.get_time() - float(plan[0])
+        if t < -_ROUNDING:
+            return
+        if t > spline.duration + _ROUNDING and self._after is not None:
+            value = self._after
+        else:
+            value = spline.weights(min(max(t, 0.0), spline.duration)) @ plan[1:].reshape(spline.knots, self._size)
+        state.set_value(0, value)
+
+
+def _vector(value: ArrayLike, size: int) -> np.ndarray:
+    array = np.asarray(value, dtype=float)
+    if array.shape not in ((), (size,)) or not np.isfinite(array).all():
+        raise ValueError(f"SplineCommand: after is one finite number, or {size} of them, not {value!r}")
+    return np.array(np.broadcast_to(array, (size,)))

@@ -1,0 +1,3 @@
+"""The public names for reasoning."""
+
+from vtbdrake.reasoning.trajectory import Trajectory as Trajectory

@@ -1,0 +1,257 @@
+"""Decisions that are whole trajectories: the knots of a spline, within limits that hold between the knots, too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.argument_checks import as_whole
+from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.spline import Spline
+from vtbdrake.state import Variables
+
+Array = NDArray[np.float64]
+
+# Rows that are this small beside the largest one are rounding errors of zero.
+_NEGLIGIBLE = 1e-12
+# Relative: limits that are exceeded by less count as kept, and those of rates are reached up to this.
+_ROUNDING, _ACCURACY = 1e-9, 1e-5
+_LIMITS = ("lower", "upper", "rate", "acceleration")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A decision that is a trajectory: a spline whose knots are searched, over a vector command.
+
+    The variable at ``address`` is a plan [t_begin, w_0, ..., w_{n-1}] of 1 + n m entries, as a `SplineCommand` of the
+    DPS takes it: the time at which the plan begins, and n knots of m entries. It may be a command (``u.plan``) or any
+    other element of the DPS. A search varies one `Parameter` per knot and entry; the reasoner sets t_begin.
+
+    The limits hold at every instant of the plan, not only at the knots: `limited` changes a candidate as far as they
+    require. Where the rate is limited, the plan also begins at the value of the plan in use. (Its rate there may
+    differ from that of the plan in use, whatever the acceleration limit.)
+
+    Attributes:
+        address: of the plan.
+        knots: their number n.
+        duration: of the plan in seconds, usually the horizon. Afterwards the last value is held.
+        order: ``zero``, ``linear``, ``cubic`` or ``bspline``, see `Spline`.
+        size: entries m of a knot.
+        lower, upper: limits of the value, scalars or one per entry, in its unit.
+        rate: the largest change per second, positive, likewise.
+        acceleration: the largest change per second of that change, positive, likewise.
+
+    Raises:
+        ValueError: a limit is ill-formed or cannot be kept by splines of this order, or see `Spline`.
+    """
+
+    address: str
+    knots: int
+    duration: float
+    order: str = "cubic"
+    size: int = field(default=1, kw_only=True)
+    lower: ArrayLike = field(kw_only=True)
+    upper: ArrayLike = field(kw_only=True)
+    rate: ArrayLike = field(default=inf, kw_only=True)
+    acceleration: ArrayLike = field(default=inf, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.address, str):
+            raise ValueError(f"a trajectory is named by the address of its plan, a text, not by {self.address!r}")
+        size = as_whole(f"the size of {self.address}", self.size)
+        if size < 1:
+            raise ValueError(f"{self.address} has at least one entry, not {size}")
+        object.__setattr__(self, "size", size)
+        for name in _LIMITS:
+            object.__setattr__(self, name, self._limit(name))
+        for derivative, name in enumerate(("rate", "acceleration"), 1):
+            limit = np.asarray(getattr(self, name))
+            if not (limit > 0.0).all():
+                raise ValueError(f"the {name} limit of {self.address} is positive, not {limit.tolist()}")
+            if (limit < inf).any() and self.spline.smoothness < derivative:
+                raise ValueError(
+                    f"a trajectory of order {self.order!r} has no finite {name}, so it cannot keep the {name} limit "
+                    f"of {self.address}: take order='cubic' or 'bspline'"
+                )
+        assert self.parameters  # Their ranges are checked.
+
+    def _limit(self, name: str) -> tuple[float, ...]:
+        given = getattr(self, name)
+        try:
+            values = np.broadcast_to(np.asarray(given, dtype=float), (self.size,))
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{name} of {self.address} is a number, or one for each of its {self.size} entries, not {given!r}"
+            ) from error
+        return tuple(values.tolist())
+
+    @cached_property
+    def _limits(self) -> Array:
+        """Return lower, upper, rate and acceleration, shape (4, m)."""
+        return np.array([getattr(self, name) for name in _LIMITS])
+
+    @cached_property
+    def spline(self) -> Spline:
+        """Return the curve that the knots define."""
+        return Spline(self.order, self.knots, self.duration)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return what a search varies: n m parameters, knot by knot."""
+        ranges = self._limits[:2].T.tolist() * self.spline.knots
+        return tuple(Parameter(f"{self.address}[{1 + k}]", *ends) for k, ends in enumerate(ranges))
+
+    @property
+    def begin(self) -> str:
+        """Return the address of t_begin."""
+        return f"{self.address}[0]"
+
+    @property
+    def is_continued(self) -> bool:
+        """Return whether a plan begins at the value of the plan in use, as a limited rate requires."""
+        return bool((self._limits[2] < inf).any())
+
+    def find(self, variables: Variables) -> None:
+        """Check that the testbed has this plan.
+
+        Raises:
+            ValueError: there is no such variable, it has another size, or its bounds are narrower than the limits.
+        """
+        shape = (1 + self.spline.knots * self.size,)
+        variable = variables[self.address]
+        if variable.shape != shape:
+            raise ValueError(
+                f"{self.address} has shape {variable.shape}; a plan of {self.spline.knots} knots with {self.size} "
+                f"entries each, and the time at which it begins, has shape {shape}"
+            )
+        for parameter in self.parameters:
+            parameter.find(variables)
+
+    def plan(self, knots: ArrayLike, begin: float) -> Array:
+        """Return the whole plan [t_begin, knots].
+
+        Args:
+            knots: shape (n m,) or (n, m).
+            begin: t_begin in seconds.
+        """
+        return np.concatenate(([float(begin)], self._matrix(knots).ravel()))
+
+    def values(self, knots: ArrayLike, times: ArrayLike, derivative: int = 0) -> Array:
+        """Return the trajectory, or a derivative, at some times.
+
+        Args:
+            knots: shape (n m,) or (n, m).
+            times: shape (p,), in seconds since t_begin.
+            derivative: 0 to 3.
+
+        Returns:
+            Shape (p, m).
+        """
+        return self.spline.matrix(times, derivative) @ self._matrix(knots)
+
+    def shifted(self, knots: ArrayLike, dt: float) -> Array:
+        """Return the knots of the same trajectory for a plan that begins ``dt`` seconds later, within the limits.
+
+        It ends with the old last value. Where the new knots cannot follow the old curve exactly, they agree with it
+        at the `Spline.sites`.
+
+        Args:
+            knots: shape (n m,) or (n, m).
+            dt: in seconds.
+
+        Returns:
+            Knots in the shape of those given.
+        """
+        shifted = self.spline.shift(dt) @ self._matrix(knots)
+        return self.limited(shifted, start=shifted[0] if self.is_continued else None).reshape(np.shape(knots))
+
+    def limited(self, knots: ArrayLike, *, start: ArrayLike | None = None) -> Array:
+        """Return the nearest knots whose trajectory keeps all limits at every instant.
+
+        A trajectory that keeps them already stays as it is. Any other one is projected, in the Euclidean distance of
+        the knots, onto those whose Bezier points keep the limits, see `Spline.bezier`. It may end up a little inside
+        the limits.
+
+        Args:
+            knots: shape (n m,) or (n, m).
+            start: the value at which it begins, a scalar or shape (m,); where it was decided, if left out.
+
+        Returns:
+            Knots in the shape of those given.
+        """
+        lower, upper = self._limits[:2]
+        w = np.clip(self._matrix(knots), lower, upper)
+        if start is not None:
+            w[0] = np.clip(start, lower, upper)
+        for j in range(self.size):
+            if any(value[j] > 0.0 for value in self._beyond(w).values()):
+                w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+        return w.reshape(np.shape(knots))
+
+    def _projected(self, w: Array, j: int, *, fixed: int) -> Array:
+        """Return the knots of entry ``j`` nearest to ``w`` that keep its limits; the first ``fixed`` ones are kept."""
+        value, speed, change = (self.spline.bezier(derivative) for derivative in range(3))
+        lower, upper, rate, acceleration = self._limits[:, j]
+        sides = (
+            (value, upper),
+            (-value, -lower),
+            *((sign * speed, (1.0 - _ACCURACY) * rate) for sign in (1, -1)),
+            *((sign * change, (1.0 - _ACCURACY) * acceleration) for sign in (1, -1)),
+        )
+        kept = [(rows, limit) for rows, limit in sides if limit < inf]
+        rows = np.concatenate([rows for rows, _ in kept])
+        room = np.concatenate([np.full(len(rows), limit) for rows, limit in kept]) - rows @ w
+        return w + np.concatenate((np.zeros(fixed), _shortest(rows[:, fixed:], room)))
+
+    def excess(self, knots: ArrayLike) -> dict[str, float]:
+        """Return by how much a trajectory exceeds its limits, by ``lower``, ``upper``, ``rate`` and ``acceleration``.
+
+        Args:
+            knots: shape (n m,) or (n, m).
+        """
+        beyond = {name: float(value.max()) for name, value in self._beyond(self._matrix(knots)).items()}
+        return {name: value for name, value in beyond.items() if value > 0.0}
+
+    def _beyond(self, w: Array) -> dict[str, Array]:
+        """Return by how much each limit is exceeded, shape (m,) each; not positive where it is kept."""
+        (least, most), speeds, changes = (self.spline.extremes(w, derivative) for derivative in range(3))
+        lower, upper, rate, acceleration = self._limits
+        tolerance = _ROUNDING * (upper - lower)
+        return {
+            "lower": lower - least - tolerance,
+            "upper": most - upper - tolerance,
+            "rate": np.max(np.abs(speeds), axis=0) - (1.0 + _ROUNDING) * rate,
+            "acceleration": np.max(np.abs(changes), axis=0) - (1.0 + _ROUNDING) * acceleration,
+        }
+
+    def _matrix(self, knots: ArrayLike) -> Array:
+        w = np.array(knots, dtype=float)
+        n, m = self.spline.knots, self.size
+        if w.shape not in ((n * m,), (n, m)):
+            raise ValueError(f"{self.address} has {n} knots of {m} entries, but those given have shape {w.shape}")
+        if not np.isfinite(w).all():
+            raise ValueError(f"the knots of {self.address} are finite numbers, not {w.tolist()}")
+        return w.reshape(n, m)
+
+
+def _shortest(rows: Array, room: Array) -> Array:
+    """Return the shortest x of shape (n,) with rows x <= room; rows has shape (k, n)."""
+    # Imported here: it takes as long as the rest of the package.
+    from pydrake.solvers import ClarabelSolver, MathematicalProgram
+
+    length = np.linalg.norm(rows, axis=1)
+    bound = length > _NEGLIGIBLE * length.max()
+    rows, room = rows[bound] / length[bound, None], room[bound] / length[bound]
+    scale = np.abs(room).max()
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(rows.shape[1])
+    program.AddQuadraticErrorCost(1.0, np.zeros(len(x)), x)
+    program.AddLinearConstraint(rows, np.full(len(room), -inf), room / scale, x)
+    result = ClarabelSolver().Solve(program)
+    if not result.is_success():
+        raise RuntimeError(f"no knots that keep the limits were found: {result.get_solution_result()}")
+    return scale * np.asarray(result.GetSolution(x), dtype=float)
