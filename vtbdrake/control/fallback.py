@@ -13,15 +13,10 @@ from vtbdrake.testbed import Interface, Signal
 
 
 class Sample(NamedTuple):
-    """The newest plausible sample of a sensor signal.
+    """The newest plausible sample of a sensor signal."""
 
-    Attributes:
-        value: an array of shape (size,), or an abstract value.
-        age: time since it arrived, in seconds.
-    """
-
-    value: Any
-    age: float
+    value: Any  # an array of shape (size,), or an abstract value
+    age: float  # time since it arrived, in seconds
 
 
 class NoCommand:

@@ -27,17 +27,11 @@ MOST_UNSENT = 10
 
 
 class Verdict(NamedTuple):
-    """The guards' decision in one cycle.
+    """The guards' decision in one cycle."""
 
-    Attributes:
-        actuation: the commands to be sent, by actuator signal.
-        ok: whether these are the DPS's commands, limited; otherwise they are the fallbacks'.
-        faults: the faults of this cycle. A latch can outlast them.
-    """
-
-    actuation: dict[str, Any]
-    ok: bool
-    faults: tuple[Fault, ...]
+    actuation: dict[str, Any]  # the commands to be sent, by actuator signal
+    ok: bool  # whether these are the DPS's commands, limited; otherwise they are the fallbacks'
+    faults: tuple[Fault, ...]  # the faults of this cycle. A latch can outlast them.
 
 
 class Guards:

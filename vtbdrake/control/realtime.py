@@ -37,19 +37,12 @@ class RunawayError(BaseException):
 
 @dataclass(frozen=True)
 class Grant:
-    """The operating system's answer to one request.
+    """The operating system's answer to one request."""
 
-    Attributes:
-        request: the requested setting.
-        granted: whether it was granted.
-        reason: why it was refused; empty if granted.
-        remedy: what to do about a refusal; empty if granted.
-    """
-
-    request: str
-    granted: bool
-    reason: str = ""
-    remedy: str = ""
+    request: str  # the requested setting
+    granted: bool  # whether it was granted
+    reason: str = ""  # why it was refused; empty if granted
+    remedy: str = ""  # what to do about a refusal; empty if granted
 
     def __str__(self) -> str:
         return f"{self.request}: " + ("granted" if self.granted else f"refused ({self.reason}): {self.remedy}")

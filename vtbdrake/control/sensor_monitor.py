@@ -21,21 +21,14 @@ SETTLING = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A detected reason why the machine must not get the DPS's commands.
+    """A detected reason why the machine must not get the DPS's commands."""
 
-    Attributes:
-        time: time of detection on the loop's clock, in seconds.
-        signal: name of the faulty signal; None if the fault concerns all.
-        kind: of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``,
-            ``not finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``blocked``
-            or ``told``.
-        reason: description in one sentence.
-    """
-
-    time: float
-    signal: str | None
+    time: float  # time of detection on the loop's clock, in seconds
+    signal: str | None  # name of the faulty signal; None if the fault concerns all
+    # of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``, ``not
+    # finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``blocked`` or ``told``
     kind: str
-    reason: str
+    reason: str  # description in one sentence
 
     def __str__(self) -> str:
         return self.reason

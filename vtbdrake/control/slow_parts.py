@@ -27,22 +27,14 @@ _ROUNDING = 1e-6
 
 @dataclass
 class SlowStatistics:
-    """Statistics of a slow part beside the loop.
+    """Statistics of a slow part beside the loop."""
 
-    Attributes:
-        results: the number of results that arrived in time.
-        missed: the number of results that were declared missing.
-        late: the number of results that arrived after that, and were not used.
-        errors: the number of calls of its function that raised an exception.
-        restarts: the number of times its worker was replaced, because it died or did not answer.
-        took: the times from a request to its answer, in seconds on the loop's clock.
-    """
-
-    results: int = 0
-    missed: int = 0
-    late: int = 0
-    errors: int = 0
-    restarts: int = 0
+    results: int = 0  # the number of results that arrived in time
+    missed: int = 0  # the number of results that were declared missing
+    late: int = 0  # the number of results that arrived after that, and were not used
+    errors: int = 0  # the number of calls of its function that raised an exception
+    restarts: int = 0  # the number of times its worker was replaced, because it died or did not answer
+    # the times from a request to its answer, in seconds on the loop's clock
     took: Histogram = field(default_factory=Histogram)
 
 

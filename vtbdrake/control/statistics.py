@@ -134,19 +134,12 @@ class Histogram:
 
 @dataclass
 class Threshold:
-    """Thresholds of a duration, with counts of the durations above them.
+    """Thresholds of a duration, with counts of the durations above them."""
 
-    Attributes:
-        warning: longer durations count as warnings, in seconds.
-        error: longer durations count as errors, in seconds.
-        warnings: number of durations above ``warning``, up to ``error``.
-        errors: number of durations above ``error``.
-    """
-
-    warning: float
-    error: float
-    warnings: int = 0
-    errors: int = 0
+    warning: float  # longer durations count as warnings, in seconds
+    error: float  # longer durations count as errors, in seconds
+    warnings: int = 0  # number of durations above ``warning``, up to ``error``
+    errors: int = 0  # number of durations above ``error``
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.warning <= self.error:

@@ -42,24 +42,15 @@ class Cycle(NamedTuple):
 
     Together with the state before the first cycle, ``changes`` and ``fed`` of every cycle determine all that the DPS
     does.
-
-    Attributes:
-        number: number of the cycle, from 0.
-        time: DPS time at the end of the cycle, in seconds; unchanged if the DPS raised or has not started.
-        now: time on the runtime's clock after the cycle's messages were received, in seconds.
-        changes: changes of the target before the step, in order.
-        fed: sensor values that are new to the DPS in this cycle, by signal.
-        actuation: the DPS's actuator commands before the guards, by signal; empty if it raised.
-        verdict: the guards' decision; `Verdict.actuation` was sent.
     """
 
-    number: int
-    time: float
-    now: float
-    changes: tuple[Change, ...]
-    fed: Mapping[str, Any]
-    actuation: Mapping[str, Any]
-    verdict: Verdict
+    number: int  # number of the cycle, from 0
+    time: float  # DPS time at the end of the cycle, in seconds; unchanged if the DPS raised or has not started
+    now: float  # time on the runtime's clock after the cycle's messages were received, in seconds
+    changes: tuple[Change, ...]  # changes of the target before the step, in order
+    fed: Mapping[str, Any]  # sensor values that are new to the DPS in this cycle, by signal
+    actuation: Mapping[str, Any]  # the DPS's actuator commands before the guards, by signal; empty if it raised
+    verdict: Verdict  # the guards' decision; `Verdict.actuation` was sent
 
 
 def time_after(steps: int, *, start: float, period: float) -> float:

@@ -27,19 +27,12 @@ class SwitchRefusedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Preparation:
-    """The first phase of a switch: the planned changes, and the reasons against them.
+    """The first phase of a switch: the planned changes, and the reasons against them."""
 
-    Attributes:
-        sense: new positions by sensor signal.
-        act: new positions by actuator signal.
-        reasons: the reasons against the switch; empty if there are none.
-        cycle: number of the runtime's cycles when they were collected.
-    """
-
-    sense: Mapping[str, str]
-    act: Mapping[str, str]
-    reasons: tuple[str, ...]
-    cycle: int
+    sense: Mapping[str, str]  # new positions by sensor signal
+    act: Mapping[str, str]  # new positions by actuator signal
+    reasons: tuple[str, ...]  # the reasons against the switch; empty if there are none
+    cycle: int  # number of the runtime's cycles when they were collected
 
 
 def prepare(

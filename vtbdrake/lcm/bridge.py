@@ -288,17 +288,13 @@ class ChannelReader:
 
 @dataclass
 class SentSignal:
-    """The record of one actuator signal.
+    """The record of one actuator signal."""
 
-    Attributes:
-        count: how many actuator commands were sent.
-        withheld: how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its
-            message needs another signal), ``same message`` (another signal of its message was at fault), ``encode``,
-            ``no bus`` (lost, or it takes nothing at present), ``refused`` (the hub protects the channel for another
-            client; counted from the hub's first message about it).
-    """
-
-    count: int = 0
+    count: int = 0  # how many actuator commands were sent
+    # how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its message needs
+    # another signal), ``same message`` (another signal of its message was at fault), ``encode``, ``no bus`` (lost, or
+    # it takes nothing at present), ``refused`` (the hub protects the channel for another client; counted from the hub's
+    # first message about it)
     withheld: dict[str, int] = field(default_factory=dict)
 
     def record(self, problem: str) -> None:

@@ -87,12 +87,9 @@ class ImageMap(LcmMap):
 
     A signal's ``model_value`` gives pixel type, width and height. Rejected are an image of another size (``size``), of
     another pixel type (``type``), and one that is compressed by anything but zlib (``compression``).
-
-    Attributes:
-        select: returns the `lcmt_image` of each signal from a message.
     """
 
-    select: Callable[[Any], Mapping[str, Any]]
+    select: Callable[[Any], Mapping[str, Any]]  # returns the `lcmt_image` of each signal from a message
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         models = {signal.name: signal.model_value for signal in signals}

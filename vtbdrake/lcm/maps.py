@@ -159,19 +159,13 @@ class LcmMap:
 
 
 class Field(NamedTuple):
-    """A field of a message type.
+    """A field of a message type."""
 
-    Attributes:
-        path: its name; dotted if it lies in a message within the message.
-        typename: its type in LCM.
-        dimensions: its shape; the path of another field where that field holds the size. Empty for a scalar.
-        members: the fields of a message within the message.
-    """
-
-    path: str
-    typename: str
+    path: str  # its name; dotted if it lies in a message within the message
+    typename: str  # its type in LCM
+    # its shape; the path of another field where that field holds the size. Empty for a scalar.
     dimensions: tuple[int | str, ...] = ()
-    members: tuple[Field, ...] = ()
+    members: tuple[Field, ...] = ()  # the fields of a message within the message
 
     @property
     def code(self) -> str:
@@ -215,17 +209,11 @@ def _by_path(fields: Sequence[Field]) -> dict[str, Field]:
 
 @dataclass(frozen=True, kw_only=True)
 class VectorMap(LcmMap):
-    """An `LcmMap` of vector signals; `vector_map` makes one.
+    """An `LcmMap` of vector signals; `vector_map` makes one."""
 
-    Attributes:
-        parts: by signal, the fields that hold its entries, one after the other.
-        fields: all fields of the message type.
-        stamp: path of the field with the sender's time in microseconds; empty if there is none.
-    """
-
-    parts: Mapping[str, Sequence[Field]]
-    fields: Sequence[Field]
-    stamp: str = ""
+    parts: Mapping[str, Sequence[Field]]  # by signal, the fields that hold its entries, one after the other
+    fields: Sequence[Field]  # all fields of the message type
+    stamp: str = ""  # path of the field with the sender's time in microseconds; empty if there is none
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         self._check(signals)

@@ -19,19 +19,12 @@ class InjectedFaultError(ValueError):
 
 
 class Packet(NamedTuple):
-    """A message on its way.
+    """A message on its way."""
 
-    Attributes:
-        channel: the LCM channel.
-        type: the message type, a class made by lcm-gen.
-        data: the bytes.
-        due: the cycle of the machine in which it arrives.
-    """
-
-    channel: str
-    type: Any
-    data: bytes
-    due: int
+    channel: str  # the LCM channel
+    type: Any  # the message type, a class made by lcm-gen
+    data: bytes  # the bytes
+    due: int  # the cycle of the machine in which it arrives
 
 
 Effect = Callable[[Packet], Iterable[Packet]]
@@ -40,19 +33,14 @@ Effect = Callable[[Packet], Iterable[Packet]]
 
 @dataclass(frozen=True, kw_only=True)
 class InjectedFault:
-    """One thing that goes wrong with messages until it is ended.
-
-    Attributes:
-        side: ``sense`` for messages that the machine sends, ``act`` for those that it receives.
-        channels: the channels that are affected; all of that side if empty.
-    """
+    """One thing that goes wrong with messages until it is ended."""
 
     name: ClassVar[str]
     sides: ClassVar[Sequence[str]] = (SENSE, ACT)
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # of fields; those of whole numbers are integers
 
-    side: str = SENSE
-    channels: Sequence[str] = ()
+    side: str = SENSE  # ``sense`` for messages that the machine sends, ``act`` for those that it receives
+    channels: Sequence[str] = ()  # the channels that are affected; all of that side if empty
 
     def __post_init__(self) -> None:
         if self.side not in self.sides:
@@ -118,17 +106,12 @@ class Freeze(InjectedFault):
 
 @dataclass(frozen=True, kw_only=True)
 class Corrupt(InjectedFault):
-    """Messages arrive corrupted.
-
-    Attributes:
-        kind: a key of `CORRUPTIONS`.
-        fraction: the probability for each message.
-    """
+    """Messages arrive corrupted."""
 
     name = "corrupt"
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"fraction": (0.0, 1.0)}
-    kind: str = "bits"
-    fraction: float = 1.0
+    kind: str = "bits"  # a key of `CORRUPTIONS`
+    fraction: float = 1.0  # the probability for each message
 
     def __post_init__(self) -> None:
         super().__post_init__()

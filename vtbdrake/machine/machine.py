@@ -80,26 +80,17 @@ class MachineConfig:
 
 @dataclass
 class MachineStatus:
-    """The status of a machine.
+    """The status of a machine."""
 
-    Attributes:
-        cycle: the number of cycles it has done.
-        time: the time of its world, in seconds.
-        braking: True if it braked in its last cycle.
-        silent: the command channels on which no command was accepted for longer than its timeout.
-        accepted: the number of accepted commands, by actuator signal.
-        rejected: the number of rejected commands, by actuator signal and reason; see `ReceivedSignal`, and
-            `Machine.reject_late` for the reason ``late``.
-        faults: the injected faults that have begun, as `InjectedFault.to_dict` gives them.
-    """
-
-    cycle: int
-    time: float
-    braking: bool
-    silent: list[str]
-    accepted: dict[str, int]
+    cycle: int  # the number of cycles it has done
+    time: float  # the time of its world, in seconds
+    braking: bool  # True if it braked in its last cycle
+    silent: list[str]  # the command channels on which no command was accepted for longer than its timeout
+    accepted: dict[str, int]  # the number of accepted commands, by actuator signal
+    # the number of rejected commands, by actuator signal and reason; see `ReceivedSignal`, and `Machine.reject_late`
+    # for the reason ``late``
     rejected: dict[str, dict[str, int]]
-    faults: list[dict[str, Any]]
+    faults: list[dict[str, Any]]  # the injected faults that have begun, as `InjectedFault.to_dict` gives them
 
     def to_dict(self) -> dict[str, Any]:
         """Return the status as plain data for JSON."""

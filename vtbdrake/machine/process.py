@@ -30,17 +30,11 @@ class MachineError(RuntimeError):
 
 @dataclass(frozen=True)
 class MachineStatistics:
-    """Statistics of the loop of a machine; see `MachineLoop`.
+    """Statistics of the loop of a machine; see `MachineLoop`."""
 
-    Attributes:
-        loop: the statistics of its cycles; ``step`` is the simulation.
-        state_to_command: the times from sending a state to the arrival of the next command, in seconds.
-        lost: the time in seconds by which the simulation did not keep up with the clock.
-    """
-
-    loop: LoopStatistics
-    state_to_command: Histogram
-    lost: float
+    loop: LoopStatistics  # the statistics of its cycles; ``step`` is the simulation
+    state_to_command: Histogram  # the times from sending a state to the arrival of the next command, in seconds
+    lost: float  # the time in seconds by which the simulation did not keep up with the clock
 
 
 class MachineProcess(ChildService):

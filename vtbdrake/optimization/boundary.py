@@ -31,19 +31,12 @@ _REPEATS = 5
 
 @dataclass(frozen=True)
 class Chance:
-    """The share of unsafe rollouts of one value, repeated under one condition with jittered start values.
+    """The share of unsafe rollouts of one value, repeated under one condition with jittered start values."""
 
-    Attributes:
-        value: the parameter's value.
-        condition: number of the condition.
-        rollouts: the number of rollouts at this value, the one without jitter included.
-        unsafe: the number of unsafe ones.
-    """
-
-    value: float
-    condition: int
-    rollouts: int
-    unsafe: int
+    value: float  # the parameter's value
+    condition: int  # number of the condition
+    rollouts: int  # the number of rollouts at this value, the one without jitter included
+    unsafe: int  # the number of unsafe ones
 
     @property
     def share(self) -> float:

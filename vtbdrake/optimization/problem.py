@@ -47,15 +47,10 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ProblemRollout(RolloutResult):
-    """A rollout with a reference to its problem, so that it can be shown.
+    """A rollout with a reference to its problem, so that it can be shown."""
 
-    Attributes:
-        problem: the problem of which it is a rollout.
-        condition: address -> value of its condition.
-    """
-
-    problem: Problem
-    condition: Mapping[str, Any] = field(default_factory=dict)
+    problem: Problem  # the problem of which it is a rollout
+    condition: Mapping[str, Any] = field(default_factory=dict)  # address -> value of its condition
 
     def _repr_html_(self) -> str:
         """Show the result with the quality trajectory in a notebook."""

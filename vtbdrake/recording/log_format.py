@@ -158,40 +158,27 @@ def installed_versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class LogHeader:
-    """The first event of a log: a description of the recorded loop, from which it can be built again.
+    """The first event of a log: a description of the recorded loop, from which it can be built again."""
 
-    Attributes:
-        version: version of the format.
-        scenario: text of the scenario as `Scenario.save` writes it; empty if it was built by hand or is not plain data.
-        record: what identifies the scenario, see `Scenario.record`.
-        target: ``testbed``, or ``dps`` if the DPS was stepped alone.
-        sense, act, commands: the signals.
-        period: period of the loop in seconds.
-        start_time: time of the DPS in seconds from which its steps count.
-        steps: number of steps before the first recorded cycle.
-        first_cycle: number of the first recorded cycle.
-        initialized, idle: see `Runtime`.
-        pace: the sensor signal that began the cycles; None for the clock.
-        positions: positions of a testbed's switches before the first recorded cycle.
-        versions: versions of vtbdrake, drake and Python.
-    """
-
-    version: int = VERSION
+    version: int = VERSION  # version of the format
+    # text of the scenario as `Scenario.save` writes it; empty if it was built by hand or is not plain data
     scenario: str
-    record: Mapping[str, Any]
-    target: str
+    record: Mapping[str, Any]  # what identifies the scenario, see `Scenario.record`
+    target: str  # ``testbed``, or ``dps`` if the DPS was stepped alone
+    # sense, act, commands: the signals
     sense: Sequence[LoggedSignal]
     act: Sequence[LoggedSignal]
     commands: Sequence[LoggedSignal]
-    period: float
-    start_time: float
-    steps: int
-    first_cycle: int
+    period: float  # period of the loop in seconds
+    start_time: float  # time of the DPS in seconds from which its steps count
+    steps: int  # number of steps before the first recorded cycle
+    first_cycle: int  # number of the first recorded cycle
+    # initialized, idle: see `Runtime`
     initialized: bool
     idle: bool
-    pace: str | None
-    positions: Mapping[str, Mapping[str, str]]
-    versions: Mapping[str, str] = field(default_factory=installed_versions)
+    pace: str | None  # the sensor signal that began the cycles; None for the clock
+    positions: Mapping[str, Mapping[str, str]]  # positions of a testbed's switches before the first recorded cycle
+    versions: Mapping[str, str] = field(default_factory=installed_versions)  # versions of vtbdrake, drake and Python
 
     def to_json(self) -> str:
         """Return the header as JSON."""

@@ -18,25 +18,15 @@ PARAMETER = "parameter"
 
 @dataclass(frozen=True)
 class Element:
-    """One named piece of a numeric group of a LeafSystem's context.
+    """One named piece of a numeric group of a LeafSystem's context."""
 
-    Attributes:
-        name: last part of the address.
-        group: ``continuous``, ``discrete`` or ``parameter``.
-        index: number of the group.
-        shape: ``()`` is a scalar; arrays lie in C order.
-        start: first entry in the group.
-        unit: SI unit; ``"1"`` if it has none.
-        bounds: closed interval, for every entry.
-    """
-
-    name: str
-    group: str
-    index: int
-    shape: tuple[int, ...] = ()
-    start: int = 0
-    unit: str = "1"
-    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
+    name: str  # last part of the address
+    group: str  # ``continuous``, ``discrete`` or ``parameter``
+    index: int  # number of the group
+    shape: tuple[int, ...] = ()  # ``()`` is a scalar; arrays lie in C order
+    start: int = 0  # first entry in the group
+    unit: str = "1"  # SI unit; ``"1"`` if it has none
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for every entry
 
 
 def parameter(

@@ -27,31 +27,21 @@ class VariableError(ValueError):
 
 @dataclass(frozen=True, repr=False)
 class Variable:
-    """An addressed element of the state s = [x, a] of a Diagram.
+    """An addressed element of the state s = [x, a] of a Diagram."""
 
-    Attributes:
-        address: dotted path, such as ``sim.sys.payload.mass``.
-        kind: ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part).
-        shape: of its value; ``()`` is a scalar.
-        unit: SI unit; ``"1"`` if it has none.
-        bounds: closed interval, for all entries or of the variable's shape.
-        read: reads the value from a context of the Diagram.
-        write: writes a checked value into a context; None marks a derived quantity, which is read only.
-        carried_by: empty if a copy of the numeric groups of a context carries the variable. Else (contact friction,
-            camera poses, joint locks, switches) the address of the hidden variable that copies and snapshots have to
-            carry for it: itself, or a finer one.
-        order: variables of a lower order are written first, as writing them changes others.
-    """
-
-    address: str
-    kind: str
-    shape: tuple[int, ...]
-    unit: str
-    read: Reader
+    address: str  # dotted path, such as ``sim.sys.payload.mass``
+    kind: str  # ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part)
+    shape: tuple[int, ...]  # of its value; ``()`` is a scalar
+    unit: str  # SI unit; ``"1"`` if it has none
+    read: Reader  # reads the value from a context of the Diagram
+    # writes a checked value into a context; None marks a derived quantity, which is read only
     write: Writer | None = None
-    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for all entries or of the variable's shape
+    # empty if a copy of the numeric groups of a context carries the variable. Else (contact friction, camera poses,
+    # joint locks, switches) the address of the hidden variable that copies and snapshots have to carry for it: itself,
+    # or a finer one.
     carried_by: str = ""
-    order: int = 0
+    order: int = 0  # variables of a lower order are written first, as writing them changes others
 
     def __repr__(self) -> str:
         return f"Variable({self.address!r}, kind={self.kind!r}, shape={self.shape}, unit={self.unit!r})"

@@ -44,20 +44,14 @@ class Wire:
 
 @dataclass(frozen=True)
 class Structure:
-    """Figure 4 of one testbed.
+    """Figure 4 of one testbed."""
 
-    Attributes:
-        name: of its scenario's class.
-        dps: class of the DPS; empty if it is a plain Diagram.
-        dps_parts: the DPS's subsystems.
-        world: role -> simulated parts; role is sense, sys, act or env, or ``other`` for what was added without one.
-        sense, act, commands: the signals.
-    """
-
-    name: str
-    dps: str
-    dps_parts: tuple[str, ...]
+    name: str  # of its scenario's class
+    dps: str  # class of the DPS; empty if it is a plain Diagram
+    dps_parts: tuple[str, ...]  # the DPS's subsystems
+    # role -> simulated parts; role is sense, sys, act or env, or ``other`` for what was added without one
     world: dict[str, tuple[str, ...]]
+    # sense, act, commands: the signals
     sense: tuple[Wire, ...]
     act: tuple[Wire, ...]
     commands: tuple[Wire, ...]

@@ -44,19 +44,12 @@ _RESOLUTION = 1000.0
 
 @dataclass(frozen=True, repr=False)
 class Scene:
-    """The scene of a Meshcat with its recording, which shows itself in a notebook.
+    """The scene of a Meshcat with its recording, which shows itself in a notebook."""
 
-    Attributes:
-        meshcat: the server whose scene is shown; the scene is copied when it is displayed or saved.
-        title: a caption.
-        legend: label -> colour, below the caption.
-        height: of the notebook's cell output, in pixels.
-    """
-
-    meshcat: Meshcat
-    title: str = ""
-    legend: Mapping[str, str] = field(default_factory=dict)
-    height: int = 400
+    meshcat: Meshcat  # the server whose scene is shown; the scene is copied when it is displayed or saved
+    title: str = ""  # a caption
+    legend: Mapping[str, str] = field(default_factory=dict)  # label -> colour, below the caption
+    height: int = 400  # of the notebook's cell output, in pixels
 
     def page(self) -> str:
         """Return the scene as one self-contained HTML page."""

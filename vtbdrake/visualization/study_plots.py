@@ -34,19 +34,12 @@ _DROPPED = "0.6"
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a study, grouped by their outcome.
+    """The points of a study, grouped by their outcome."""
 
-    Attributes:
-        kept: they have a value and keep all constraints.
-        broken: they have a value, but break a constraint.
-        dropped: by racing; their value is only known to be no better than their bound.
-        failed: a simulation failed.
-    """
-
-    kept: tuple[Trial, ...]
-    broken: tuple[Trial, ...]
-    dropped: tuple[Trial, ...]
-    failed: tuple[Trial, ...]
+    kept: tuple[Trial, ...]  # they have a value and keep all constraints
+    broken: tuple[Trial, ...]  # they have a value, but break a constraint
+    dropped: tuple[Trial, ...]  # by racing; their value is only known to be no better than their bound
+    failed: tuple[Trial, ...]  # a simulation failed
 
     @classmethod
     def of(cls, study: Study) -> Points:

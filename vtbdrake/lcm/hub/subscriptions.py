@@ -25,15 +25,11 @@ _PARTS = re.compile(rf"({_ATOM})({_REPETITION}?)")
 
 
 class Pattern(NamedTuple):
-    """A compiled pattern that can match more than one channel.
+    """A compiled pattern that can match more than one channel."""
 
-    Attributes:
-        matches: returns something true for a channel that matches, as liblcm decides: ``^pattern$`` is found in it.
-        cost: upper bound of the steps per character of a channel that matching takes.
-    """
-
+    # returns something true for a channel that matches, as liblcm decides: ``^pattern$`` is found in it
     matches: Callable[[str], object]
-    cost: int
+    cost: int  # upper bound of the steps per character of a channel that matching takes
 
 
 def literal(pattern: str) -> str | None:

@@ -58,15 +58,11 @@ class SetRequest:
 
 @dataclass(frozen=True)
 class ReadRequest:
-    """A request to read variables and output ports: once, or every ``every`` cycles for ``lease`` seconds.
-
-    Attributes:
-        every: period in cycles; 0 to read once.
-    """
+    """A request to read variables and output ports: once, or every ``every`` cycles for ``lease`` seconds."""
 
     id: str
     addresses: tuple[str, ...]
-    every: int = 0
+    every: int = 0  # period in cycles; 0 to read once
     lease: float = 0.0
 
 

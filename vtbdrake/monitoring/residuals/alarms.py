@@ -31,20 +31,14 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Mean and deviation of every residual in nominal operation, as plain data.
+    """Mean and deviation of every residual in nominal operation, as plain data."""
 
-    Attributes:
-        mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``).
-        windows: number of windows that it was made of.
-        horizon: length of these windows in periods.
-        period: length of a period in seconds.
-    """
-
+    # mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``)
     mean: Mapping[str, list[float]]
     deviation: Mapping[str, list[float]]
-    windows: int
-    horizon: int
-    period: float
+    windows: int  # number of windows that it was made of
+    horizon: int  # length of these windows in periods
+    period: float  # length of a period in seconds
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as JSON."""
@@ -177,25 +171,16 @@ class Cusum:
 
 @dataclass(frozen=True)
 class Alarm:
-    """A persistent difference between the machine and its model.
+    """A persistent difference between the machine and its model."""
 
-    Attributes:
-        signal: ``sense.<name>``, or ``act.<name>`` if the reported actuator command differs.
-        entry: index of the entry of the signal.
-        began, ended: time of the DPS in seconds; the end is infinite while the alarm lasts.
-        residual: measured less predicted value in the window at whose end the alarm began, in the signal's unit.
-        scale: scale of the residual in nominal operation.
-        statistic: the sum (see `Cusum`) that exceeded the threshold, in scales; at most twice the threshold.
-        threshold: threshold of the statistic.
-    """
-
-    signal: str
-    entry: int
+    signal: str  # ``sense.<name>``, or ``act.<name>`` if the reported actuator command differs
+    entry: int  # index of the entry of the signal
+    # began, ended: time of the DPS in seconds; the end is infinite while the alarm lasts
     began: float
-    residual: float
-    scale: float
-    statistic: float
-    threshold: float
+    residual: float  # measured less predicted value in the window at whose end the alarm began, in the signal's unit
+    scale: float  # scale of the residual in nominal operation
+    statistic: float  # the sum (see `Cusum`) that exceeded the threshold, in scales; at most twice the threshold
+    threshold: float  # threshold of the statistic
     ended: float = inf
 
     def __str__(self) -> str:

@@ -130,17 +130,12 @@ def _indices(places: Iterable[slice]) -> list[int]:
 
 
 class Window(NamedTuple):
-    """The residuals of one prediction.
+    """The residuals of one prediction."""
 
-    Attributes:
-        time: time of the DPS at its end, in seconds.
-        residual: mean of measured less predicted values over its samples, all signals concatenated; NaN where there was
-            no sample.
-        statistic: statistic of each entry that an alarm compares with its threshold; None without alarm detection.
-    """
-
-    time: float
+    time: float  # time of the DPS at its end, in seconds
+    # mean of measured less predicted values over its samples, all signals concatenated; NaN where there was no sample
     residual: Array
+    # statistic of each entry that an alarm compares with its threshold; None without alarm detection
     statistic: Array | None = None
 
 

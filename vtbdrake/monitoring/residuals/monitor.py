@@ -385,16 +385,11 @@ class Sampler:
 
 @dataclass
 class ResidualReport:
-    """The results since the last report.
+    """The results since the last report."""
 
-    Attributes:
-        windows: the windows.
-        alarms: alarms that began or ended.
-        skipped, failed, error: see `Comparison`.
-    """
-
-    windows: list[Window] = field(default_factory=list)
-    alarms: list[Alarm] = field(default_factory=list)
+    windows: list[Window] = field(default_factory=list)  # the windows
+    alarms: list[Alarm] = field(default_factory=list)  # alarms that began or ended
+    # skipped, failed, error: see `Comparison`
     skipped: int = 0
     failed: int = 0
     error: str = ""
