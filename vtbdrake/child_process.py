@@ -60,16 +60,16 @@ class ChildProcess:
     To restart a child, close it and create another one.
 
     Args:
-        function: a function of the child's end of the connection and the arguments. It is sent by cloudpickle, so that
+        function: A function of the child's end of the connection and the arguments. It is sent by cloudpickle, so that
             it may be defined in a notebook.
-        arguments: picklable values.
-        name: the name of the child in errors and logs, such as "the hub".
-        sockets: sockets that the child gets too, behind the arguments; they stay open here.
-        grace: time in seconds.
+        arguments: Picklable values.
+        name: The name of the child in errors and logs, such as "the hub".
+        sockets: Sockets that the child gets too, behind the arguments; they stay open here.
+        grace: Time in seconds.
 
     Attributes:
-        name: see above.
-        connection: this end of the connection. What is sent here is between the parent and ``function``.
+        name: See above.
+        connection: This end of the connection. What is sent here is between the parent and ``function``.
     """
 
     def __init__(
@@ -111,10 +111,10 @@ class ChildProcess:
         """Wait until the child has called `report_ready`. If that fails, or is interrupted, the child is killed.
 
         Args:
-            timeout: time in seconds; None to wait forever.
+            timeout: Time in seconds; None to wait forever.
 
         Raises:
-            StartError: the child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
+            StartError: The child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
         """
         try:
             reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: the rest is left to other readers.
@@ -136,7 +136,7 @@ class ChildProcess:
         """Send a line to the child, and return the line that it answers.
 
         Raises:
-            OSError: the child has ended, or does not answer within ``timeout`` seconds.
+            OSError: The child has ended, or does not answer within ``timeout`` seconds.
         """
         self.connection.settimeout(timeout)
         self.connection.sendall(line)
@@ -157,7 +157,7 @@ class ChildProcess:
         """Wait until the child has ended, and return its exit code.
 
         Raises:
-            TimeoutError: it is still running after ``timeout`` seconds.
+            TimeoutError: It is still running after ``timeout`` seconds.
         """
         try:
             return self._process.wait(timeout)
@@ -253,7 +253,7 @@ def report_ready(connection: socket.socket) -> None:
     """Tell the parent that this child is ready; see `ChildProcess.wait_until_ready`.
 
     Args:
-        connection: the child's end of the connection, on which nothing was sent before.
+        connection: The child's end of the connection, on which nothing was sent before.
     """
     connection.sendall(b"\n")
 

@@ -37,11 +37,11 @@ class FrameConnection:
         """Return the next frame.
 
         Args:
-            timeout: time in seconds; None to wait forever.
+            timeout: Time in seconds; None to wait forever.
 
         Raises:
-            EOFError: the other end is closed, and all frames were returned.
-            TimeoutError: no frame arrived in time.
+            EOFError: The other end is closed, and all frames were returned.
+            TimeoutError: No frame arrived in time.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while (frame := self._frames.frame()) is None:
@@ -56,7 +56,7 @@ class FrameConnection:
         """Send one frame that consists of the parts.
 
         Raises:
-            OSError: the other end is closed.
+            OSError: The other end is closed.
         """
         self._socket.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
@@ -68,14 +68,14 @@ class BackgroundProcess:
     scheduling on all processors, whatever the loop has. `close` ends it, and so does the end of this process.
 
     Args:
-        function: a function of a `FrameConnection` and the arguments; it returns or raises EOFError when no more frames
+        function: A function of a `FrameConnection` and the arguments; it returns or raises EOFError when no more frames
             come. It is sent by cloudpickle.
-        arguments: picklable values.
-        name: the name of the worker in errors and logs.
-        backlog: the number of bytes that may wait to be sent; frames beyond that are dropped.
+        arguments: Picklable values.
+        name: The name of the worker in errors and logs.
+        backlog: The number of bytes that may wait to be sent; frames beyond that are dropped.
 
     Attributes:
-        dropped: the number of frames that were dropped.
+        dropped: The number of frames that were dropped.
     """
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:

@@ -29,14 +29,14 @@ class Bridge(ABC):
     because the machine is gone: messages are counted, and `connected` tells the state.
 
     Attributes:
-        interface: signals of the DPS.
-        sensed: the received sensor signals, by name.
-        commands: the received commands u that come from outside, by name.
-        channels: channel of the messages of each sensor signal, for a bridge that has channels.
-        reported: for the actuator signals that the machine reports: the received command that acts there, by name.
-        tap: called with channel and bytes of every message that was received or sent, by a bridge that has channels. It
+        interface: Signals of the DPS.
+        sensed: The received sensor signals, by name.
+        commands: The received commands u that come from outside, by name.
+        channels: Channel of the messages of each sensor signal, for a bridge that has channels.
+        reported: For the actuator signals that the machine reports: the received command that acts there, by name.
+        tap: Called with channel and bytes of every message that was received or sent, by a bridge that has channels. It
             must not raise, and costs the loop's time.
-        real_time: whether `poll` waits in real time; False for a bridge of tests that advances a `SimulatedClock`.
+        real_time: Whether `poll` waits in real time; False for a bridge of tests that advances a `SimulatedClock`.
     """
 
     interface: Interface
@@ -52,7 +52,7 @@ class Bridge(ABC):
         """Connect.
 
         Raises:
-            BridgeError: the connection cannot be made. A bridge never falls back to a private bus.
+            BridgeError: The connection cannot be made. A bridge never falls back to a private bus.
         """
 
     @abstractmethod
@@ -67,7 +67,7 @@ class Bridge(ABC):
         """Send actuator commands.
 
         Args:
-            actuation: commands by actuator signal. A signal that is missing is not sent: there is no message for "no
+            actuation: Commands by actuator signal. A signal that is missing is not sent: there is no message for "no
                 command".
 
         Returns:
@@ -105,11 +105,11 @@ def reported_signals(interface: Interface, reported: Mapping[str, str]) -> dict[
     They have no limits: they are only observed.
 
     Args:
-        interface: signals of the DPS.
-        reported: actuator signal -> name, in a message, of the signal that reports what acts there.
+        interface: Signals of the DPS.
+        reported: Actuator signal -> name, in a message, of the signal that reports what acts there.
 
     Raises:
-        ValueError: there is no such actuator signal, or the name is that of another signal.
+        ValueError: There is no such actuator signal, or the name is that of another signal.
     """
     actuators = {signal.name: signal for signal in interface.act}
     taken = {signal.name for signal in interface.sense}

@@ -20,8 +20,8 @@ class Clock(ABC):
         """Wait until `now` is at least ``t``, and return the time then.
 
         Args:
-            t: a time of this clock, in seconds.
-            meanwhile: called shortly before ``t``, if there is time for it.
+            t: A time of this clock, in seconds.
+            meanwhile: Called shortly before ``t``, if there is time for it.
 
         Raises:
             ValueError: ``t`` is not finite.
@@ -34,7 +34,7 @@ class WallClock(Clock):
     Other threads and signal handlers run while it sleeps: Ctrl-C ends the wait.
 
     Args:
-        spin: time in seconds before the deadline at which it wakes up, calls ``meanwhile`` and then polls the clock. It
+        spin: Time in seconds before the deadline at which it wakes up, calls ``meanwhile`` and then polls the clock. It
             keeps a processor (and the GIL) busy to save the time that waking up takes.
 
     Raises:
@@ -66,8 +66,8 @@ class SimulatedClock(Clock):
     """A clock that only advances when it is waited for, so that runs are repeatable. It never calls ``meanwhile``.
 
     Args:
-        start: the first time, in seconds.
-        lateness: delay of `wait_until` in seconds, one per call; later calls have none.
+        start: The first time, in seconds.
+        lateness: Delay of `wait_until` in seconds, one per call; later calls have none.
     """
 
     def __init__(self, *, start: float = 0.0, lateness: Sequence[float] = ()) -> None:

@@ -34,7 +34,7 @@ class Fallback(ABC):
     """Commands one actuator signal from a fault on, until the guards are reset; its commands are limited like all.
 
     Attributes:
-        otherwise: the fallback for a cycle in which this one raises or returns an invalid command. If it is None or
+        otherwise: The fallback for a cycle in which this one raises or returns an invalid command. If it is None or
             fails, too, the last command stays.
     """
 
@@ -44,7 +44,7 @@ class Fallback(ABC):
         """Check that this fallback can command a signal.
 
         Raises:
-            ValueError: it cannot.
+            ValueError: It cannot.
         """
 
     def begin(self) -> None:  # noqa: B027 - most remember nothing
@@ -55,12 +55,12 @@ class Fallback(ABC):
         """Return the command to be sent, shape (size,), or `NO_COMMAND`.
 
         Args:
-            last_sent: the last sent command, shape (size,).
-            sensed: values of the sensor signals that are fresh and plausible at present. Usually the signal that caused
+            last_sent: The last sent command, shape (size,).
+            sensed: Values of the sensor signals that are fresh and plausible at present. Usually the signal that caused
                 the fault is missing.
-            known: the newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
+            known: The newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
                 accepted are missing.
-            dt: time since the cycle before, in seconds.
+            dt: Time since the cycle before, in seconds.
         """
 
 
@@ -96,13 +96,13 @@ class Brake(Fallback):
     `Hold`, for commanded velocities `Zero`.)
 
     Args:
-        velocity: name of the sensor signal that contains v.
-        gain: viscous damping, in the actuator signal's unit by the sensor's; a scalar or one per entry of v. In a loop
+        velocity: Name of the sensor signal that contains v.
+        gain: Viscous damping, in the actuator signal's unit by the sensor's; a scalar or one per entry of v. In a loop
             of period T it is stable for gain T < 2 * inertia; delay reduces this bound.
-        entries: the entries of the sensor signal that are v; by default all.
+        entries: The entries of the sensor signal that are v; by default all.
 
     Raises:
-        ValueError: a gain is negative.
+        ValueError: A gain is negative.
     """
 
     otherwise = Zero()
@@ -133,8 +133,8 @@ class FallbackController(Fallback):
     """Calls a function of the user.
 
     Args:
-        function: gets the arguments of `Fallback.command` and returns the command.
-        otherwise: the fallback for a cycle in which the function raises or returns an invalid command.
+        function: Gets the arguments of `Fallback.command` and returns the command.
+        otherwise: The fallback for a cycle in which the function raises or returns an invalid command.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ def default_fallback(signal: Signal) -> Fallback:
     """Return `Hold` for positions (rad, m), `Zero` for velocities, torques, forces, currents and voltages.
 
     Raises:
-        ValueError: the signal's unit is none of these.
+        ValueError: The signal's unit is none of these.
     """
     if signal.unit not in _BY_UNIT:
         raise ValueError(
@@ -172,7 +172,7 @@ def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[F
     """Return a fallback, the one that replaces it if it fails, and so on.
 
     Raises:
-        ValueError: one of them cannot command ``signal``.
+        ValueError: One of them cannot command ``signal``.
     """
     found: list[Fallback] = []
     link: Fallback | None = fallback

@@ -56,25 +56,25 @@ class Guards:
     than the `max_age` of the measurement, too: in lock-step, where that is infinite, time stands still in the pause.
 
     Args:
-        interface: signals of the DPS.
-        period: period of the loop, in seconds.
-        fallback: by actuator signal; see `default_fallback` for the others.
-        jump_tolerance: by sensor signal; see `SensorMonitor`.
-        max_delay: by sensor signal, in seconds; see `SensorMonitor`.
-        max_missed: more deadlines missed in a row are a fault. So are more commands in a row that did not leave, but
+        interface: Signals of the DPS.
+        period: Period of the loop, in seconds.
+        fallback: By actuator signal; see `default_fallback` for the others.
+        jump_tolerance: By sensor signal; see `SensorMonitor`.
+        max_delay: By sensor signal, in seconds; see `SensorMonitor`.
+        max_missed: More deadlines missed in a row are a fault. So are more commands in a row that did not leave, but
             of those never more than `MOST_UNSENT` are allowed.
-        log_size: number of faults that `log` keeps.
+        log_size: Number of faults that `log` keeps.
 
     Attributes:
-        period: period of the loop, in seconds.
-        limiters: the limiter of each actuator signal, with its counts.
-        monitors: the monitor of each sensor signal.
-        log: the newest faults, each once while it lasts.
-        measured_by: actuator signal -> sensor signal that measures what acts there; the `Runtime` takes it from its
+        period: Period of the loop, in seconds.
+        limiters: The limiter of each actuator signal, with its counts.
+        monitors: The monitor of each sensor signal.
+        log: The newest faults, each once while it lasts.
+        measured_by: Actuator signal -> sensor signal that measures what acts there; the `Runtime` takes it from its
             continuity. Without one, commands go on from the last one that left.
 
     Raises:
-        ValueError: a fallback is missing, for an unknown signal or does not fit its signal.
+        ValueError: A fallback is missing, for an unknown signal or does not fit its signal.
     """
 
     def __init__(
@@ -140,11 +140,11 @@ class Guards:
         """Let the commands of an actuator signal depart from ``value``, at rest.
 
         Args:
-            name: the actuator signal. When its switch is thrown to real, ``value`` is what is measured.
-            value: shape (size,).
+            name: The actuator signal. When its switch is thrown to real, ``value`` is what is measured.
+            value: Shape (size,).
 
         Raises:
-            ValueError: the value has another size or is not finite.
+            ValueError: The value has another size or is not finite.
         """
         self.limiters[name].start_from(value)
         self._departing |= {name}
@@ -169,15 +169,15 @@ class Guards:
         """Judge one cycle. The returned commands count as sent, unless `note_unsent` is called before the next cycle.
 
         Args:
-            now: present time on the clock of `ReceivedSignal.arrived`, in seconds.
-            received: the sensor signals that are on real; no others are monitored.
-            actuation: the DPS's commands, by actuator signal.
-            active: the actuator signals that are on real, each once; by default those of ``actuation``, or if the DPS
+            now: Present time on the clock of `ReceivedSignal.arrived`, in seconds.
+            received: The sensor signals that are on real; no others are monitored.
+            actuation: The DPS's commands, by actuator signal.
+            active: The actuator signals that are on real, each once; by default those of ``actuation``, or if the DPS
                 raised, those of the cycle before.
-            error: the error that the DPS raised, if it did.
-            missed: number of deadlines missed in a row, up to now.
-            blocked: why the machine is not to be commanded, if it is not.
-            others: sensor signals that are not on real; fallbacks may use them.
+            error: The error that the DPS raised, if it did.
+            missed: Number of deadlines missed in a row, up to now.
+            blocked: Why the machine is not to be commanded, if it is not.
+            others: Sensor signals that are not on real; fallbacks may use them.
         """
         if self._unconfirmed:
             self.note_unsent(())
@@ -214,7 +214,7 @@ class Guards:
         """Record which commands of the last verdict did not leave: they do not count as sent.
 
         Args:
-            names: actuator signals of these commands; empty if all have left.
+            names: Actuator signals of these commands; empty if all have left.
         """
         self._unconfirmed = False
         if not names and not self._unsent and not self._silent and not self._departing:
@@ -244,9 +244,9 @@ class Guards:
         signal that has jumped is accepted where it is, if it has been steady there.
 
         Args:
-            now: as in `check`.
-            received: as in `check`.
-            against: further reasons not to release.
+            now: As in `check`.
+            received: As in `check`.
+            against: Further reasons not to release.
 
         Returns:
             The reasons why the latch stays; empty if it was released.

@@ -62,22 +62,22 @@ class RealTime:
     frozen, and threads hand over the GIL quickly. Enter and leave it in the same thread.
 
     Args:
-        priority: priority of SCHED_FIFO, 1 to 99; None keeps the scheduler.
-        lock_memory: whether to keep present and future memory from being paged out. If locked memory is limited (see
+        priority: Priority of SCHED_FIFO, 1 to 99; None keeps the scheduler.
+        lock_memory: Whether to keep present and future memory from being paged out. If locked memory is limited (see
             ``ulimit -l``), later allocations fail when the limit is reached.
-        cpus: processors to run on; None keeps them.
-        awake: whether to keep idle processors from sleeping, since a sleeping one wakes up late. It costs power.
-        collect_garbage: whether Python's garbage collector stays enabled. While it is disabled, cyclic garbage is not
+        cpus: Processors to run on; None keeps them.
+        awake: Whether to keep idle processors from sleeping, since a sleeping one wakes up late. It costs power.
+        collect_garbage: Whether Python's garbage collector stays enabled. While it is disabled, cyclic garbage is not
             freed.
-        switch_interval: time in seconds after which a waiting thread requests the GIL; None keeps it.
-        longest_step: processor time in seconds that a thread under SCHED_FIFO may take without waiting; None sets no
+        switch_interval: Time in seconds after which a waiting thread requests the GIL; None keeps it.
+        longest_step: Processor time in seconds that a thread under SCHED_FIFO may take without waiting; None sets no
             limit. Beyond it, the stacks of all threads are written to stderr, and `RunawayError` is raised in the main
             thread. If that does not help within a second, because the thread is stuck in C++, or at once if the thread
             is not the main one, the process ends: otherwise nothing else would ever run on its processor.
-        require: whether a refusal is an error.
+        require: Whether a refusal is an error.
 
     Attributes:
-        grants: the answers, in order, after entering.
+        grants: The answers, in order, after entering.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class RealTime:
         """Apply the settings.
 
         Raises:
-            RealTimeError: a setting was refused and ``require`` is set; nothing has changed.
+            RealTimeError: A setting was refused and ``require`` is set; nothing has changed.
         """
         with ExitStack() as undo:
             self.grants = tuple(_ask(undo, *request) for request in self._requests)

@@ -52,31 +52,31 @@ class Runtime(Stepped):
     channels.
 
     Args:
-        target: the testbed or the DPS alone.
-        bridge: an open bridge; the thread that runs the cycles polls it and publishes by it.
-        period: period of a cycle, in seconds.
-        context: where the target starts; its default context if None. It belongs to the runtime from then on.
-        clock: by default the wall clock, which wakes up 0.1 ms early; a `SimulatedClock` makes tests deterministic.
-        guards: guards made for the same period and signals; by default those that follow from the interface.
-        pace: by default the clock starts the cycles. With the name of a sensor signal, every message of it starts one
+        target: The testbed or the DPS alone.
+        bridge: An open bridge; the thread that runs the cycles polls it and publishes by it.
+        period: Period of a cycle, in seconds.
+        context: Where the target starts; its default context if None. It belongs to the runtime from then on.
+        clock: By default the wall clock, which wakes up 0.1 ms early; a `SimulatedClock` makes tests deterministic.
+        guards: Guards made for the same period and signals; by default those that follow from the interface.
+        pace: By default the clock starts the cycles. With the name of a sensor signal, every message of it starts one
             (lock-step with the machine), or the clock, if none comes for ``patience`` periods. If the machine's cycle
             takes several messages, name a signal of the last one: the first message that contains the signal starts
             the cycle, which gets the values of later messages from the cycle before.
-        patience: in periods, see ``pace``. It must cover the machine's jitter and be shorter than the sensor signals'
-            maximum ages, so that a cycle notices a silent machine. A paced loop that is delayed by more has missed
-            cycles.
-        continuity: actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
+        patience: Number of periods, see ``pace``. It must cover the machine's jitter and be shorter than the sensor
+            signals' maximum ages, so that a cycle notices a silent machine. A paced loop that is delayed by more has
+            missed cycles.
+        continuity: Actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more. Commands depart from that sensor signal, also after a time in which none left.
-        blocked_by: returns the blocked reason of the machine (why it must not be commanded yet), or None.
-        statistics: statistics of the loop's timing, made for the same period.
-        watchers: called with every `Cycle`. One that raises is removed, and the loop goes on.
+        blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None.
+        statistics: Statistics of the loop's timing, made for the same period.
+        watchers: Called with every `Cycle`. One that raises is removed, and the loop goes on.
 
     Attributes:
-        cycles: number of cycles so far.
-        slow_parts: the slow parts of the DPS, with their statistics.
+        cycles: Number of cycles so far.
+        slow_parts: The slow parts of the DPS, with their statistics.
 
     Raises:
-        ValueError: an argument does not fit the target or the period, or a paced loop has a `SimulatedClock`.
+        ValueError: An argument does not fit the target or the period, or a paced loop has a `SimulatedClock`.
     """
 
     def __init__(
@@ -149,9 +149,9 @@ class Runtime(Stepped):
         """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
 
         Args:
-            cycles: number of cycles.
-            seconds: time on the clock.
-            until: called after every cycle; True ends the run.
+            cycles: Number of cycles.
+            seconds: Time on the clock.
+            until: Called after every cycle; True ends the run.
 
         Raises:
             ValueError: ``seconds`` is not a number.
@@ -226,8 +226,8 @@ class Runtime(Stepped):
         """Run one cycle now and return its record.
 
         Args:
-            lateness: time since the cycle was due, in seconds.
-            poll: whether to poll the bridge first.
+            lateness: Time since the cycle was due, in seconds.
+            poll: Whether to poll the bridge first.
         """
         begin = self.clock.now()
         if poll:
@@ -306,7 +306,7 @@ class Runtime(Stepped):
         """Check whether switches can be thrown (first phase), without changing anything.
 
         Args:
-            mode: as in `VirtualTestbed.switch`.
+            mode: As in `VirtualTestbed.switch`.
             **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
         """
         return prepare(self, mode, **sides)
@@ -315,7 +315,7 @@ class Runtime(Stepped):
         """Throw the switches of a preparation (second phase), before another cycle has run.
 
         Raises:
-            SwitchRefusedError: the preparation has reasons against it, or is outdated, as there were cycles since.
+            SwitchRefusedError: The preparation has reasons against it, or is outdated, as there were cycles since.
         """
         if preparation.cycle != self.cycles:
             age = self.cycles - preparation.cycle
@@ -328,11 +328,11 @@ class Runtime(Stepped):
         """Prepare and perform a switch. Call it in the thread that runs the cycles, or between cycles.
 
         Args:
-            mode: as in `VirtualTestbed.switch`.
+            mode: As in `VirtualTestbed.switch`.
             **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
 
         Raises:
-            SwitchRefusedError: there are reasons against the switch; nothing has changed.
+            SwitchRefusedError: There are reasons against the switch; nothing has changed.
         """
         self.perform(self.prepare(mode, **sides))
 
@@ -398,7 +398,7 @@ class Runtime(Stepped):
         """Release the latch of the guards: the DPS's commands are sent again from the next cycle on.
 
         Raises:
-            SwitchRefusedError: a cause of the latch persists, or a command would not continue what is measured.
+            SwitchRefusedError: A cause of the latch persists, or a command would not continue what is measured.
         """
         against = discontinuities(self, self.guards.driven)
         reasons = self.guards.reset(self.clock.now(), self.watched, against)

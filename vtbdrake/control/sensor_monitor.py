@@ -40,7 +40,7 @@ class LatencyMonitor:
     The zeros of the two clocks need not agree, and the clocks may drift apart slowly.
 
     Args:
-        limit: largest excess latency, in seconds.
+        limit: Largest excess latency, in seconds.
     """
 
     def __init__(self, limit: float) -> None:
@@ -75,11 +75,11 @@ class SensorMonitor(StalenessMonitor):
     elsewhere.
 
     Args:
-        signal: the sensor signal with its limits.
-        jump_tolerance: a scalar or one per entry, in the signal's unit. If given, entries may change from one accepted
+        signal: The sensor signal with its limits.
+        jump_tolerance: A scalar or one per entry, in the signal's unit. If given, entries may change from one accepted
             sample to the next by rate * dt + jump_tolerance, with dt between their arrivals: the tolerance covers
             noise and the jitter of the arrival.
-        max_delay: in seconds. If given, a sample with a larger excess latency (see `LatencyMonitor`) is stale. Only for
+        max_delay: Largest excess latency of a sample, in seconds (see `LatencyMonitor`); a later one is stale. Only for
             a sender whose clock runs as ours does; that of a simulation may stand still.
 
     Raises:

@@ -47,14 +47,14 @@ class SlowParts:
     it cannot begin in time become missing, so that no queue grows.
 
     Args:
-        parts: the slow parts by path.
-        context: the context of the Diagram that contains them.
-        period: the period of the loop, in seconds.
-        clock: the clock of the loop.
-        changed: called with the kind and the values of every `Change`.
+        parts: The slow parts by path.
+        context: The context of the Diagram that contains them.
+        period: The period of the loop, in seconds.
+        clock: The clock of the loop.
+        changed: Called with the kind and the values of every `Change`.
 
     Raises:
-        ValueError: a latency is so short that no result could arrive in time, or a function cannot be sent to another
+        ValueError: A latency is so short that no result could arrive in time, or a function cannot be sent to another
             process.
     """
 

@@ -27,10 +27,10 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
     """Keep a worker running, and forward requests and answers.
 
     Args:
-        loop: the connection to the loop.
-        function: see `compute`.
-        patience: the time in seconds after which a worker that does not answer is replaced.
-        name: the name of the slow part.
+        loop: The connection to the loop.
+        function: See `compute`.
+        patience: The time in seconds after which a worker that does not answer is replaced.
+        name: The name of the slow part.
     """
     while True:
         begin = time.monotonic()
@@ -72,8 +72,8 @@ def compute(supervisor: FrameConnection, function: bytes) -> None:
     """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error).
 
     Args:
-        supervisor: the connection to the supervisor.
-        function: a `SlowFunction`, pickled by cloudpickle.
+        supervisor: The connection to the supervisor.
+        function: A `SlowFunction`, pickled by cloudpickle.
     """
     evaluate = pickle.loads(function)
     supervisor.send(*pack((READY, None)))

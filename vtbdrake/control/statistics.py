@@ -17,15 +17,15 @@ class Histogram:
     largest. Count, total, least and largest are exact.
 
     Args:
-        resolution: ratio of the ends of a bin, less one.
-        lowest: in seconds; shorter and negative durations share one bin.
-        highest: in seconds; longer durations share one bin.
+        resolution: Ratio of the ends of a bin, less one.
+        lowest: Shortest duration, in seconds; shorter and negative durations share one bin.
+        highest: Longest duration, in seconds; longer durations share one bin.
 
     Attributes:
-        count: number of durations.
-        total: sum of the durations, in seconds.
-        least: shortest duration in seconds; NaN if there is none.
-        largest: longest duration in seconds; NaN if there is none.
+        count: Number of durations.
+        total: Sum of the durations, in seconds.
+        least: Shortest duration in seconds; NaN if there is none.
+        largest: Longest duration in seconds; NaN if there is none.
     """
 
     def __init__(self, *, resolution: float = 0.01, lowest: float = 1e-6, highest: float = 10.0) -> None:
@@ -45,7 +45,7 @@ class Histogram:
         """Add one duration.
 
         Raises:
-            ValueError: it is NaN.
+            ValueError: It is NaN.
         """
         if seconds <= self.lowest:
             self._bins[0] += 1
@@ -85,7 +85,7 @@ class Histogram:
         """Add all durations of ``other``.
 
         Raises:
-            ValueError: its bins are different.
+            ValueError: Its bins are different.
         """
         if self._shape() != other._shape():
             raise ValueError(
@@ -116,7 +116,7 @@ class Histogram:
         """Return the histogram that `to_dict` described.
 
         Raises:
-            ValueError: the data contain a bin that such a histogram does not have.
+            ValueError: The data contain a bin that such a histogram does not have.
         """
         histogram = cls(resolution=data["resolution"], lowest=data["lowest"], highest=data["highest"])
         for index, number in data["bins"].items():
@@ -154,17 +154,17 @@ class LoopStatistics:
     """Statistics of a loop with a fixed period, in constant memory.
 
     Args:
-        period: period of the loop, in seconds.
-        thresholds: by quantity; by default, warnings start above half a period and errors above a whole one.
+        period: Period of the loop, in seconds.
+        thresholds: By quantity; by default, warnings start above half a period and errors above a whole one.
 
     Attributes:
-        histograms: of ``lateness`` (from the deadline to the wake-up), ``step`` (of the DPS) and ``cycle`` (all work of
-            a cycle, from the wake-up on).
-        thresholds: for the same quantities.
-        misses: number of deadlines that passed while the loop worked on an earlier cycle.
-        run: number of misses in a row, up to now.
-        longest_run: number of misses in the longest such row.
-        foreign: number of commands of other publishers that were heard while the loop commanded.
+        histograms: Histograms of ``lateness`` (from the deadline to the wake-up), ``step`` (of the DPS) and ``cycle``
+            (all work of a cycle, from the wake-up on).
+        thresholds: Thresholds of the same quantities.
+        misses: Number of deadlines that passed while the loop worked on an earlier cycle.
+        run: Number of misses in a row, up to now.
+        longest_run: Number of misses in the longest such row.
+        foreign: Number of commands of other publishers that were heard while the loop commanded.
     """
 
     def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:

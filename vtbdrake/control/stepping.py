@@ -27,7 +27,7 @@ class Change(NamedTuple):
 
     Attributes:
         kind: ``write`` (variables), ``switch``, ``reset`` (of the guards) or ``result`` (of a slow part).
-        values: for ``write``, the new values by address; for ``switch``, the positions by ``sense.<signal>`` and
+        values: For ``write``, the new values by address; for ``switch``, the positions by ``sense.<signal>`` and
             ``act.<signal>``; for ``result``, one entry: path of the slow part -> ``{"tick": number of the sample (int),
             name: array, ...}``, where the arrays (any dtype and shape; none if the result is declared missing) are
             what `SlowPart.deliver` takes besides the tick.
@@ -78,8 +78,8 @@ def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:
     Otherwise pydrake makes and discards a wrapper (1 us) whenever a system in Python reads its parameters.
 
     Args:
-        diagram: the root of ``context``, or a part of it.
-        context: the root context.
+        diagram: The root of ``context``, or a part of it.
+        context: The root context.
     """
     contexts = [system.GetMyContextFromRoot(context) for _, system in leaves(diagram)]
     return [own.get_numeric_parameter(i) for own in contexts for i in range(own.num_numeric_parameter_groups())]
@@ -89,7 +89,7 @@ class RealPorts:
     """The ports ``real.sense.*``, ``real.act.*`` and ``real.act.active`` in one context.
 
     Attributes:
-        feed: sets the value of a sensor signal's input port: ``feed(name, value)``.
+        feed: Sets the value of a sensor signal's input port: ``feed(name, value)``.
     """
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:
@@ -124,23 +124,23 @@ class Stepped:
     """A testbed, or the DPS alone, with one context that advances by one period per step.
 
     Args:
-        target: the testbed or the DPS alone.
-        bridge: source of sensor values and of commands u.
-        period: length of a step, in seconds.
-        context: where the target starts; its default context if None. It belongs to this object from then on.
+        target: The testbed or the DPS alone.
+        bridge: Source of sensor values and of commands u.
+        period: Length of a step, in seconds.
+        context: Where the target starts; its default context if None. It belongs to this object from then on.
 
     Attributes:
-        steps: number of steps that the DPS has done.
-        time: the DPS's time, in seconds.
-        start_time: the DPS's time before its first step, in seconds.
-        idle: whether the target is a DPS alone that has not been started yet.
-        initialized: whether the initialization events have happened. They happen in the first step, unless ``context``
+        steps: Number of steps that the DPS has done.
+        time: The DPS's time, in seconds.
+        start_time: The DPS's time before its first step, in seconds.
+        idle: Whether the target is a DPS alone that has not been started yet.
+        initialized: Whether the initialization events have happened. They happen in the first step, unless ``context``
             was given.
-        active: names of the actuator signals that are on real.
-        watched: the received signal of each sensor signal that is on real, by name.
+        active: Names of the actuator signals that are on real.
+        watched: The received signal of each sensor signal that is on real, by name.
 
     Raises:
-        ValueError: the bridge receives a command u that comes from inside the testbed.
+        ValueError: The bridge receives a command u that comes from inside the testbed.
     """
 
     def __init__(
@@ -234,7 +234,7 @@ class Stepped:
         Call it in the thread that runs the cycles, or between them; from another thread by `request`.
 
         Raises:
-            ValueError: an address is unknown or a value impossible (nothing has changed), or the address is the time or
+            ValueError: An address is unknown or a value impossible (nothing has changed), or the address is the time or
                 a switch.
         """
         for address in values:

@@ -49,13 +49,13 @@ def prepare(
     real must continue what is measured. The machine must be ready and connected, and have no other commander.
 
     Args:
-        runtime: the loop.
-        mode: as in `VirtualTestbed.switch`.
-        sense: as in `VirtualTestbed.switch`.
-        act: as in `VirtualTestbed.switch`.
+        runtime: The loop.
+        mode: As in `VirtualTestbed.switch`.
+        sense: As in `VirtualTestbed.switch`.
+        act: As in `VirtualTestbed.switch`.
 
     Raises:
-        ValueError: the mode, a signal or a position is unknown, or there are a mode and positions.
+        ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
     """
     target = runtime.target
     if mode is not None:
@@ -111,7 +111,7 @@ def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, f
     """Check the ``continuity`` argument of `Runtime`.
 
     Raises:
-        ValueError: a signal does not exist, two signals have different sizes, or a largest difference is negative.
+        ValueError: A signal does not exist, two signals have different sizes, or a largest difference is negative.
     """
     acted = {signal.name: signal for signal in interface.act}
     sensed = {signal.name: signal for signal in interface.sense}
@@ -179,10 +179,10 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
     If a signal goes back to sim, the simulated world continues from the DPS's belief of the machine, if it can.
 
     Args:
-        target: the testbed.
-        context: its context.
-        senses: new positions by sensor signal.
-        acts: new positions by actuator signal.
+        target: The testbed.
+        context: Its context.
+        senses: New positions by sensor signal.
+        acts: New positions by actuator signal.
     """
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)

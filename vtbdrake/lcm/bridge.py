@@ -46,11 +46,11 @@ class LcmBridge(Bridge):
     never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
 
     Attributes:
-        url: the LCM URL of the bus.
-        sent: by actuator signal, how many commands were sent, and why others were not.
-        foreign_messages: by actuator channel, how many messages of other publishers were heard (with ``watch``).
-        clock_jumps: by channel, how often a sender's time jumped, back or ahead, and was accepted.
-        link: the connection to the bus, which counts losses and reconnections.
+        url: The LCM URL of the bus.
+        sent: By actuator signal, how many commands were sent, and why others were not.
+        foreign_messages: By actuator channel, how many messages of other publishers were heard (with ``watch``).
+        clock_jumps: By channel, how often a sender's time jumped, back or ahead, and was accepted.
+        link: The connection to the bus, which counts losses and reconnections.
     """
 
     def __init__(
@@ -71,23 +71,23 @@ class LcmBridge(Bridge):
         """Check the maps; `open` connects.
 
         Args:
-            interface: the DPS's signals.
-            url: an LCM URL: ``tcpq://127.0.0.1:7700`` (a hub), ``udpm://239.255.76.67:7667?ttl=0``, ... ``memq://`` is
+            interface: The DPS's signals.
+            url: An LCM URL: ``tcpq://127.0.0.1:7700`` (a hub), ``udpm://239.255.76.67:7667?ttl=0``, ... ``memq://`` is
                 private to the connection.
-            sense: maps of the sensor signals, each in exactly one of them.
-            act: maps of the actuator signals, each in exactly one of them.
-            commands: maps of those commands u that come over LCM.
-            reported: by actuator signal, the name under which a map of ``sense`` carries the actuator command that the
+            sense: Maps of the sensor signals, each in exactly one of them.
+            act: Maps of the actuator signals, each in exactly one of them.
+            commands: Maps of those commands u that come over LCM.
+            reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
                 machine says it executes.
-            watch: whether to listen on the actuator channels for other publishers. By default on every bus that others
+            watch: Whether to listen on the actuator channels for other publishers. By default on every bus that others
                 can be on.
-            on_foreign: called, in `poll`, with channel and bytes of a message of another publisher.
-            reorder_window: in seconds, see above.
-            connect_timeout: seconds that `open` waits for a hub.
-            burst: the most messages that one `poll` receives.
+            on_foreign: Called, in `poll`, with channel and bytes of a message of another publisher.
+            reorder_window: Window in seconds, see above.
+            connect_timeout: Seconds that `open` waits for a hub.
+            burst: The most messages that one `poll` receives.
 
         Raises:
-            ValueError: a signal has no map or several, a map names a signal that does not exist or does not fit its
+            ValueError: A signal has no map or several, a map names a signal that does not exist or does not fit its
                 message type, or two maps have one channel.
         """
         if "://" not in url:
@@ -162,13 +162,13 @@ class LcmBridge(Bridge):
         """Send actuator commands.
 
         Args:
-            actuation: actuator commands by signal.
+            actuation: Actuator commands by signal.
 
         Returns:
             The signals whose actuator commands were not sent, or do not pass the hub.
 
         Raises:
-            ValueError: there is no such actuator signal.
+            ValueError: There is no such actuator signal.
         """
         for name in actuation:
             if name not in self.sent:
@@ -208,7 +208,7 @@ class LcmBridge(Bridge):
         """Claim the protected actuator channels at the hub, which grants those whose owner has fallen silent.
 
         Raises:
-            ValueError: the bus has no hub.
+            ValueError: The bus has no hub.
         """
         if not self.url.startswith(_HUB):
             raise ValueError(f"only a hub protects channels; {self.url} has none, so there is nothing to claim")
@@ -219,8 +219,8 @@ class ChannelReader:
     """Checks the messages of one channel and updates its signals; `LcmBridge` tells the rules.
 
     Attributes:
-        channel: name of the channel.
-        clock_jumps: how often the sender's time jumped, back or ahead, and was accepted.
+        channel: Name of the channel.
+        clock_jumps: How often the sender's time jumped, back or ahead, and was accepted.
     """
 
     def __init__(
@@ -229,13 +229,13 @@ class ChannelReader:
         """Prepare the decoder.
 
         Args:
-            map: the map of the channel.
-            signals: the signals of the map, in its order.
-            received: what to update, by signal.
-            reorder_window: in seconds, see `LcmBridge`.
+            map: The map of the channel.
+            signals: The signals of the map, in its order.
+            received: What to update, by signal.
+            reorder_window: Window in seconds, see `LcmBridge`.
 
         Raises:
-            ValueError: the map cannot carry the signals.
+            ValueError: The map cannot carry the signals.
         """
         self.channel = map.channel
         self.clock_jumps = 0
@@ -312,12 +312,12 @@ class ChannelWriter:
         """Prepare the encoder.
 
         Args:
-            map: the map of the channel.
-            signals: the signals of the map, in its order.
-            sent: counts what is withheld, by signal.
+            map: The map of the channel.
+            signals: The signals of the map, in its order.
+            sent: Counts what is withheld, by signal.
 
         Raises:
-            ValueError: the map cannot carry the signals.
+            ValueError: The map cannot carry the signals.
         """
         self.channel = map.channel
         self._encode = map.encoder(signals)
@@ -372,9 +372,9 @@ class ForeignCommands:
         """Start with nothing heard.
 
         Args:
-            channels: the actuator channels.
-            name: returns under which name the hub knows our connection at present.
-            on_foreign: called with channel and bytes of a foreign message.
+            channels: The actuator channels.
+            name: Returns under which name the hub knows our connection at present.
+            on_foreign: Called with channel and bytes of a foreign message.
         """
         self.heard = dict.fromkeys(channels, 0)
         self.refused = 0

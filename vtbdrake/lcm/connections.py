@@ -53,10 +53,10 @@ class Connection(ABC):
     """One connection, whose calls do not wait. It is of no use after an OSError.
 
     Attributes:
-        name: the client's name at the hub; None without a hub.
-        arrived: when the last received message arrived at this computer, by `time.monotonic`; None unless the kernel
+        name: The client's name at the hub; None without a hub.
+        arrived: When the last received message arrived at this computer, by `time.monotonic`; None unless the kernel
             stamps messages.
-        pending: whether the rest of what was published waits to be sent; `take` sends it.
+        pending: Whether the rest of what was published waits to be sent; `take` sends it.
     """
 
     name: str | None = None
@@ -72,7 +72,7 @@ class Connection(ABC):
         """Pass up to ``limit`` messages that have arrived to their handlers, and return how many.
 
         Raises:
-            OSError: the connection is lost.
+            OSError: The connection is lost.
         """
 
     @abstractmethod
@@ -80,8 +80,8 @@ class Connection(ABC):
         """Publish messages, each a channel and its bytes.
 
         Raises:
-            BlockingIOError: the bus takes nothing at present; the messages are dropped.
-            OSError: the connection is lost.
+            BlockingIOError: The bus takes nothing at present; the messages are dropped.
+            OSError: The connection is lost.
         """
 
     @abstractmethod
@@ -127,12 +127,12 @@ class TcpqConnection(Connection):
 
     Args:
         url: ``tcpq://host:port``; both have defaults.
-        handlers: by channel, what takes its messages.
-        timeout: seconds to wait for the hub.
-        stamped: whether the kernel shall stamp what arrives; it does so for TCP only.
+        handlers: By channel, what takes its messages.
+        timeout: Seconds to wait for the hub.
+        stamped: Whether the kernel shall stamp what arrives; it does so for TCP only.
 
     Raises:
-        OSError: there is no hub.
+        OSError: There is no hub.
     """
 
     def __init__(self, url: str, handlers: Mapping[str, Handler], timeout: float, *, stamped: bool = False) -> None:
@@ -285,9 +285,9 @@ class LcmLink:
     """Receives and publishes while there is a bus, and searches for it while there is none.
 
     Attributes:
-        url: the LCM URL of the bus.
-        losses: how often the bus was lost.
-        reconnections: how often it was found again.
+        url: The LCM URL of the bus.
+        losses: How often the bus was lost.
+        reconnections: How often it was found again.
     """
 
     def __init__(
@@ -296,10 +296,10 @@ class LcmLink:
         """Prepare the link; `open` connects.
 
         Args:
-            url: the LCM URL of the bus.
-            handlers: by channel, what takes its messages.
-            connect_timeout: seconds to wait for a hub.
-            stamped: whether the kernel shall stamp what arrives; see `TcpqConnection`.
+            url: The LCM URL of the bus.
+            handlers: By channel, what takes its messages.
+            connect_timeout: Seconds to wait for a hub.
+            stamped: Whether the kernel shall stamp what arrives; see `TcpqConnection`.
         """
         self.url = url
         self.losses = 0
@@ -314,7 +314,7 @@ class LcmLink:
         """Connect to the bus.
 
         Raises:
-            BridgeError: there is no bus.
+            BridgeError: There is no bus.
         """
         if self.is_open:
             return
@@ -369,8 +369,8 @@ class LcmLink:
         """Pass messages to their handlers, and return how many.
 
         Args:
-            timeout: seconds to wait for the first message.
-            limit: the most messages that are taken.
+            timeout: Seconds to wait for the first message.
+            limit: The most messages that are taken.
         """
         end = time.monotonic() + timeout
         connection = self._connection or self._required(timeout)

@@ -30,14 +30,14 @@ def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "II
     """Return a map for the state of an arm that speaks the iiwa messages, as the arm sends it.
 
     Args:
-        fields: by signal, the field of `lcmt_iiwa_status` that holds it: ``joint_position_measured``,
+        fields: By signal, the field of `lcmt_iiwa_status` that holds it: ``joint_position_measured``,
             ``joint_velocity_estimated``, ``joint_position_commanded``, ``joint_position_ipo`` in rad and rad/s;
             ``joint_torque_measured``, ``joint_torque_commanded`` (with the sign of the arm's own software, opposite to
             Drake's) and ``joint_torque_external`` in N m. A sequence, if signals and fields have the same names.
-        channel: name of the channel.
+        channel: Name of the channel.
 
     Raises:
-        ValueError: there is no such field.
+        ValueError: There is no such field.
     """
     return vector_map(channel, lcmt_iiwa_status, _same_names(fields))
 
@@ -48,13 +48,13 @@ def iiwa_command(
     """Return a map for the actuator commands to an arm that speaks the iiwa messages.
 
     Args:
-        fields: by signal, the field of `lcmt_iiwa_command` that holds it: ``joint_position`` in rad, ``joint_torque``
+        fields: By signal, the field of `lcmt_iiwa_command` that holds it: ``joint_position`` in rad, ``joint_torque``
             in N m. A field without a command is empty in the message. A sequence, if signals and fields have the same
             names.
-        channel: name of the channel.
+        channel: Name of the channel.
 
     Raises:
-        ValueError: there is no such field.
+        ValueError: There is no such field.
     """
     return vector_map(channel, lcmt_iiwa_command, _same_names(fields))
 
@@ -118,8 +118,8 @@ def image_array_map(channel: str, frames: Mapping[str, str]) -> ImageMap:
     """Return a map for `lcmt_image_array` messages, as Drake's `ImageToLcmImageArrayT` makes them.
 
     Args:
-        channel: name of the channel.
-        frames: by signal, the ``frame_name`` of its image. A message need not have all of them: a signal whose image is
+        channel: Name of the channel.
+        frames: By signal, the ``frame_name`` of its image. A message need not have all of them: a signal whose image is
             not in it counts it as ``missing``.
     """
 

@@ -38,8 +38,8 @@ def decode(message_type: Any, data: bytes) -> Any:
     """Decode one message strictly: all of it, and nothing else.
 
     Args:
-        message_type: a class made by lcm-gen.
-        data: the bytes of the message.
+        message_type: A class made by lcm-gen.
+        data: The bytes of the message.
 
     Raises:
         MalformedError: ``fingerprint``: the message is of another type; ``truncated``: its end is missing;
@@ -95,14 +95,14 @@ class LcmMap:
         LcmMap(channel="GOAL", type=pose_t, signals=("goal",), decode=lambda message: {"goal": to_pose(message)})
 
     Attributes:
-        channel: name of the channel.
-        type: class made by lcm-gen.
-        signals: names of the signals that travel in the messages.
-        decode: returns the values by signal from a message; required for receiving. A value is an array of the
+        channel: Name of the channel.
+        type: Class made by lcm-gen.
+        signals: Names of the signals that travel in the messages.
+        decode: Returns the values by signal from a message; required for receiving. A value is an array of the
             signal's size, or an object of an abstract signal's type. Raises `MalformedError` to reject the message.
-        encode: returns a message from values by signal and the time in microseconds; required for sending. Raises
+        encode: Returns a message from values by signal and the time in microseconds; required for sending. Raises
             LookupError if the message makes no sense without a signal that is missing.
-        sent: returns the sender's time in a message, in seconds; NaN if it has none.
+        sent: Returns the sender's time in a message, in seconds; NaN if it has none.
     """
 
     channel: str
@@ -128,10 +128,10 @@ class LcmMap:
         """Return the decoder of this channel's messages.
 
         Args:
-            signals: the signals of this map, in its order.
+            signals: The signals of this map, in its order.
 
         Raises:
-            ValueError: the message type cannot carry them.
+            ValueError: The message type cannot carry them.
         """
         to_values = self.decode
         if to_values is None:
@@ -147,10 +147,10 @@ class LcmMap:
         """Return the encoder of this channel's messages.
 
         Args:
-            signals: the signals of this map, in its order.
+            signals: The signals of this map, in its order.
 
         Raises:
-            ValueError: the message type cannot carry them.
+            ValueError: The message type cannot carry them.
         """
         to_message = self.encode
         if to_message is None:
@@ -246,7 +246,7 @@ class VectorMap(LcmMap):
         """Return a message with signals of these sizes, in which all numbers but the lengths of arrays are zero.
 
         Raises:
-            LookupError: the message cannot leave out a signal that is missing.
+            LookupError: The message cannot leave out a signal that is missing.
         """
         lengths = {self.parts[name][0].length: size for name, size in sizes.items()}
         for name in self.parts.keys() - sizes.keys():
@@ -297,15 +297,15 @@ def vector_map(
     """Return a map for messages whose signals are fields of numbers.
 
     Args:
-        channel: name of the channel.
-        message_type: class made by lcm-gen.
-        fields: by signal, the field that holds it: a number or an array. Several fields, if its entries are spread
+        channel: Name of the channel.
+        message_type: Class made by lcm-gen.
+        fields: By signal, the field that holds it: a number or an array. Several fields, if its entries are spread
             over them. Dotted names reach into messages within the message.
-        stamp: field with the sender's time in microseconds; empty if there is none: late and repeated messages then
+        stamp: Field with the sender's time in microseconds; empty if there is none: late and repeated messages then
             count as new ones.
 
     Raises:
-        ValueError: there is no such field, or it does not hold numbers.
+        ValueError: There is no such field, or it does not hold numbers.
     """
     try:
         known_fields = _fields(message_type)

@@ -29,12 +29,12 @@ class Protocol:
             return Deployment(protocol=protocol)
 
     Attributes:
-        sense: what the machine publishes; each sensor signal in one map.
-        act: what it listens to; each actuator signal in one map.
-        commands: commands u that reach the controller over LCM; the machine has no part in them.
-        reported: by actuator signal, the name under which a map of ``sense`` carries the actuator command that the
+        sense: What the machine publishes; each sensor signal in one map.
+        act: What it listens to; each actuator signal in one map.
+        commands: Commands u that reach the controller over LCM; the machine has no part in them.
+        reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
             machine says it executed in the cycle that has just ended.
-        periods: by channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named.
+        periods: By channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named.
     """
 
     sense: Sequence[LcmMap]
@@ -47,9 +47,9 @@ class Protocol:
         """Return the controller's end, not yet open.
 
         Args:
-            interface: the DPS's signals.
-            url: the LCM URL of the bus.
-            **options: further arguments of `LcmBridge`.
+            interface: The DPS's signals.
+            url: The LCM URL of the bus.
+            **options: Further arguments of `LcmBridge`.
         """
         return LcmBridge(
             interface,

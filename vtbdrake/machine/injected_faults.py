@@ -61,8 +61,8 @@ class InjectedFault:
         """Return the effect on the packets of the channels, from now on.
 
         Args:
-            random: the source of random numbers.
-            period: the period of the machine's cycles, in seconds.
+            random: The source of random numbers.
+            period: The period of the machine's cycles, in seconds.
         """
         return lambda packet: (packet,)
 
@@ -198,7 +198,7 @@ def fault_from_dict(data: Mapping[str, Any]) -> InjectedFault:
     """Return the fault that plain data describe, such as ``{"fault": "drop", "fraction": 0.5}``.
 
     Raises:
-        InjectedFaultError: there is no such fault, or it has no such fields or values.
+        InjectedFaultError: There is no such fault, or it has no such fields or values.
     """
     name = data.get("fault")
     kind = FAULTS.get(name) if isinstance(name, str) else None
@@ -223,12 +223,12 @@ class DelayLine:
     """One direction between a machine and its controller: a latency, and the faults that have begun.
 
     Args:
-        delay: the latency of every packet without faults, in cycles.
-        period: the period of a cycle, in seconds.
-        random: the source of random numbers of the faults.
+        delay: The latency of every packet without faults, in cycles.
+        period: The period of a cycle, in seconds.
+        random: The source of random numbers of the faults.
 
     Attributes:
-        faults: the faults that have begun, by name.
+        faults: The faults that have begun, by name.
     """
 
     def __init__(self, *, delay: int, period: float, random: np.random.Generator) -> None:

@@ -50,22 +50,22 @@ class MachineLoop:
     is released.
 
     Args:
-        machine: the machine.
-        url: the URL of the bus.
-        clock: the clock of the cycles; by default the wall clock.
-        control: a connected stream; the loop stops when its other end closes.
-        connect_timeout: the time to wait for the bus, in seconds.
+        machine: The machine.
+        url: The URL of the bus.
+        clock: The clock of the cycles; by default the wall clock.
+        control: A connected stream; the loop stops when its other end closes.
+        connect_timeout: The time to wait for the bus, in seconds.
 
     Attributes:
-        statistics: the statistics of its cycles; ``step`` is the simulation.
-        state_to_command: the times in seconds from sending a state to the arrival of the next command at the computer
+        statistics: The statistics of its cycles; ``step`` is the simulation.
+        state_to_command: The times in seconds from sending a state to the arrival of the next command at the computer
             (the machine may be simulating then). If a state is not answered before the next one, the older one counts.
             A command does not say which state it answers: if all answers take more than a period, they are taken for
             answers to the next state.
-        lost: the time in seconds by which the simulation did not keep up with the clock.
+        lost: The time in seconds by which the simulation did not keep up with the clock.
 
     Raises:
-        BridgeError: there is no bus at ``url``.
+        BridgeError: There is no bus at ``url``.
     """
 
     def __init__(
@@ -118,12 +118,12 @@ class MachineLoop:
         the DPS of a testbed does in simulation.
 
         Args:
-            lock_step: begin a cycle when one message has arrived on every command channel, instead of with the clock.
-            cycles: the number of cycles.
-            ready: called when the first state is sent.
+            lock_step: Begin a cycle when one message has arrived on every command channel, instead of with the clock.
+            cycles: The number of cycles.
+            ready: Called when the first state is sent.
 
         Raises:
-            RuntimeError: the simulation failed.
+            RuntimeError: The simulation failed.
         """
         end = self.machine.cycle + cycles
         self.machine.reject_late(not lock_step)
@@ -314,14 +314,14 @@ def serve(
     """Run a loop in the main thread of a process that does nothing else, until SIGTERM (or SIGINT, if not ignored).
 
     Args:
-        loop: the loop, which is closed at the end.
-        lock_step: see `MachineLoop.run`, as for ``cycles`` and ``ready``.
-        cycles: the number of cycles.
-        priority: the priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
-        ready: called when the first state is sent.
+        loop: The loop, which is closed at the end.
+        lock_step: See `MachineLoop.run`, as for ``cycles`` and ``ready``.
+        cycles: The number of cycles.
+        priority: The priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
+        ready: Called when the first state is sent.
 
     Raises:
-        RuntimeError: the simulation failed.
+        RuntimeError: The simulation failed.
     """
     # Without a longest step: a simulation that cannot keep up computes without a pause.
     real_time = RealTime(priority=priority, longest_step=None) if priority else nullcontext()

@@ -42,7 +42,7 @@ class MachineConfig:
     """Configuration of a machine: its differences from the simulated world, and its behaviour.
 
     Raises:
-        ValueError: a value is out of its range.
+        ValueError: A value is out of its range.
     """
 
     period: float = 1e-3  # s, of a cycle
@@ -106,18 +106,18 @@ class Machine:
     after `reject_late`, commands must come in time.
 
     Args:
-        scenario: the scenario of the world. Its deployment has the protocol of the machine (see `Protocol`).
-        config: the differences from the simulated world.
-        epoch: the time of cycle 0 in its messages, in microseconds.
+        scenario: The scenario of the world. Its deployment has the protocol of the machine (see `Protocol`).
+        config: The differences from the simulated world.
+        epoch: The time of cycle 0 in its messages, in microseconds.
 
     Attributes:
-        protocol: its LCM protocol.
-        cycle: the number of cycles it has done.
-        perturbed: the values of variables that differ from the scenario's, by address.
+        protocol: Its LCM protocol.
+        cycle: The number of cycles it has done.
+        perturbed: The values of variables that differ from the scenario's, by address.
 
     Raises:
-        ProtocolError: the scenario has no protocol, or one that does not fit its signals.
-        ValueError: the config does not fit the scenario.
+        ProtocolError: The scenario has no protocol, or one that does not fit its signals.
+        ValueError: The config does not fit the scenario.
     """
 
     def __init__(self, scenario: Scenario, config: MachineConfig | None = None, *, epoch: int = 0) -> None:
@@ -180,7 +180,7 @@ class Machine:
         """Set variables of its world between two cycles, by address, as if a tool was changed.
 
         Raises:
-            ValueError: an address is unknown, or a value impossible; nothing has changed.
+            ValueError: An address is unknown, or a value impossible; nothing has changed.
         """
         self.world.write(self._context, values)
         self.perturbed.update(values)
@@ -204,7 +204,7 @@ class Machine:
         """Do one cycle.
 
         Raises:
-            RuntimeError: the simulation failed.
+            RuntimeError: The simulation failed.
         """
         for packet in self._lines[ACT].arrivals(self.cycle):
             self._readers[packet.channel].take(packet.channel, packet.data)
@@ -255,7 +255,7 @@ class Machine:
         """Begin a fault, from the next message on, in place of one of the same name and side.
 
         Raises:
-            InjectedFaultError: the machine has no such channel.
+            InjectedFaultError: The machine has no such channel.
         """
         known = self._sensors.channels if fault.side == SENSE else self.channels
         for channel in fault.channels:
@@ -291,15 +291,15 @@ class HoldingBrake:
     ones, which is right for position commands.
 
     Args:
-        world: the world of the machine.
-        kind: one of `BRAKES`; empty for ``lock`` if the plant is discrete, else ``idle``.
+        world: The world of the machine.
+        kind: One of `BRAKES`; empty for ``lock`` if the plant is discrete, else ``idle``.
 
     Attributes:
         engaged: True while it brakes.
-        idle: the idle commands by actuator signal; arrays for vector signals.
+        idle: The idle commands by actuator signal; arrays for vector signals.
 
     Raises:
-        ValueError: joints of a continuous plant cannot be locked.
+        ValueError: Joints of a continuous plant cannot be locked.
     """
 
     def __init__(self, world: WorldAlone, kind: str) -> None:
@@ -319,8 +319,8 @@ class HoldingBrake:
         """Return what acts on an actuator.
 
         Args:
-            name: the actuator signal.
-            command: its last command; None if there was none.
+            name: The actuator signal.
+            command: Its last command; None if there was none.
             stale: True if the command is too old to be obeyed.
         """
         idle = self._kind != HOLD if self.engaged else stale
@@ -376,9 +376,9 @@ class _Sensors:
         """Return the messages of this cycle.
 
         Args:
-            context: the context of the world.
-            cycle: the number of the cycle.
-            time: the time of a message in microseconds, as a function of its channel.
+            context: The context of the world.
+            cycle: The number of the cycle.
+            time: The time of a message in microseconds, as a function of its channel.
         """
         return [
             Packet(

@@ -46,13 +46,13 @@ class MachineProcess(ChildService):
     Requests are answered between two cycles: a fault acts from the next message on.
 
     Args:
-        scenario: the scenario of its world.
-        url: the URL of the LCM bus.
-        config: the differences from the simulated world.
-        lock_step: begin cycles with commands, instead of with the clock; see `MachineLoop.run`.
-        cycles: the number of cycles after which it ends; by default it goes on.
-        priority: the priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
-        options: fields of the config, which replace those of ``config``.
+        scenario: The scenario of its world.
+        url: The URL of the LCM bus.
+        config: The differences from the simulated world.
+        lock_step: Begin cycles with commands, instead of with the clock; see `MachineLoop.run`.
+        cycles: The number of cycles after which it ends; by default it goes on.
+        priority: The priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
+        options: Fields of the config, which replace those of ``config``.
     """
 
     name, error = "the machine", MachineError
@@ -78,7 +78,7 @@ class MachineProcess(ChildService):
         """Start the machine; when this returns, it has sent its first state.
 
         Raises:
-            MachineError: it does not start.
+            MachineError: It does not start.
         """
         if self.alive:
             raise MachineError("the machine runs already")
@@ -94,7 +94,7 @@ class MachineProcess(ChildService):
         """Return the present status.
 
         Raises:
-            MachineError: it does not answer.
+            MachineError: It does not answer.
         """
         return self._status({"request": "status"})
 
@@ -115,7 +115,7 @@ class MachineProcess(ChildService):
         """Wait for a status that fulfils the condition, and return it.
 
         Raises:
-            MachineError: there was none within ``timeout`` seconds.
+            MachineError: There was none within ``timeout`` seconds.
         """
         limit = time.monotonic() + timeout
         while not condition(status := self.status()):
@@ -127,7 +127,7 @@ class MachineProcess(ChildService):
         """Set variables of its world by address, as if a tool was changed while it runs.
 
         Raises:
-            MachineError: an address is unknown, or a value impossible; nothing has changed.
+            MachineError: An address is unknown, or a value impossible; nothing has changed.
         """
         return self._status({"set": {address: np.asarray(value).tolist() for address, value in values.items()}})
 
@@ -167,7 +167,7 @@ class MachineProcess(ChildService):
         """Wait until the machine has ended, and return its exit code.
 
         Raises:
-            MachineError: it is still running after ``timeout`` seconds.
+            MachineError: It is still running after ``timeout`` seconds.
         """
         try:
             return self._running().wait(timeout)

@@ -63,25 +63,25 @@ class Boundary:
     A rollout is unsafe if it exceeds the threshold, violates a constraint, or fails.
 
     Attributes:
-        address: the address of the parameter.
-        unit: the unit of the parameter.
-        lower: the largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
-        upper: the smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
+        address: The address of the parameter.
+        unit: The unit of the parameter.
+        lower: The largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
+        upper: The smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
             none). There is one rollout per value and condition, and repeats close to the boundary.
-        by_condition: the same interval for each condition alone, shape (conditions, 2).
-        examined: the smallest and the largest value examined.
-        gap: width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have
+        by_condition: The same interval for each condition alone, shape (conditions, 2).
+        examined: The smallest and the largest value examined.
+        gap: Width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have
             been missed.
-        step: the smallest distance of two values examined.
-        chances: one for each value and condition that was repeated, by value and condition.
-        safe_beyond: values above a condition's first unsafe one that were safe nevertheless: the outcome is not
+        step: The smallest distance of two values examined.
+        chances: One for each value and condition that was repeated, by value and condition.
+        safe_beyond: Values above a condition's first unsafe one that were safe nevertheless: the outcome is not
             monotonic, and a bisection could have ended there.
-        ended_at: values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
+        ended_at: Values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
             safe up to there.
-        failed_at: values at which a simulation failed.
-        failure: the reason of the first failure.
-        sweep: the rollouts without jitter.
-        repeated: the rollouts with jitter; None if there are none.
+        failed_at: Values at which a simulation failed.
+        failure: The reason of the first failure.
+        sweep: The rollouts without jitter.
+        repeated: The rollouts with jitter; None if there are none.
     """
 
     address: str
@@ -113,7 +113,7 @@ class Boundary:
         """Plot h over the parameter, with the interval shaded, beside the rollouts over time; see `Sweep.plot`.
 
         Raises:
-            ValueError: the boundary has no sweep.
+            ValueError: The boundary has no sweep.
         """
         from vtbdrake.visualization import plot_sweep
 
@@ -196,9 +196,9 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
     """Return the boundary that the rollouts of a sweep over one parameter show.
 
     Args:
-        sweep: one rollout for each value and condition; `why_no_boundary` of it is empty.
-        chances: of the repeated values.
-        repeated: the rollouts with jitter that ``chances`` count.
+        sweep: One rollout for each value and condition; `why_no_boundary` of it is empty.
+        chances: Chances of the repeated values.
+        repeated: The rollouts with jitter that ``chances`` count.
     """
     values = sweep.points[:, 0]
     unsafe = {(float(value), int(c)): bad for value, c, bad in zip(values, sweep.condition, sweep.unsafe, strict=True)}
@@ -258,13 +258,13 @@ class Refinement:
     failure found there moves both cells down, until there is none.
 
     Args:
-        parameter: its range is searched.
-        resolution: step of the fine grid, in the parameter's unit; with a logarithmic range, the ratio of two
+        parameter: Its range is searched.
+        resolution: Step of the fine grid, in the parameter's unit; with a logarithmic range, the ratio of two
             neighbouring values, above 1.
-        coarse: step of the coarse grid, likewise; it is rounded to whole steps of the fine one.
+        coarse: Step of the coarse grid, likewise; it is rounded to whole steps of the fine one.
 
     Raises:
-        ValueError: the steps do not fit the range, or are not whole for an integer.
+        ValueError: The steps do not fit the range, or are not whole for an integer.
     """
 
     def __init__(self, parameter: Parameter, *, resolution: float, coarse: float) -> None:
@@ -325,9 +325,9 @@ def find_boundary(
     """Examine candidates, in as few rounds as possible, until the refinement asks for no more.
 
     Args:
-        refinement: which values to examine.
-        conditions: the number of conditions.
-        examine: returns for each candidate whether it was unsafe.
+        refinement: Which values to examine.
+        conditions: The number of conditions.
+        examine: Returns for each candidate whether it was unsafe.
 
     Returns:
         index -> unsafe, for each condition.
@@ -345,9 +345,9 @@ def repeat_around(first: int, last: int, count: Callable[[Sequence[int]], Mappin
     """Repeat the values around the boundary: downwards to one that is always safe, upwards to one that never is.
 
     Args:
-        first: index of the first value that was unsafe under some condition; above ``last`` if none was.
-        last: index of the last value.
-        count: repeats values under all conditions; returns index -> the share of unsafe rollouts by condition.
+        first: Index of the first value that was unsafe under some condition; above ``last`` if none was.
+        last: Index of the last value.
+        count: Repeats values under all conditions; returns index -> the share of unsafe rollouts by condition.
     """
     down, up = min(first - 1, last), first
     wanted = [index for index in (down, up) if 0 <= index <= last]

@@ -34,17 +34,17 @@ class ProblemFunction(casadi.Callback):
     exceptions of a function: call `check` after them, which raises the last one.
 
     Attributes:
-        error: the last exception during an evaluation, or None.
+        error: The last exception during an evaluation, or None.
 
     Args:
-        problem: with continuous parameters and one quality.
-        name: of the CasADi function.
+        problem: A problem with continuous parameters and one quality.
+        name: Name of the CasADi function.
         gradient: ``central`` differences, whose points are rolled out side by side, or ``autodiff`` (see `Gradients`).
-        step: of the differences, as a part of each parameter's range.
-        executor, workers: see `Problem.sweep`.
+        step: Step of the differences, as a part of each parameter's range.
+        executor, workers: See `Problem.sweep`.
 
     Raises:
-        ValueError: a parameter is not continuous, there are several qualities, or the gradient is unknown or not
+        ValueError: A parameter is not continuous, there are several qualities, or the gradient is unknown or not
             available.
     """
 

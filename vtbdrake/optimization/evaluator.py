@@ -32,18 +32,18 @@ class Evaluator:
         problem: The problem to evaluate.
         known: The outcomes known so far; ``run`` adds to them.
         run: Function that runs the rollouts of the given keys.
-        racing: drop a point as soon as it can no longer be better than the best one, whatever the conditions that have
+        racing: Drop a point as soon as it can no longer be better than the best one, whatever the conditions that have
             not run would give. The winner is never dropped: the risk does not fall when a quality rises, and a quality
             is at most `Quality.upper` (a cost at least 0). Under the mean, say, a quality without ``upper`` can be
             anything, and no point is dropped for its value.
-        budget: how many rollouts the points may take together; only as many points run side by side as it allows to
+        budget: How many rollouts the points may take together; only as many points run side by side as it allows to
             finish.
 
     Attributes:
-        best: the best evaluation so far; None if there are several qualities.
+        best: The best evaluation so far; None if there are several qualities.
 
     Raises:
-        ValueError: racing, but several qualities.
+        ValueError: Racing, but several qualities.
     """
 
     def __init__(
@@ -151,8 +151,8 @@ class Evaluator:
         """Return the evaluation of a point by its known outcomes.
 
         Args:
-            point: s^0.
-            conditions: the numbers of those that count; None: all. The others, and the unknown ones, count as the best
+            point: The point s^0.
+            conditions: The numbers of those that count; None: all. The others, and the unknown ones, count as the best
                 possible.
         """
         counted = self._conditions if conditions is None else conditions
@@ -190,8 +190,8 @@ class Gradients:
     A gradient takes one simulation with AutoDiffXd per condition, for any number of parameters.
 
     Raises:
-        SolverError: a parameter is not continuous, or is a field of the scenario, which needs another diagram.
-        DerivativeError: the testbed does not convert to AutoDiffXd, or its integrator controls its error.
+        SolverError: A parameter is not continuous, or is a field of the scenario, which needs another diagram.
+        DerivativeError: The testbed does not convert to AutoDiffXd, or its integrator controls its error.
     """
 
     def __init__(self, problem: Problem) -> None:

@@ -55,11 +55,11 @@ def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
     """Return values as JSON gives them back.
 
     Args:
-        values: what is to be stored, by name.
-        what: a word for the values in the error.
+        values: What is to be stored, by name.
+        what: A word for the values in the error.
 
     Raises:
-        ValueError: one is neither a number, nor a word, nor made of these.
+        ValueError: One is neither a number, nor a word, nor made of these.
     """
     try:
         found: dict[str, Any] = json.loads(json.dumps(dict(values), default=lambda value: value.tolist()))

@@ -37,7 +37,7 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
-        StudyError: the storage cannot be opened, or is the file of this study; or ``name`` is another study there.
+        StudyError: The storage cannot be opened, or is the file of this study; or ``name`` is another study there.
     """
     optuna = import_optuna("an export to Optuna")
     trials, outcomes, finished = study.trials, study.rollouts, study.finished
@@ -69,8 +69,8 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
-        StudyError: the storage cannot be opened, has no study ``name``, or that varies other parameters.
-        ValueError: a point lies outside its range.
+        StudyError: The storage cannot be opened, has no study ``name``, or that varies other parameters.
+        ValueError: A point lies outside its range.
     """
     optuna = import_optuna("an import from Optuna")
     with quiet():
@@ -97,7 +97,7 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
-        ValueError: fewer than ten points have a value, or they all have the same.
+        ValueError: Fewer than ten points have a value, or they all have the same.
     """
     optuna = import_optuna("the importances")
     values = [trial.values for trial in study.trials if trial.exact and not trial.failed]

@@ -40,13 +40,14 @@ class Parameter(_Addressed):
     """One varied number of s0: a scalar variable of the testbed, an entry of an array (``address[3]``), or a field.
 
     Attributes:
-        address: of the variable; or ``scenario.<field>`` for a field, which needs another Diagram (gravity, geometry).
-        lower, upper: the range, in the variable's unit.
-        integer: only whole numbers, both ends included.
-        log: searched on a logarithmic scale.
+        address: Address of the variable; or ``scenario.<field>`` for a field, which needs another Diagram (gravity,
+            geometry).
+        lower, upper: The range, in the variable's unit.
+        integer: Only whole numbers, both ends included.
+        log: Searched on a logarithmic scale.
 
     Raises:
-        ValueError: the range is empty, reversed or not finite, an integer has ends that are not whole, or the lower end
+        ValueError: The range is empty, reversed or not finite, an integer has ends that are not whole, or the lower end
             of a logarithmic scale is not positive.
     """
 
@@ -94,7 +95,7 @@ class Parameter(_Addressed):
         """Check a value, and return it as a number of the range.
 
         Raises:
-            ValueError: it is no number, lies outside the range, or is not whole for an integer.
+            ValueError: It is no number, lies outside the range, or is not whole for an integer.
         """
         try:
             number = float(value)
@@ -131,7 +132,7 @@ class Parameter(_Addressed):
         """Return the variable that is varied.
 
         Raises:
-            ValueError: there is none, it is derived or an array, or the range exceeds its bounds.
+            ValueError: There is none, it is derived or an array, or the range exceeds its bounds.
         """
         variable = self._variable(variables)
         lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
@@ -148,11 +149,11 @@ class Choice(_Addressed):
     """One varied element of s0 that takes one of several values without an order: numbers, words, True or False.
 
     Attributes:
-        address: of a scalar variable (the options are numbers then), or ``scenario.<field>``.
-        options: at least two different values.
+        address: Address of a scalar variable (the options are numbers then), or ``scenario.<field>``.
+        options: At least two different values.
 
     Raises:
-        ValueError: there are fewer than two options, or two are equal, as 1 and True are.
+        ValueError: There are fewer than two options, or two are equal, as 1 and True are.
     """
 
     address: str
@@ -185,7 +186,7 @@ class Choice(_Addressed):
         """Return the option that equals a value.
 
         Raises:
-            ValueError: there is none.
+            ValueError: There is none.
         """
         for option in self.options:
             if option == value and isinstance(option, bool) == isinstance(value, bool):
@@ -205,7 +206,7 @@ class Choice(_Addressed):
         """Return the variable that is varied.
 
         Raises:
-            ValueError: there is none, it is derived or an array, or it refuses an option.
+            ValueError: There is none, it is derived or an array, or it refuses an option.
         """
         variable = self._variable(variables)
         for option in self.options:
@@ -220,7 +221,7 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
     """Check a point s^0, given as values in the order of the parameters or by address, and return its values.
 
     Raises:
-        ValueError: the point has another number of entries, sets what is not varied, or one lies outside its range.
+        ValueError: The point has another number of entries, sets what is not varied, or one lies outside its range.
     """
     addresses = [parameter.address for parameter in parameters]
     if isinstance(point, Mapping):

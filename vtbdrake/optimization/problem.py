@@ -78,24 +78,26 @@ class Problem:
     """Problem (18) of a scenario.
 
     Args:
-        scenario: builds the testbed; its defaults are s0.
-        parameters: s^0, equation (8): the elements of s0, and the fields of the scenario (``scenario.gravity``), to be
-            varied. All else is held constant (9).
-        quality: f and its quality variables, equations (11) and (12); or a cost. Several have a Pareto front.
-        horizon: t_m in seconds.
-        threshold: f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None: never.
-        sample_period: of f, in seconds; part of the problem, see `RolloutTask`.
-        conditions: further elements of s0 (address -> value) that a decision must cope with, such as start phases,
+        scenario: Builds the testbed; its defaults are s0.
+        parameters: The parameters s^0, equation (8): the elements of s0, and the fields of the scenario
+            (``scenario.gravity``), to be varied. All else is held constant (9).
+        quality: The quality f and its quality variables, equations (11) and (12); or a cost. Several have a Pareto
+            front.
+        horizon: The horizon t_m in seconds.
+        threshold: The threshold f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None:
+            never.
+        sample_period: Period of the samples of f, in seconds; part of the problem, see `RolloutTask`.
+        conditions: Further elements of s0 (address -> value) that a decision must cope with, such as start phases,
             frictions or the seeds of sensors; every point runs under each, so that all points have the same noise
             (common random numbers).
-        risk: how the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
-        constraints: what every rollout must keep, under every condition.
+        risk: How the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
+        constraints: What every rollout must keep, under every condition.
         start: s0 from a snapshot instead of the defaults. Take that of a running simulation with error control by
             ``testbed.fork(simulator)``: a plain ``testbed.snapshot(context)`` lacks the integrator's memory of its last
             step, so that the forecast differs a little from what follows.
 
     Raises:
-        ValueError: an address does not exist, a range exceeds its variable's bounds, a condition sets a parameter, the
+        ValueError: An address does not exist, a range exceeds its variable's bounds, a condition sets a parameter, the
             horizon, threshold or sample period is invalid, the start is of another scenario or of a DPS alone, or an
             argument is of another type.
     """
@@ -206,7 +208,7 @@ class Problem:
         """Check a point s^0, given as values in the order of the parameters or by address, and return its values.
 
         Raises:
-            ValueError: the point has another number of entries, or one lies outside its range.
+            ValueError: The point has another number of entries, or one lies outside its range.
         """
         return checked_point(self.parameters, point)
 
@@ -214,7 +216,7 @@ class Problem:
         """Return what a point sets in s0, address -> value, and what a condition sets if its number is given.
 
         Raises:
-            ValueError: as in `point`, or there is no such condition.
+            ValueError: As in `point`, or there is no such condition.
         """
         chosen = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
         return chosen if condition is None else {**self._condition(condition), **chosen}
@@ -236,10 +238,10 @@ class Problem:
         """Run one rollout, with s(t*).
 
         Args:
-            point: s^0, as values in the order of the parameters or by address.
-            condition: the number of the condition.
-            record: addresses and ports (``path.port``) to record at the sample times.
-            run_on: simulate to t_m although the threshold was exceeded.
+            point: The point s^0, as values in the order of the parameters or by address.
+            condition: The number of the condition.
+            record: Addresses and ports (``path.port``) to record at the sample times.
+            run_on: Simulate to t_m although the threshold was exceeded.
         """
         task = replace(self.task, record=record, run_on=run_on, keep_state=True)
         parameters = self.values(point, condition=condition)
@@ -302,17 +304,17 @@ class Problem:
         """Run a rollout at every point, under every condition. Ctrl-C keeps the finished rollouts.
 
         Args:
-            points: the numbers of points of an equally spaced grid over one or two parameters: one for all or each.
-            values: the points themselves instead, shape (n,) for one parameter or (n, p).
+            points: The numbers of points of an equally spaced grid over one or two parameters: one for all or each.
+            values: The points themselves instead, shape (n,) for one parameter or (n, p).
             executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask``, an Executor, any
                 ``concurrent.futures`` executor, or a client of Dask; see `make_executor`.
-            workers: the number of threads or processes; by default the number of cores.
-            record: addresses and ports to record at the sample times.
-            run_on: simulate to t_m although the threshold was exceeded; gives all of G1.
-            progress: show a progress bar.
+            workers: The number of threads or processes; by default the number of cores.
+            record: Addresses and ports to record at the sample times.
+            run_on: Simulate to t_m although the threshold was exceeded; gives all of G1.
+            progress: Show a progress bar.
 
         Raises:
-            ValueError: a point lies outside the range of a parameter, or the executor is unknown.
+            ValueError: A point lies outside the range of a parameter, or the executor is unknown.
             QualityError: f raises, is negative or NaN.
         """
         if (points is None) == (values is None):
@@ -353,20 +355,20 @@ class Problem:
         (`Boundary.chances`).
 
         Args:
-            resolution: step of the fine grid, in the parameter's unit; of a parameter with a logarithmic range, the
+            resolution: Step of the fine grid, in the parameter's unit; of a parameter with a logarithmic range, the
                 ratio of neighbouring values, above 1.
-            coarse: step of the coarse grid, likewise.
-            repeats: the number of rollouts with jitter for each value close to the boundary and each condition. By
+            coarse: Step of the coarse grid, likewise.
+            repeats: The number of rollouts with jitter for each value close to the boundary and each condition. By
                 default 5, and 0 for integers and for fields of the scenario, where each takes another Diagram.
-            jitter: how far the parameter is moved at most in these, as a fraction of its range (on its own scale).
-            executor: see `sweep`.
-            workers: see `sweep`.
-            progress: show a progress bar.
+            jitter: How far the parameter is moved at most in these, as a fraction of its range (on its own scale).
+            executor: See `sweep`.
+            workers: See `sweep`.
+            progress: Show a progress bar.
 
         Raises:
-            ValueError: there is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
+            ValueError: There is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
                 (which is a goal, not a danger), or the steps do not fit the range.
-            KeyboardInterrupt: it was interrupted, before there is an answer.
+            KeyboardInterrupt: It was interrupted, before there is an answer.
         """
         return search_boundary(
             self,
@@ -397,17 +399,17 @@ class Problem:
         """Begin a study of the problem, or resume the one in a file.
 
         Args:
-            path: of the file; None keeps the study in memory.
-            solver: by name, see `vtbdrake.optimization.solvers`; by default ``auto``, which chooses by the problem,
-                or that of the file.
-            seed: of the solver; 0 by default, or that of the file.
-            options: of the solver.
-            allow_changed_code: go on although the functions of the problem, or the Python code of its testbed, have
+            path: Path of the file; None keeps the study in memory.
+            solver: Name of the solver, see `vtbdrake.optimization.solvers`; by default ``auto``, which chooses by the
+                problem, or that of the file.
+            seed: Seed of the solver; 0 by default, or that of the file.
+            options: Options of the solver.
+            allow_changed_code: Go on although the functions of the problem, or the Python code of its testbed, have
                 changed. The file notes the changes (`Study.record`, ``changes``). Its rollouts stay, but those in which
                 a quality function failed run again.
 
         Raises:
-            StudyError: the file is no study, is damaged, of another version, problem, solver or seed, or of other code.
+            StudyError: The file is no study, is damaged, of another version, problem, solver or seed, or of other code.
         """
         from vtbdrake.optimization.study import Study
 

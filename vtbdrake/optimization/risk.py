@@ -91,7 +91,7 @@ def make_risk(risk: str | Risk) -> Risk:
     """Return a risk by name, or the one given.
 
     Raises:
-        ValueError: the name is unknown.
+        ValueError: The name is unknown.
     """
     if isinstance(risk, Risk):
         return risk
@@ -113,11 +113,11 @@ def aggregate(
     """Aggregate the outcomes of one point under several conditions.
 
     Args:
-        outcomes: one per condition, none of them failed; None if a condition has not run.
-        risk: how the qualities under several conditions become one.
-        minimize: whether a quality is a cost, for each of them.
-        constraints: the number of constraints.
-        bounds: the best that each quality can be, in the user's terms; used for conditions that have not run.
+        outcomes: One per condition, none of them failed; None if a condition has not run.
+        risk: How the qualities under several conditions become one.
+        minimize: Whether a quality is a cost, for each of them.
+        constraints: The number of constraints.
+        bounds: The best that each quality can be, in the user's terms; used for conditions that have not run.
 
     Returns:
         The qualities, larger is better (a cost is negated), and the worst violation of each constraint.

@@ -50,9 +50,9 @@ class Study:
     for again are known, and take no rollouts.
 
     Attributes:
-        reason: why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
+        reason: Why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
             ``interrupted``; empty before the first.
-        message: the same in a sentence.
+        message: The same in a sentence.
     """
 
     def __init__(self, file: StudyFile, problem: Problem | None = None) -> None:
@@ -68,7 +68,7 @@ class Study:
         """Open a study file for reading and for giving points.
 
         Raises:
-            StudyError: there is none, it is damaged, or of another version.
+            StudyError: There is none, it is damaged, or of another version.
         """
         return cls(StudyFile(path))
 
@@ -170,27 +170,27 @@ class Study:
         """Run rollouts until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
 
         Args:
-            rollouts: how many the study has in the end, those of former runs included. With racing, a rest that is
+            rollouts: How many the study has in the end, those of former runs included. With racing, a rest that is
                 smaller than one point under all conditions is left; `message` says so.
-            seconds: the wall time of this run.
-            target: the run ends as soon as a point is at least as good: a quality as large, a cost as small. With
+            seconds: The wall time of this run.
+            target: The run ends as soon as a point is at least as good: a quality as large, a cost as small. With
                 several workers, others may be finished by then.
-            racing: drop points that can no longer win before all their conditions have run (see `Evaluator`). By
+            racing: Drop points that can no longer win before all their conditions have run (see `Evaluator`). By
                 default, if there are several conditions and one quality.
-            executor: see `Problem.sweep`.
-            workers: see `Problem.sweep`.
-            time_limit: in seconds; a rollout that takes longer fails.
-            on_error: what happens if a quality or constraint function raises, is negative or NaN. ``record``: the
+            executor: See `Problem.sweep`.
+            workers: See `Problem.sweep`.
+            time_limit: Wall time in seconds; a rollout that takes longer fails.
+            on_error: What happens if a quality or constraint function raises, is negative or NaN. ``record``: the
                 rollout counts as failed, with the message, and the first of a run is logged; ``raise``: the run ends.
-            callbacks: functions of the study and a trial, called in this thread for every trial that is recorded for
+            callbacks: Functions of the study and a trial, called in this thread for every trial that is recorded for
                 the first time, batch by batch. One may set attributes, add points, or `stop` the run; an exception ends
                 the run.
-            progress: show a progress bar: rollouts per second, the best so far, the time left. Without a terminal or a
+            progress: Show a progress bar: rollouts per second, the best so far, the time left. Without a terminal or a
                 notebook, log it every half minute instead, at the level INFO.
 
         Raises:
-            ValueError: there is no budget at all, or an invalid one; an executor or solver is unknown.
-            StudyError: another process runs the study, or it was opened without its problem.
+            ValueError: There is no budget at all, or an invalid one; an executor or solver is unknown.
+            StudyError: Another process runs the study, or it was opened without its problem.
             QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``. Finished rollouts are kept.
         """
         problem = self._problem
@@ -260,7 +260,7 @@ class Study:
         learns from them.
 
         Raises:
-            ValueError: a point has other entries than the study, or one lies outside its range.
+            ValueError: A point has other entries than the study, or one lies outside its range.
         """
         self._file.give([checked_point(self.parameters, point) for point in points])
 
@@ -268,8 +268,8 @@ class Study:
         """Replace a point of the `queue`.
 
         Raises:
-            StudyError: no point of that number waits: it was evaluated, removed, or never given.
-            ValueError: as in `add`.
+            StudyError: No point of that number waits: it was evaluated, removed, or never given.
+            ValueError: As in `add`.
         """
         self._file.change_queue(
             as_whole("the number of a point in the queue", number), checked_point(self.parameters, point)
@@ -279,7 +279,7 @@ class Study:
         """Remove a point from the `queue`.
 
         Raises:
-            StudyError: no point of that number waits: it was evaluated, removed, or never given.
+            StudyError: No point of that number waits: it was evaluated, removed, or never given.
         """
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
@@ -287,12 +287,12 @@ class Study:
         """Set an attribute of the study, or of a point: for example an operator or a remark. It changes no result.
 
         Args:
-            key: its name; an attribute of the same name is replaced.
-            value: a number, a word, or lists and dicts of these.
-            point: as in `add`; None for the study itself.
+            key: Its name; an attribute of the same name is replaced.
+            value: A number, a word, or lists and dicts of these.
+            point: As in `add`; None for the study itself.
 
         Raises:
-            ValueError: the value cannot be stored, or the point is invalid.
+            ValueError: The value cannot be stored, or the point is invalid.
         """
         if not isinstance(key, str) or not key:
             raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
@@ -374,7 +374,7 @@ class Study:
         """Return s^0*, equation (18), among the points examined: the best that keeps all constraints.
 
         Raises:
-            ValueError: there are several qualities, or no point has a value and keeps the constraints.
+            ValueError: There are several qualities, or no point has a value and keeps the constraints.
         """
         if len(self.directions) > 1:
             raise ValueError("several qualities have no single best point: use pareto()")
@@ -418,7 +418,7 @@ class Study:
         """Return the columns of `to_dict` as a DataFrame, one row per trial; its index is `Trial.number`.
 
         Raises:
-            ModuleNotFoundError: pandas is not installed.
+            ModuleNotFoundError: Pandas is not installed.
         """
         try:
             import pandas
@@ -504,12 +504,12 @@ class Study:
         it again adds the new points. Optuna takes about 20 ms per point in an SQL database.
 
         Args:
-            storage: a URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
-            name: the name of the study there.
+            storage: A URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
+            name: The name of the study there.
 
         Raises:
             ModuleNotFoundError: Optuna is not installed.
-            StudyError: the storage cannot be opened, or has another study of that name.
+            StudyError: The storage cannot be opened, or has another study of that name.
         """
         from vtbdrake.optimization.optuna_bridge import to_optuna
 
@@ -522,16 +522,16 @@ class Study:
         evaluated already, or wait in the queue, are left out, so that importing an export of `to_optuna` costs nothing.
 
         Args:
-            storage: a URL or a storage of Optuna's, see `to_optuna`.
-            name: of Optuna's study. Its parameters are named by their addresses.
+            storage: A URL or a storage of Optuna's, see `to_optuna`.
+            name: Name of Optuna's study. Its parameters are named by their addresses.
 
         Returns:
             How many points were given.
 
         Raises:
             ModuleNotFoundError: Optuna is not installed.
-            StudyError: there is no such study, or it varies other parameters.
-            ValueError: a point lies outside its range.
+            StudyError: There is no such study, or it varies other parameters.
+            ValueError: A point lies outside its range.
         """
         from vtbdrake.optimization.optuna_bridge import points_from_optuna
 

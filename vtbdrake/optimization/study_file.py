@@ -76,17 +76,17 @@ class Trial(PointValues):
     """A point s^0 of a study, and how good it is.
 
     Attributes:
-        number: in the order of the study; counted by the study file.
-        parameters: the point, address -> value.
-        values: one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
+        number: Number in the order of the study; counted by the study file.
+        parameters: The point, address -> value.
+        values: One per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
             simulation failed.
-        violations: one per constraint, the worst over the conditions: at most 0 where it holds.
+        violations: One per constraint, the worst over the conditions: at most 0 where it holds.
         exact: False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is
             known but that the point violates a constraint.
         origin: ``solver`` or ``user``, whichever asked for the point.
-        method: the solver's method at that time.
-        batch: the number of the batch of points that were evaluated together.
-        attributes: the user's notes on the point, see `Study.set_attribute`.
+        method: The solver's method at that time.
+        batch: The number of the batch of points that were evaluated together.
+        attributes: The user's notes on the point, see `Study.set_attribute`.
     """
 
     parameters: Mapping[str, Any]
@@ -117,10 +117,10 @@ class StudyFile:
 
     Args:
         path: None keeps the study in memory.
-        meta: what a new study is about; None opens an existing one.
+        meta: What a new study is about; None opens an existing one.
 
     Raises:
-        StudyError: there is none, it is damaged, or of another version.
+        StudyError: There is none, it is damaged, or of another version.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, *, meta: Mapping[str, Any] | None = None) -> None:
@@ -241,7 +241,7 @@ class StudyFile:
             A list, to which the reason why the run ended is appended.
 
         Raises:
-            StudyError: another process has claimed it.
+            StudyError: Another process has claimed it.
         """
         with _claim(self.path):
             with self._transaction():
@@ -328,9 +328,9 @@ class StudyFile:
         """Record trials of a batch, by their positions in it.
 
         Args:
-            batch: the number of the batch.
-            trials: position -> trial.
-            complete: whether the solver was told of the batch. Then the trials replace all that an interrupted run has
+            batch: The number of the batch.
+            trials: Position -> trial.
+            complete: Whether the solver was told of the batch. Then the trials replace all that an interrupted run has
                 recorded of it.
         """
         with self._transaction():
@@ -370,7 +370,7 @@ class StudyFile:
         """Note that the code of the problem has changed, and forget the rollouts in which a quality function failed.
 
         Raises:
-            StudyError: another process runs the study.
+            StudyError: Another process runs the study.
         """
         with _claim(self.path), self._transaction():
             failed = {row["point"] for row in self._rows("rollouts") if row["message"].startswith(QUALITY_FAILED)}
@@ -455,7 +455,7 @@ class StudyFile:
         """Replace a point of the queue, or remove it if ``point`` is None.
 
         Raises:
-            StudyError: no point of that number waits.
+            StudyError: No point of that number waits.
         """
         with self._transaction():
             if not self._rows("given", "WHERE number = ? AND batch IS NULL", (number,)):

@@ -49,11 +49,11 @@ class StudyRun:
         file: The file of the study; this process has claimed it.
         problem: The problem to solve.
         solver: A new solver for the budget that is recorded in the file.
-        executor: runs the rollouts.
-        racing: see `Evaluator`.
-        catch: whether a failed quality function fails its rollout only; see `RolloutTask`.
-        progress: show a progress bar in a terminal or a notebook, and log the progress elsewhere.
-        after_batch: is called with the number of every batch that is recorded for the first time; returns whether the
+        executor: Runs the rollouts.
+        racing: See `Evaluator`.
+        catch: Whether a failed quality function fails its rollout only; see `RolloutTask`.
+        progress: Show a progress bar in a terminal or a notebook, and log the progress elsewhere.
+        after_batch: Called with the number of every batch that is recorded for the first time; returns whether the
             run is to end.
     """
 
@@ -319,7 +319,7 @@ def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | Non
     """Check the budget of a run.
 
     Raises:
-        ValueError: there is no budget at all, one is not positive or NaN, or a target is given for several qualities.
+        ValueError: There is no budget at all, one is not positive or NaN, or a target is given for several qualities.
     """
     if rollouts is None and seconds is None and target is None:
         raise ValueError("a study runs until its budget is spent: give rollouts=, seconds= or target=")

@@ -40,17 +40,17 @@ class Sweep:
     """The rollouts of a problem at several points, one row per point and condition.
 
     Attributes:
-        parameters: what was varied; p of them.
-        units: the units of the parameters.
-        conditions: address -> value of each condition.
-        points: shape (n, p).
-        condition: number of the condition in each row, shape (n,).
-        rollouts: n results, in the order in which the points were given.
-        scenario: the scenario's name and fields.
+        parameters: What was varied; p of them.
+        units: The units of the parameters.
+        conditions: Address -> value of each condition.
+        points: Shape (n, p).
+        condition: Number of the condition in each row, shape (n,).
+        rollouts: The n results, in the order in which the points were given.
+        scenario: The scenario's name and fields.
         complete: False if it was interrupted; it then holds the finished rollouts.
-        minimize: whether a quality is a cost, for each quality of the problem.
-        constraints: the name of each of the problem's constraints.
-        risk: how a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's
+        minimize: Whether a quality is a cost, for each quality of the problem.
+        constraints: The name of each of the problem's constraints.
+        risk: How a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's
             class, which a file cannot hold.
     """
 
@@ -127,7 +127,7 @@ class Sweep:
         """Return the evaluation of each point that has finished all its conditions, as in a study.
 
         Raises:
-            ValueError: the sweep was loaded from a file that could not hold its risk.
+            ValueError: The sweep was loaded from a file that could not hold its risk.
         """
         risk = self.risk
         if risk is None:
@@ -159,7 +159,7 @@ class Sweep:
         The problem's risk aggregates several conditions, as in `Study.best`. Of a cost, its value takes the place of h.
 
         Raises:
-            ValueError: there are several qualities; no point has finished all its conditions and keeps the constraints;
+            ValueError: There are several qualities; no point has finished all its conditions and keeps the constraints;
                 or the sweep was loaded from a file that could not hold its risk.
         """
         if len(self.minimize) > 1:
@@ -179,7 +179,7 @@ class Sweep:
         A rollout is safe if it did not exceed the threshold, kept all constraints and did not fail.
 
         Raises:
-            ValueError: the sweep has several parameters or no rollouts, was interrupted, or has nothing by which a
+            ValueError: The sweep has several parameters or no rollouts, was interrupted, or has nothing by which a
                 rollout could be unsafe.
         """
         from vtbdrake.optimization.boundary import boundary_of, why_no_boundary
@@ -223,7 +223,7 @@ class Sweep:
         """Plot h over the parameters (Figure 6); for one parameter also the quality trajectories with t* (Figure 5).
 
         Raises:
-            ValueError: there are more than two parameters.
+            ValueError: There are more than two parameters.
         """
         from vtbdrake.visualization import plot_sweep
 
@@ -233,7 +233,7 @@ class Sweep:
         """Write the sweep to a file; recordings of abstract ports cannot be saved.
 
         Raises:
-            ValueError: a recording is not numeric.
+            ValueError: A recording is not numeric.
         """
         arrays = {"points": self.points, "condition": self.condition}
         rows = []
@@ -265,7 +265,7 @@ class Sweep:
         """Read a sweep that `save` wrote.
 
         Raises:
-            ArchiveError: the file is not a sweep, is damaged, or was written by another version.
+            ArchiveError: The file is not a sweep, is damaged, or was written by another version.
         """
         return read_archive(path, kind=KIND, version=VERSION, make=cls._from_parts)
 
@@ -328,7 +328,7 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
     Logarithmic ranges are spaced on that scale; values of integers are rounded to whole numbers.
 
     Raises:
-        ValueError: there are more than two parameters, too few points for one of them, more than an integer has values,
+        ValueError: There are more than two parameters, too few points for one of them, more than an integer has values,
             or more in all than there is memory for.
     """
     if not 1 <= len(parameters) <= 2:
@@ -361,7 +361,7 @@ def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
     """Return given points, shape (n, p) or (n,) of a single parameter, as shape (n, p).
 
     Raises:
-        ValueError: they have another shape, or are no numbers.
+        ValueError: They have another shape, or are no numbers.
     """
     try:
         table = np.asarray(values, dtype=float)
@@ -379,7 +379,7 @@ def numeric(problem: Problem) -> tuple[Parameter, ...]:
     """Return the parameters of a problem, all of which must be numbers.
 
     Raises:
-        ValueError: one is a choice.
+        ValueError: One is a choice.
     """
     for parameter in problem.parameters:
         if not isinstance(parameter, Parameter):

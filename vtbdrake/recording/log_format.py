@@ -73,8 +73,8 @@ class CycleLayout:
 
     Attributes:
         dtype: NumPy type of the data, with the fields of `lcmt_vtb_cycle` and its ``fingerprint``.
-        fed: slice of each vector sensor signal in the field ``fed``.
-        actuation: slice of each vector actuator signal in the fields ``commands`` and ``sent``.
+        fed: Slice of each vector sensor signal in the field ``fed``.
+        actuation: Slice of each vector actuator signal in the fields ``commands`` and ``sent``.
     """
 
     def __init__(self, sense: Sequence[LoggedSignal], act: Sequence[LoggedSignal]) -> None:

@@ -86,7 +86,7 @@ class LogEvents:
 
     Attributes:
         damages: Offset and kind of all bytes that are not events.
-        content: bytes of the file.
+        content: Bytes of the file.
 
     Raises:
         OSError: The file cannot be read.
@@ -131,28 +131,28 @@ class ControlLog:
     """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read.
 
     Attributes:
-        path: path of the file.
-        header: what was recorded.
-        start: state before the first recorded cycle.
-        numbers: numbers of the cycles, shape (n,).
-        times: times of the DPS at the ends of the cycles, in seconds, (n,).
-        now: times on the loop's clock, in seconds, (n,).
-        utimes: times of day in microseconds since 1970, (n,).
-        ok: whether the DPS's actuator commands were sent, not those of the fallbacks, (n,).
-        fed: newest values by vector sensor signal, (n, size); NaN before the first.
-        sources: by sensor signal, where a cycle had a new value, (n,): 0 for none, -1 for a vector, and for an abstract
+        path: Path of the file.
+        header: What was recorded.
+        start: State before the first recorded cycle.
+        numbers: Numbers of the cycles, shape (n,).
+        times: Times of the DPS at the ends of the cycles, in seconds, (n,).
+        now: Times on the loop's clock, in seconds, (n,).
+        utimes: Times of day in microseconds since 1970, (n,).
+        ok: Whether the DPS's actuator commands were sent, not those of the fallbacks, (n,).
+        fed: Newest values by vector sensor signal, (n, size); NaN before the first.
+        sources: By sensor signal, where a cycle had a new value, (n,): 0 for none, -1 for a vector, and for an abstract
             signal the number of the event with its message.
-        actuation: actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
-        commanded: whether the DPS commanded, by actuator signal, (n,).
-        sent: actuator commands that were sent, after the guards, by vector signal, (n, size).
-        changes: changes of the target, each with the index of the cycle before whose step it happened.
-        faults: present faults, each with the index of the cycle from which on they hold; empty when all are over.
-        digests: digests of the DPS's state, each with the index of the cycle after which it was taken.
-        damages: damaged places of the file. Reading resumes at the next whole cycle.
-        gaps: cycles that are missing, lost by the recorder or damaged.
-        clock_jumps: indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards.
-        closed: whether the recorder was closed. If not, later cycles may be missing.
-        events: all events of the file.
+        actuation: Actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
+        commanded: Whether the DPS commanded, by actuator signal, (n,).
+        sent: Actuator commands that were sent, after the guards, by vector signal, (n, size).
+        changes: Changes of the target, each with the index of the cycle before whose step it happened.
+        faults: Present faults, each with the index of the cycle from which on they hold; empty when all are over.
+        digests: Digests of the DPS's state, each with the index of the cycle after which it was taken.
+        damages: Damaged places of the file. Reading resumes at the next whole cycle.
+        gaps: Cycles that are missing, lost by the recorder or damaged.
+        clock_jumps: Indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards.
+        closed: Whether the recorder was closed. If not, later cycles may be missing.
+        events: All events of the file.
     """
 
     path: Path

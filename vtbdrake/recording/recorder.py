@@ -70,7 +70,7 @@ class Recorder:
         backlog: Bytes that may wait for the worker process; cycles beyond that are lost.
 
     Attributes:
-        path: path of the file.
+        path: Path of the file.
 
     Raises:
         OSError: The file cannot be written, or exists.

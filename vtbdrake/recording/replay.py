@@ -73,17 +73,17 @@ class ReplayReport:
     Attributes:
         outcome: ``identical`` (every actuator command, the time after every cycle and every digest, to the last bit),
             ``different``, or ``not compared`` (the replay had other values).
-        cycles: number of replayed cycles.
-        ended: why not all cycles of the log were replayed; empty if they were.
-        first_difference: the first difference; None if there is none.
-        max_difference: largest absolute difference by vector actuator signal; inf where an actuator command is missing
+        cycles: Number of replayed cycles.
+        ended: Why not all cycles of the log were replayed; empty if they were.
+        first_difference: The first difference; None if there is none.
+        max_difference: Largest absolute difference by vector actuator signal; inf where an actuator command is missing
             on one side or not finite.
-        digests: number of digests of the DPS's state that were compared.
+        digests: Number of digests of the DPS's state that were compared.
         versions: The software whose version differs from the recorded one; results may differ for that reason.
-        times: times of the DPS at the ends of the cycles, in seconds, (n,).
-        actuation: actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
-        errors: exceptions of the DPS, by the number of the cycle.
-        record: recorded values at the ends of the cycles by address, (n, ...); a list, if they are not arrays.
+        times: Times of the DPS at the ends of the cycles, in seconds, (n,).
+        actuation: Actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
+        errors: Exceptions of the DPS, by the number of the cycle.
+        record: Recorded values at the ends of the cycles by address, (n, ...); a list, if they are not arrays.
     """
 
     outcome: str
@@ -179,8 +179,8 @@ class _Replay:
     """A replay cycle by cycle, up to the first gap.
 
     Attributes:
-        same_kind: whether the target is of the recorded kind, testbed or DPS alone.
-        errors: exceptions of the DPS, by the number of the cycle.
+        same_kind: Whether the target is of the recorded kind, testbed or DPS alone.
+        errors: Exceptions of the DPS, by the number of the cycle.
     """
 
     def __init__(self, log: ControlLog, target: Target, values: dict[str, Any], record: Sequence[str]) -> None:

@@ -36,7 +36,7 @@ def write_archive(
     """Write ``arrays`` and ``header`` (plain data) as a file of ``kind``.
 
     Raises:
-        ValueError: they would not be read again, see `read_archive`.
+        ValueError: They would not be read again, see `read_archive`.
     """
     with whole_file(path) as partial, partial.open("wb") as file:
         _write(file, kind, version, header, arrays)
@@ -118,7 +118,7 @@ def _check_entries(archive: zipfile.ZipFile) -> None:
     """Reject entries that `write_archive` has not written, and those that would take too much memory.
 
     Raises:
-        ValueError: there is an entry that `write_archive` has not written, or all would take too much memory.
+        ValueError: There is an entry that `write_archive` has not written, or all would take too much memory.
     """
     entries = archive.infolist()
     for entry in entries:
@@ -138,7 +138,7 @@ def _array(data: bytes) -> np.ndarray:
     """Return the array of an entry, after a check of its data against its header.
 
     Raises:
-        ValueError: the data are not the array that their header declares.
+        ValueError: The data are not the array that their header declares.
     """
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)

@@ -174,12 +174,12 @@ class AbstractState:
     The codecs are those of the system's attribute ``codecs``, or else `codec_of` the present value of the state.
 
     Args:
-        path: of the system, for messages.
-        system: the leaf system.
-        context: any context of this system.
+        path: Path of the system, for messages.
+        system: The leaf system.
+        context: Any context of this system.
 
     Raises:
-        SnapshotError: the system keeps an abstract value that no codec can carry.
+        SnapshotError: The system keeps an abstract value that no codec can carry.
     """
 
     def __init__(self, path: str, system: System, context: Context) -> None:
@@ -217,7 +217,7 @@ class AbstractState:
         """Return the state in the system's own context as arrays, by ``<index>/<name>``.
 
         Raises:
-            SnapshotError: the state has become something that its codec does not take.
+            SnapshotError: The state has become something that its codec does not take.
         """
         arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
@@ -235,7 +235,7 @@ class AbstractState:
         """Return a function that sets the state in the system's own context to what `read` gave.
 
         Raises:
-            SnapshotError: the arrays are not those of such a state.
+            SnapshotError: The arrays are not those of such a state.
         """
         values = {index: self._decode(index, arrays) for index in self._codecs}
 
@@ -305,7 +305,7 @@ def abstract_state(path: str, system: System, context: Context) -> AbstractState
     """Return the reader and writer of the abstract state of the leaf system at ``path``.
 
     Raises:
-        SnapshotError: the system keeps an abstract value that no codec can carry.
+        SnapshotError: The system keeps an abstract value that no codec can carry.
     """
     if isinstance(system, DiscreteTimeDelay) and context.num_abstract_states():
         return DelayState(path, system, context)

@@ -27,10 +27,10 @@ class Snapshot:
     """The state s(t) = [x, a] of a whole Diagram at one time.
 
     Attributes:
-        time: t in seconds.
-        scenario: plain data that identifies what the snapshot belongs to; empty for a bare Diagram.
-        values: the addressed variables (derived ones left out), by address.
-        groups: every numeric group and, through its codec, every abstract state of every leaf system, under
+        time: Time t in seconds.
+        scenario: Plain data that identifies what the snapshot belongs to; empty for a bare Diagram.
+        values: The addressed variables (derived ones left out), by address.
+        groups: Every numeric group and, through its codec, every abstract state of every leaf system, under
             ``path/group/index`` and ``path/abstract/index/name``.
 
     Two snapshots are equal if all of that is, where NaN equals NaN. Arrays are read only. The contact
@@ -110,7 +110,7 @@ class Snapshot:
         """Return the snapshot of a file that `save` wrote, or of the bytes of `to_bytes`.
 
         Raises:
-            ArchiveError: it is not a snapshot, is damaged, or was written by another version.
+            ArchiveError: It is not a snapshot, is damaged, or was written by another version.
         """
         return read_archive(source, kind=KIND, version=VERSION, make=cls._from_parts)
 
@@ -138,7 +138,7 @@ def take(
     """Return the snapshot of ``context``.
 
     Raises:
-        SnapshotError: a system keeps something abstract that neither a codec nor a hidden variable carries.
+        SnapshotError: A system keeps something abstract that neither a codec nor a hidden variable carries.
             (Of a testbed, it is refused when the testbed is built.)
     """
     groups: dict[str, np.ndarray] = {}
@@ -239,12 +239,12 @@ class StateCopier:
     recompute unchanged values. Their hidden state is copied by address, and only where it differs.
 
     Args:
-        source, target: the Diagrams; they may be the same one.
-        source_variables, target_variables: theirs.
-        only: selects the systems of the target that are copied, by path; left out, all are.
+        source, target: The Diagrams; they may be the same one.
+        source_variables, target_variables: Theirs.
+        only: Selects the systems of the target that are copied, by path; left out, all are.
 
     Raises:
-        ValueError: the two are not built alike.
+        ValueError: The two are not built alike.
     """
 
     def __init__(
@@ -274,9 +274,9 @@ class StateCopier:
         """Make ``target`` continue as ``source`` would.
 
         Args:
-            source: context of the source Diagram.
-            target: context of the target Diagram.
-            hidden: addresses of the hidden variables that can differ; left out, all are compared.
+            source: Context of the source Diagram.
+            target: Context of the target Diagram.
+            hidden: Addresses of the hidden variables that can differ; left out, all are compared.
         """
         target.SetTime(source.get_time())
         for from_system, to_system in self._pairs:

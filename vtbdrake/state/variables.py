@@ -67,7 +67,7 @@ class Variable:
         """Return ``value`` as an array of the variable's shape.
 
         Raises:
-            VariableError: the variable is derived, or the value has another shape, is not finite, or lies
+            VariableError: The variable is derived, or the value has another shape, is not finite, or lies
                 outside the bounds.
         """
         if self.write is None:
@@ -97,7 +97,7 @@ class Variable:
         """Check ``value`` and write it into ``context``.
 
         Raises:
-            VariableError: as `check`, or Drake rejects the value.
+            VariableError: As `check`, or Drake rejects the value.
         """
         array = self.check(value)
         assert self.write is not None

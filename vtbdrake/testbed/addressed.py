@@ -45,10 +45,10 @@ class AddressedDiagram:
     """A Diagram with addresses for the contents of its Context, and with the settings of its simulation.
 
     Attributes:
-        diagram: the input and output ports of it carry the DPS's signals.
-        interface: the DPS's signals.
-        simulator_config: how it is to be integrated.
-        scenario: what built it, or None.
+        diagram: The input and output ports of it carry the DPS's signals.
+        interface: The DPS's signals.
+        simulator_config: How it is to be integrated.
+        scenario: What built it, or None.
 
     It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
     """
@@ -94,7 +94,7 @@ class AddressedDiagram:
         """Reject a context that is not the root context of this diagram, or of a diagram that holds it.
 
         Raises:
-            ValueError: it is another diagram's, or that of a part.
+            ValueError: It is another diagram's, or that of a part.
         """
         try:
             self.diagram.ValidateContext(self.diagram.GetMyContextFromRoot(context))
@@ -108,7 +108,7 @@ class AddressedDiagram:
         """Return a new Drake Simulator with the integrator of ``simulator_config``.
 
         Args:
-            context: a context of this diagram; a default one if left out.
+            context: A context of this diagram; a default one if left out.
             restored: True if ``context`` continues another one: initialization events, which would overwrite its
                 state, do not happen again.
 
@@ -145,10 +145,10 @@ class AddressedDiagram:
         fixed steps, a plain snapshot does.
 
         Args:
-            simulator: one of this testbed; between two calls of its AdvanceTo.
+            simulator: One of this testbed; between two calls of its AdvanceTo.
 
         Raises:
-            ValueError: it is no Simulator, or one of another Diagram.
+            ValueError: It is no Simulator, or one of another Diagram.
         """
         if not isinstance(simulator, Simulator):
             raise ValueError(f"fork a simulator made by testbed.simulator(), not {simulator!r}")
@@ -183,7 +183,7 @@ class AddressedDiagram:
         """Set variables in ``context``: all of ``values`` (address -> value), or none.
 
         Raises:
-            ValueError: there is no such variable, or it does not take the value. Nothing has been set then.
+            ValueError: There is no such variable, or it does not take the value. Nothing has been set then.
         """
         self.check_context(context)
         self._variables.write(context, values)
@@ -192,7 +192,7 @@ class AddressedDiagram:
         """Return a function that reads a variable, or an output port by ``path.port``, from any context.
 
         Raises:
-            AddressError: there is neither.
+            AddressError: There is neither.
         """
         check_address(address)
         if address in self._variables:
@@ -227,7 +227,7 @@ class AddressedDiagram:
         """Raise a SnapshotError if the snapshot is of another scenario, or no snapshot.
 
         Raises:
-            SnapshotError: the snapshot is none, or is of another scenario.
+            SnapshotError: The snapshot is none, or is of another scenario.
         """
         if not isinstance(snapshot, Snapshot):
             raise SnapshotError(

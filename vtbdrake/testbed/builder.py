@@ -45,11 +45,11 @@ class VirtualTestbedBuilder:
     """Adds the parts of Figure 4 one by one; `build` puts the switches between them.
 
     Attributes:
-        diagram_builder: the DiagramBuilder of the testbed, for functions of Drake that take one.
-        plant, scene_graph: those of the simulated world; None until `add_plant` adds them.
-        sensors, actuators: the ports of the simulated world, by signal.
-        beliefs: what `believe` declares.
-        extra_variables: those that `add_variable` lists.
+        diagram_builder: The DiagramBuilder of the testbed, for functions of Drake that take one.
+        plant, scene_graph: Those of the simulated world; None until `add_plant` adds them.
+        sensors, actuators: The ports of the simulated world, by signal.
+        beliefs: What `believe` declares.
+        extra_variables: Those that `add_variable` lists.
     """
 
     def __init__(self, interface: Interface, *, simulator_config: SimulatorConfig | None = None) -> None:
@@ -75,8 +75,8 @@ class VirtualTestbedBuilder:
 
         Args:
             role: ``sense``, ``sys``, ``act`` or ``env``.
-            name: unique within the role.
-            system: any System; a Diagram, too.
+            name: Unique within the role.
+            system: Any System; a Diagram, too.
         """
         if role not in ROLES:
             raise ValueError(f"the role of {name} is one of {', '.join(ROLES)}, not {role!r}")
@@ -122,13 +122,13 @@ class VirtualTestbedBuilder:
         """Add a simulated sensor, connect its inputs to the plant and offer its output as a sensor signal.
 
         Args:
-            signal: the sensor signal of the interface.
-            sensor: a System with one output port, whose input ports have the names of output ports of the plant, such
+            signal: The sensor signal of the interface.
+            sensor: A System with one output port, whose input ports have the names of output ports of the plant, such
                 as the sensors in `vtbdrake.components.sensors`.
-            name: the sensor is added as ``sim.sense.<name>``; by default, it has the name of the signal.
+            name: The sensor is added as ``sim.sense.<name>``; by default, it has the name of the signal.
 
         Raises:
-            ValueError: the testbed has no plant.
+            ValueError: The testbed has no plant.
         """
         if self.plant is None:
             raise ValueError(f"the sensor {name or signal} measures a plant: call add_plant first")
@@ -206,7 +206,7 @@ class VirtualTestbedBuilder:
         """Declare which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
 
         Args:
-            target: address of the simulated variable.
+            target: Address of the simulated variable.
             of: Addresses of the estimates.
             by: Function of the estimates that returns the target's value; by default the value of the one estimate.
             age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
@@ -261,7 +261,7 @@ class VirtualTestbedBuilder:
         Systems without a name are named by their class, see `name_systems`.
 
         Raises:
-            ValueError: two systems have one name, or copies of the state could not continue a system.
+            ValueError: Two systems have one name, or copies of the state could not continue a system.
         """
         names = [system.get_name() for system in self.diagram_builder.GetSystems()]
         for twin in sorted({name for name in names if names.count(name) > 1}):
@@ -285,7 +285,7 @@ class VirtualTestbedBuilder:
         """Finalize the plant: that of `add_plant`, or one that Drake's own functions have added as ``plant``.
 
         Raises:
-            SignalError: the simulated world lacks a signal of the interface.
+            SignalError: The simulated world lacks a signal of the interface.
         """
         for signal in self.interface.sense:
             if signal.name not in self.sensors:

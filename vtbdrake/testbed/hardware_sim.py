@@ -59,10 +59,10 @@ class HardwareSimScenario(Scenario):
     These fields are read, kept, and not used.
 
     Attributes:
-        simulator_config, plant_config, scene_graph_config: as in hardware_sim; the defaults are Drake's.
-        directives: the models, as for `ProcessModelDirectives`.
-        cameras: by any name; ``CameraConfig.name`` is the name in the Diagram.
-        initial_position: positions of joints, by joint, by model instance; they override those of the directives.
+        simulator_config, plant_config, scene_graph_config: As in hardware_sim; the defaults are Drake's.
+        directives: The models, as for `ProcessModelDirectives`.
+        cameras: Cameras by any name; ``CameraConfig.name`` is the name in the Diagram.
+        initial_position: Positions of joints, by joint, by model instance; they override those of the directives.
     """
 
     plant_config: MultibodyPlantConfig = field(default_factory=MultibodyPlantConfig)
@@ -83,7 +83,7 @@ class HardwareSimScenario(Scenario):
             The models that the directives have added.
 
         Raises:
-            ScenarioError: a directive or an initial position does not fit.
+            ScenarioError: A directive or an initial position does not fit.
         """
         if self.model_drivers:
             _log.info(
@@ -108,7 +108,7 @@ class HardwareSimScenario(Scenario):
             The cameras ``sim.sense.<CameraConfig.name>``, by their keys in ``cameras``.
 
         Raises:
-            ScenarioError: a camera has an offset or a delay, which `RgbdSensorDiscrete` does not have.
+            ScenarioError: A camera has an offset or a delay, which `RgbdSensorDiscrete` does not have.
         """
         added = {}
         for key, config in self.cameras.items():

@@ -32,7 +32,7 @@ class DpsAlone(AddressedDiagram):
     signal commands: ``real.act.active`` is 1 throughout.
 
     Attributes:
-        dps: the data processing system, a direct subsystem of the diagram.
+        dps: The data processing system, a direct subsystem of the diagram.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -94,7 +94,7 @@ class DpsAlone(AddressedDiagram):
         """Make ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
 
         Raises:
-            SnapshotError: it is of another scenario, or of a DPS that is built in another way.
+            SnapshotError: It is of another scenario, or of a DPS that is built in another way.
         """
         self.check_context(context)
         self.check_scenario(snapshot)
@@ -123,18 +123,18 @@ class WorldAlone(AddressedDiagram):
     Its variables have the addresses that they have in the testbed.
 
     Attributes:
-        diagram: input ports ``act.<signal>``, which lead to the simulated actuators, and output ports
+        diagram: Input ports ``act.<signal>``, which lead to the simulated actuators, and output ports
             ``sense.<signal>``, which come from the simulated sensors.
-        plant: of the simulated world, if it has one.
-        beliefs: which estimates of the DPS set which of its variables.
+        plant: Plant of the simulated world, if it has one.
+        beliefs: Which estimates of the DPS set which of its variables.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         """Build the world of ``scenario``.
 
         Raises:
-            ScenarioError: a field of the scenario has a value that nothing can be built with.
-            SignalError: the world lacks a signal of the interface.
+            ScenarioError: A field of the scenario has a value that nothing can be built with.
+            SignalError: The world lacks a signal of the interface.
         """
         scenario.validate()
         own = copy.deepcopy(scenario)

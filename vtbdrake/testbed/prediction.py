@@ -34,8 +34,8 @@ class Predictor:
         values: Values of variables of the world, by address, that differ from the scenario's.
 
     Attributes:
-        interface: the signals of the DPS.
-        estimates: by age of a belief, in periods, the addresses of the estimates that it is made of.
+        interface: The signals of the DPS.
+        estimates: By age of a belief, in periods, the addresses of the estimates that it is made of.
 
     Raises:
         ValueError: The scenario declares no belief, or one whose age is not a multiple of the period; a signal is

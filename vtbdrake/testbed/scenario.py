@@ -54,7 +54,7 @@ class Scenario(ABC):
     see `vtbdrake.state`. Others stay until their process ends; `ProcessExecutor` replaces workers that have grown.
 
     Attributes:
-        simulator_config: the integrator. ``target_realtime_rate`` and ``publish_every_time_step`` hold for
+        simulator_config: The integrator. ``target_realtime_rate`` and ``publish_every_time_step`` hold for
             `VirtualTestbed.simulator`, not for rollouts and control loops.
     """
 
@@ -101,7 +101,7 @@ class Scenario(ABC):
         """Check the fields; `build` and `load_scenario` do so. Subclasses add their own checks.
 
         Raises:
-            ScenarioError: a value has another type than its field, a number is not finite, or the simulator_config
+            ScenarioError: A value has another type than its field, a number is not finite, or the simulator_config
                 cannot be used.
         """
         name = type(self).__name__
@@ -212,11 +212,11 @@ class Scenario(ABC):
         """Return a copy in which some fields have other values.
 
         Args:
-            values: by field, nested ones by dotted names (``simulator_config.accuracy``). Only fields that are a bool,
-                int, float or str can be set; an int will do for a float, and numpy's scalars for Python's.
+            values: Values by field, nested ones by dotted names (``simulator_config.accuracy``). Only fields that are a
+                bool, int, float or str can be set; an int will do for a float, and numpy's scalars for Python's.
 
         Raises:
-            ScenarioError: there is no such field, the value has another type, or the scenario rejects it.
+            ScenarioError: There is no such field, the value has another type, or the scenario rejects it.
         """
         changed = copy.deepcopy(self)
         known = {name: (owner, kinds) for name, owner, kinds in _scalar_fields(changed)}

@@ -28,7 +28,7 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
     Importing a module runs its code. So no module is imported because a file names it.
 
     Args:
-        source: one of
+        source: One of
 
             * ``package.module:Class``: the scenario with its defaults;
             * ``package.module:Class@FILE``: with the fields of a YAML file;
@@ -40,7 +40,7 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
                     gravity: 3.71
 
     Raises:
-        ScenarioError: the class, file or key does not exist, a key of the file is unknown or occurs twice, or a value
+        ScenarioError: The class, file or key does not exist, a key of the file is unknown or occurs twice, or a value
             has the wrong type or is rejected by the scenario.
     """
     text = os.fspath(source)
@@ -66,7 +66,7 @@ def scenario_class(name: str) -> type[Scenario]:
     """Return the class ``package.module:Class``; its module is imported, which runs its code.
 
     Raises:
-        ScenarioError: there is no such class, or its module cannot be imported.
+        ScenarioError: There is no such class, or its module cannot be imported.
     """
     module_name, _, class_ = name.partition(":")
     if not module_name or not class_:
@@ -99,9 +99,9 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
     """Return the scenario of a file.
 
     Args:
-        path: the file.
-        named: the class that the user has named; empty if only the file names it.
-        key: the top-level key of the scenario; empty if there is only one.
+        path: The file.
+        named: The class that the user has named; empty if only the file names it.
+        key: The top-level key of the scenario; empty if there is only one.
     """
     if not path.exists():
         raise ScenarioError(f"there is no scenario file {path}")
@@ -189,9 +189,9 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
     """Refuse keys that are no field of the class that is expected there.
 
     Args:
-        node: the value given for a field.
-        hint: the type of that field.
-        name: its dotted name.
+        node: The value given for a field.
+        hint: The type of that field.
+        name: Its dotted name.
     """
     alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))

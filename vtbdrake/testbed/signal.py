@@ -22,17 +22,17 @@ class Signal:
     """One signal that crosses the boundary of a DPS.
 
     Attributes:
-        name: the name of the port that carries it, on every side.
-        size: entries of a vector signal; leave it out for an abstract one.
-        model_value: a value of an abstract signal's type (an image, a pose, any object); None for a vector one. All
+        name: The name of the port that carries it, on every side.
+        size: Entries of a vector signal; leave it out for an abstract one.
+        model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector one. All
             images have its size, unless it has none.
         unit: SI unit of all entries; ``"1"`` if it has none.
-        lower, upper: limits of its entries, scalars or arrays of shape (size,).
-        rate: the largest change per second of an entry.
-        acceleration: the largest change per second of that change.
-        max_age: in seconds; an older sample is stale.
-        idle: of actuator signals: the command of the simulated actuator while the real one is driven.
-        default: of commands: the value until another one is given; zeros if left out.
+        lower, upper: Limits of its entries, scalars or arrays of shape (size,).
+        rate: The largest change per second of an entry.
+        acceleration: The largest change per second of that change.
+        max_age: Largest age in seconds; an older sample is stale.
+        idle: For an actuator signal, the command of the simulated actuator while the real one is driven.
+        default: The value of a command until another one is given; zeros if left out.
     """
 
     name: str
@@ -202,7 +202,7 @@ class Interface:
     """All signals of a DPS: sensor signals in, actuator signals out, commands u in.
 
     Raises:
-        SignalError: two signals have one name, an actuator signal has no idle value, or a command is abstract.
+        SignalError: Two signals have one name, an actuator signal has no idle value, or a command is abstract.
     """
 
     sense: Sequence[Signal]

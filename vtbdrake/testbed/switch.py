@@ -147,15 +147,15 @@ class Switches:
     (twin) to both.
 
     Attributes:
-        sense, act: the selectors, by signal.
-        sim_sense, real_sense: where the simulated and the real sensors go, by signal.
-        dps_sense: what the DPS reads, by signal.
-        sim_act, real_act: what the simulated and the real actuators get, by signal.
-        active: port of the flags of all actuator signals.
-        commands: where the constant commands u come from, by signal.
+        sense, act: The selectors, by signal.
+        sim_sense, real_sense: Where the simulated and the real sensors go, by signal.
+        dps_sense: What the DPS reads, by signal.
+        sim_act, real_act: What the simulated and the real actuators get, by signal.
+        active: Port of the flags of all actuator signals.
+        commands: Where the constant commands u come from, by signal.
 
     Args:
-        u: the commands that are constants, by signal, with their defaults.
+        u: The commands that are constants, by signal, with their defaults.
     """
 
     def __init__(

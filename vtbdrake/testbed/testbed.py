@@ -30,7 +30,7 @@ class Belief:
     values from which they are made: that of sampling, say. What lies between machine and DPS does not count.
 
     Raises:
-        ValueError: several estimates and no ``by``, or an age that is negative or infinite.
+        ValueError: Several estimates and no ``by``, or an age that is negative or infinite.
     """
 
     target: str
@@ -85,12 +85,12 @@ class VirtualTestbed(AddressedDiagram):
     """A DPS in one Diagram with the simulated world around it, behind switches.
 
     Attributes:
-        diagram: input ports ``real.sense.<signal>``; output ports ``real.act.<signal>`` and ``real.act.active`` (1
+        diagram: Input ports ``real.sense.<signal>``; output ports ``real.act.<signal>`` and ``real.act.active`` (1
             for every actuator signal that commands, else 0). While an actuator signal's switch is on sim, its real
             port carries no command: NaN, or an empty `ActuatorCommand` for an abstract signal. No system in it touches
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
-        dps: the data processing system, a direct subsystem of the diagram.
-        plant, scene_graph: of the simulated world, if it has them.
+        dps: The data processing system, a direct subsystem of the diagram.
+        plant, scene_graph: Those of the simulated world, if it has them.
         visualized: True if a Meshcat draws it.
     """
 
@@ -203,7 +203,7 @@ class VirtualTestbed(AddressedDiagram):
         """Make ``context`` continue from ``snapshot``: s_sim(t0) from a file.
 
         Raises:
-            SnapshotError: it is of another scenario, or of a testbed that is built in another way.
+            SnapshotError: It is of another scenario, or of a testbed that is built in another way.
         """
         self.check_context(context)
         self.check_scenario(snapshot)
@@ -226,7 +226,7 @@ class VirtualTestbed(AddressedDiagram):
         An estimate beyond the bounds of its target (a joint a little past its stop) is clipped.
 
         Raises:
-            ValueError: the testbed declares no belief, or a variable refuses what is believed of it.
+            ValueError: The testbed declares no belief, or a variable refuses what is believed of it.
         """
         self.check_context(context)
         if not self._beliefs:

@@ -163,8 +163,8 @@ def svg(testbed: VirtualTestbed, context: Context | None = None) -> str:
     ``id`` is its address (``T_sense.<signal>``) and whose ``data-position`` is where it stands.
 
     Args:
-        testbed: what is drawn.
-        context: holds the positions of the switches; by default, those in which the testbed was built.
+        testbed: What is drawn.
+        context: Holds the positions of the switches; by default, those in which the testbed was built.
     """
     return _Drawing(structure_of(testbed, context)).text()
 

@@ -92,16 +92,16 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
     It replaces the present recording, and what is drawn under ``prefix``. `show_motions` shows several motions.
 
     Args:
-        meshcat: the server that shows it.
-        motion: the states over time.
-        prefix: the Meshcat path under which it is drawn.
-        rate: keyframes per second at most.
+        meshcat: The server that shows it.
+        motion: The states over time.
+        prefix: The Meshcat path under which it is drawn.
+        rate: Keyframes per second at most.
 
     Returns:
         The scene, which shows itself in a notebook.
 
     Raises:
-        ValueError: the motion has no sample, its states do not fit the scenario's plant, or there is nothing to draw.
+        ValueError: The motion has no sample, its states do not fit the scenario's plant, or there is nothing to draw.
     """
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
@@ -125,20 +125,20 @@ def show_motions(
     are drawn once. A motion that ends earlier stands still until the last one has ended.
 
     Args:
-        meshcat: the server that shows them.
-        motions: label -> motion.
-        prefix: the Meshcat path under which they are drawn.
-        colors: label -> tint, any matplotlib colour; a motion without an entry keeps its own colours. By default every
+        meshcat: The server that shows them.
+        motions: Label -> motion.
+        prefix: The Meshcat path under which they are drawn.
+        colors: Label -> tint, any matplotlib colour; a motion without an entry keeps its own colours. By default every
             motion is tinted.
-        opacity: of the moving bodies, in (0, 1], for all or by label.
-        spacing: displacement from each motion to the next, in metres; shape (3,).
-        rate: keyframes per second at most.
+        opacity: Opacity of the moving bodies, in (0, 1], for all or by label.
+        spacing: Displacement from each motion to the next, in metres; shape (3,).
+        rate: Keyframes per second at most.
 
     Returns:
         The scene, whose legend names the tints; it shows itself in a notebook.
 
     Raises:
-        ValueError: there is no motion, a label or opacity makes no sense, or as in `show_motion`.
+        ValueError: There is no motion, a label or opacity makes no sense, or as in `show_motion`.
     """
     if not motions:
         raise ValueError("there is no motion to show")

@@ -270,13 +270,13 @@ def draw_mesh(
     """Draw values on a full grid as cells around its points, with lines of equal value.
 
     Args:
-        axes: where it is drawn.
-        x: where the columns lie, ascending, shape (n,).
-        y: where the rows lie, ascending, shape (m,).
-        image: the values, shape (m, n); NaN leaves a hole.
-        log: whether the cells lie around their points on a logarithmic scale, in x and y.
-        lines: draw the lines.
-        cmap: the colour map.
+        axes: Where it is drawn.
+        x: Where the columns lie, ascending, shape (n,).
+        y: Where the rows lie, ascending, shape (m,).
+        image: The values, shape (m, n); NaN leaves a hole.
+        log: Whether the cells lie around their points on a logarithmic scale, in x and y.
+        lines: Draw the lines.
+        cmap: The colour map.
     """
     cells = axes.pcolormesh(
         _edges(x, log=log[0]), _edges(y, log=log[1]), np.ma.masked_invalid(image), cmap=cmap, gid="h"
@@ -336,11 +336,11 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
     parameters: the landscape of h, under the worst condition, with the best point.
 
     Args:
-        sweep: what is drawn.
-        boundary: the boundary to be shaded; left out, it is that of the sweep, if there is one.
+        sweep: What is drawn.
+        boundary: The boundary to be shaded; left out, it is that of the sweep, if there is one.
 
     Raises:
-        ValueError: there are more than two parameters, or no rollouts.
+        ValueError: There are more than two parameters, or no rollouts.
     """
     if len(sweep.parameters) > 2:
         names = ", ".join(parameter.address for parameter in sweep.parameters)
@@ -370,7 +370,7 @@ def plot_quality(rollouts: Sequence[RolloutResult]) -> Figure:
     """Plot the quality trajectories f'(t) of some rollouts, with f_m, the samples in G1 and t* (Figure 5).
 
     Raises:
-        ValueError: there is none, or one has no quality.
+        ValueError: There is none, or one has no quality.
     """
     if not rollouts or any(rollout.quality.size == 0 for rollout in rollouts):
         raise ValueError("a quality trajectory is that of a rollout with a quality and at least one sample")

@@ -46,7 +46,7 @@ class Points:
         """Group the points of a study.
 
         Raises:
-            ValueError: the study has no points.
+            ValueError: The study has no points.
         """
         sorted_: dict[str, list[Trial]] = {"kept": [], "broken": [], "dropped": [], "failed": []}
         for trial in study.trials:
@@ -278,11 +278,11 @@ def plot_landscape(study: Study, *addresses: str) -> Figure:
     numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
 
     Args:
-        study: what is drawn.
-        addresses: one or two parameters; by default all of a study that has one or two.
+        study: What is drawn.
+        addresses: One or two parameters; by default all of a study that has one or two.
 
     Raises:
-        ValueError: there are no points, an address is none of the study's parameters, or there are not one or two.
+        ValueError: There are no points, an address is none of the study's parameters, or there are not one or two.
     """
     points = Points.of(study)
     known = scales(study)
@@ -432,7 +432,7 @@ def plot_history(study: Study) -> Figure:
     """Plot every quality in the order of the points, coloured by solver, with the best value so far.
 
     Raises:
-        ValueError: there are no points.
+        ValueError: There are no points.
     """
     points = Points.of(study)
     trials = study.trials
@@ -480,7 +480,7 @@ def plot_slices(study: Study) -> Figure:
     """Plot every quality over every parameter, coloured by the order of the points; the best point is a star.
 
     Raises:
-        ValueError: there are no points.
+        ValueError: There are no points.
     """
     points = Points.of(study)
     axis_of = scales(study)
@@ -516,7 +516,7 @@ def plot_importances(study: Study) -> Figure:
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
-        ValueError: there are too few points with a value, or they all have the same.
+        ValueError: There are too few points with a value, or they all have the same.
     """
     from vtbdrake.optimization.optuna_bridge import importances
 
@@ -543,7 +543,7 @@ def plot_pareto(study: Study) -> Figure:
     """Plot two qualities against each other with the Pareto front; of three qualities, every pair.
 
     Raises:
-        ValueError: there are no points, or not two or three qualities.
+        ValueError: There are no points, or not two or three qualities.
     """
     points = Points.of(study)
     count = len(study.names)

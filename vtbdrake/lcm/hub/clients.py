@@ -20,11 +20,11 @@ class ClientConnection:
     """A connected client: its socket, its subscriptions and its backlog, the messages that it has not read yet.
 
     Args:
-        sock: connected socket, which the connection owns from now on.
-        max_message: largest data of a message, in bytes.
-        max_queue: largest backlog, in bytes.
-        now: time on the hub's clock, in seconds.
-        user: user id of the client; None if unknown.
+        sock: Connected socket, which the connection owns from now on.
+        max_message: Largest data of a message, in bytes.
+        max_queue: Largest backlog, in bytes.
+        now: Time on the hub's clock, in seconds.
+        user: User id of the client; None if unknown.
     """
 
     def __init__(self, sock: socket.socket, *, max_message: int, max_queue: int, now: float, user: int | None) -> None:

@@ -35,8 +35,8 @@ class Hub(ChildService):
             bus = lcm.LCM(hub.url)
 
     Args:
-        config: address, protected channels and limits.
-        fields: fields of `HubConfig` that replace those of ``config``.
+        config: Address, protected channels and limits.
+        fields: Fields of `HubConfig` that replace those of ``config``.
 
     Raises:
         ValueError: A field is out of range.
@@ -84,8 +84,8 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
     """Run a hub in the main thread of a process that does nothing else, until SIGTERM (or SIGINT, if not ignored).
 
     Args:
-        server: the hub.
-        ready: called when processors and priority are set.
+        server: The hub.
+        ready: Called when processors and priority are set.
     """
     config = server.config
     settings = RealTime(

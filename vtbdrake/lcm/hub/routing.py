@@ -63,11 +63,11 @@ class ProtectedChannel:
     """A channel on which only its owner may publish; the docstring of the package has the rules.
 
     Args:
-        name: name of the channel.
-        lease: time after the owner's last publication during which no other client can take over, in seconds.
+        name: Name of the channel.
+        lease: Time after the owner's last publication during which no other client can take over, in seconds.
 
     Attributes:
-        owner: the client that may publish; None if there is none.
+        owner: The client that may publish; None if there is none.
     """
 
     def __init__(self, name: str, *, lease: float) -> None:
@@ -152,14 +152,14 @@ class Router:
     """Decides for every record where it goes; it neither reads nor writes sockets.
 
     Args:
-        protect: names of the protected channels.
-        lease: lease of their owners, in seconds.
+        protect: Names of the protected channels.
+        lease: Lease of their owners, in seconds.
 
     Attributes:
-        outgoing: messages to send, by client: those that arrive together leave together, so that the client wakes up
+        outgoing: Messages to send, by client: those that arrive together leave together, so that the client wakes up
             once. The server sends and removes them.
-        status_changed: whether an owner changed or something was rejected since the last status.
-        totals: the statistics that are counted; `statistics` returns all.
+        status_changed: Whether an owner changed or something was rejected since the last status.
+        totals: The statistics that are counted; `statistics` returns all.
     """
 
     def __init__(self, protect: Iterable[str], *, lease: float) -> None:

@@ -167,9 +167,9 @@ class HubServer:
     hub in another process: `Hub`.
 
     Args:
-        config: address, protected channels and limits.
-        listeners: sockets returned by `listen`, which the hub owns from now on; by default it calls `listen`.
-        control: connected socket, which the hub owns from now on. For every byte received there, the hub sends its
+        config: Address, protected channels and limits.
+        listeners: Sockets returned by `listen`, which the hub owns from now on; by default it calls `listen`.
+        control: Connected socket, which the hub owns from now on. For every byte received there, the hub sends its
             statistics as a line of JSON; when the other end closes, the hub stops.
 
     Attributes:

@@ -64,7 +64,7 @@ class TcpqError(Exception):
     """A client violated the protocol or its limits.
 
     Attributes:
-        reason: kind of the violation, as counted in `HubStatistics.disconnected`.
+        reason: Kind of the violation, as counted in `HubStatistics.disconnected`.
     """
 
     def __init__(self, reason: str, message: str) -> None:

@@ -328,7 +328,7 @@ class LiveWatch:
         """Return `arrays` as a pandas DataFrame with one column per number, over time.
 
         Raises:
-            ModuleNotFoundError: pandas is not installed.
+            ModuleNotFoundError: Pandas is not installed.
         """
         try:
             import pandas as pd

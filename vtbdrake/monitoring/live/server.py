@@ -86,7 +86,7 @@ class LiveServer:
         addresses: Addresses of the output ports, and of the variables, of the loop's target.
 
     Attributes:
-        rejected: number of rejected requests.
+        rejected: Number of rejected requests.
 
     Raises:
         EOFError: The loop has closed its connection before there was a bus.

@@ -41,7 +41,7 @@ class LiveService:
         pause: Seconds between two frames of watched values: waking the worker process costs more than reading a value.
 
     Attributes:
-        rejected: number of rejected requests, as last reported.
+        rejected: Number of rejected requests, as last reported.
     """
 
     def __init__(
@@ -188,12 +188,12 @@ class _Reading:
     """Values that are read together, once or in rounds.
 
     Attributes:
-        every: cycles from round to round; 0 for one round only.
-        since: time of the DPS in the cycle in which the present round began.
-        entries: entries of all values, concatenated.
-        shapes: shapes of the values.
-        described: whether the shapes were sent.
-        error: why the values cannot be read.
+        every: Cycles from round to round; 0 for one round only.
+        since: Time of the DPS in the cycle in which the present round began.
+        entries: Entries of all values, concatenated.
+        shapes: Shapes of the values.
+        described: Whether the shapes were sent.
+        error: Why the values cannot be read.
     """
 
     def __init__(

@@ -204,8 +204,8 @@ class AlarmDetector:
         calibration: Calibration; None if there are tolerances for all signals.
 
     Attributes:
-        mean, scale: mean and scale of the residuals, of shape (size,).
-        statistic: the larger sum of each entry after the last window.
+        mean, scale: Mean and scale of the residuals, of shape (size,).
+        statistic: The larger sum of each entry after the last window.
 
     Raises:
         CalibrationError: The calibration is of other signals or windows.

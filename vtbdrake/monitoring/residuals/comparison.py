@@ -30,19 +30,19 @@ class ResidualConfig:
     A scenario has its own in `Scenario.deployment`.
 
     Attributes:
-        scenario: scenario of the predicted world; by default that of the loop's target. It has the latencies of the
+        scenario: Scenario of the predicted world; by default that of the loop's target. It has the latencies of the
             sensors, but no random errors.
-        period: period of the machine's cycles and the DPS's, in seconds.
-        horizon: length of a prediction in periods, after which it restarts from the belief.
-        delay: periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
+        period: Period of the machine's cycles and the DPS's, in seconds.
+        horizon: Length of a prediction in periods, after which it restarts from the belief.
+        delay: Periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
             where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on.
-        settle: windows that are predicted but not used at first and after a gap, while state that the belief does not
+        settle: Windows that are predicted but not used at first and after a gap, while state that the belief does not
             cover (currents of drives, samples in transit) follows the actuator commands.
-        values: values of variables of the predicted world by address, such as the assumed payload.
-        tolerance: by signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
+        values: Values of variables of the predicted world by address, such as the assumed payload.
+        tolerance: By signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
             each; persistent residuals below half of it are not reported.
         allowance: k of `Cusum`, in scales.
-        false_alarm_interval: mean time between two false alarms of all signals together, in seconds.
+        false_alarm_interval: Mean time between two false alarms of all signals together, in seconds.
 
     Raises:
         ValueError: A value is out of its range.
@@ -87,14 +87,14 @@ class RowLayout:
         estimates: Sizes of the estimates of the DPS, by address.
 
     Attributes:
-        sense: slices of the measured values, by sensor signal.
-        actuation: slices of the DPS's actuator commands, by actuator signal.
-        reported: slices of the reported actuator commands, which acted in the period before the sample.
-        estimates: slices of the estimates, by address.
-        all_sense: slice of all of ``sense``.
-        all_actuation, all_reported: indices of all of ``actuation`` and ``reported``.
-        compared: indices of the actuator commands that are compared with ``all_reported``.
-        width: number of entries of a row.
+        sense: Slices of the measured values, by sensor signal.
+        actuation: Slices of the DPS's actuator commands, by actuator signal.
+        reported: Slices of the reported actuator commands, which acted in the period before the sample.
+        estimates: Slices of the estimates, by address.
+        all_sense: Slice of all of ``sense``.
+        all_actuation, all_reported: Indices of all of ``actuation`` and ``reported``.
+        compared: Indices of the actuator commands that are compared with ``all_reported``.
+        width: Number of entries of a row.
     """
 
     def __init__(self, interface: Interface, reported: Collection[str], estimates: Mapping[str, int]) -> None:
@@ -166,8 +166,8 @@ class Comparison:
         mode: ``shadow`` or ``twin``.
 
     Attributes:
-        skipped: number of windows without a result, because rows, a belief or actuator commands were missing.
-        failed: number of windows whose prediction failed; ``error`` describes the last failure.
+        skipped: Number of windows without a result, because rows, a belief or actuator commands were missing.
+        failed: Number of windows whose prediction failed; ``error`` describes the last failure.
     """
 
     def __init__(self, predictor: Predictor, rows: RowLayout, config: ResidualConfig, *, mode: str) -> None:

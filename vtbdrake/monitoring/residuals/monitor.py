@@ -65,12 +65,12 @@ class ResidualMonitor:
         memory: Number of windows, and of alarms, that are kept.
 
     Attributes:
-        config: the configuration.
-        places: slices of a window by signal.
-        alarms: recent alarms, in the order in which they began.
-        history: recent windows.
-        skipped: number of windows without a result, because rows were missing or the worker process was too slow.
-        failed: number of windows whose prediction failed; ``error`` describes the last failure.
+        config: The configuration.
+        places: Slices of a window by signal.
+        alarms: Recent alarms, in the order in which they began.
+        history: Recent windows.
+        skipped: Number of windows without a result, because rows were missing or the worker process was too slow.
+        failed: Number of windows whose prediction failed; ``error`` describes the last failure.
 
     Raises:
         ValueError: The scenario declares no belief, has other signals than the loop's target, or an abstract one; a
