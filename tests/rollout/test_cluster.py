@@ -13,7 +13,7 @@ from distributed import Client
 from benchmarks.dask_cluster import dask_cluster
 from tests.rollout.scenarios import HANG, KILL, KILL_PARENT, RecordedScenario, TreacherousScenario
 from tests.testbeds import PendulumScenario
-from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, WorkerError, make_executor
+from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, Start, WorkerError, make_executor
 from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -25,10 +25,10 @@ def _points(count):
     return [{THETA: 0.1 * i} for i in range(count)]
 
 
-def _assert_right(executor, task, points):
-    found = list(executor.run(task, points))
+def _assert_right(executor, task, points, start=None):
+    found = list(executor.run(task, points, start=start))
     assert sorted(index for index, _ in found) == list(range(len(points)))
-    expected = dict(SerialExecutor().run(task, points))
+    expected = dict(SerialExecutor().run(task, points, start=start))
     assert all(result.identical(expected[index]) for index, result in found)
 
 
@@ -41,6 +41,15 @@ def test_each_worker_builds_its_testbed_once(cluster, tmp_path):
     processes = [int(line) for line in file.read_text().split()]
     assert len(set(processes)) == len(processes) <= 2
     assert os.getpid() not in processes
+
+
+def test_rollouts_begin_at_their_starts(cluster):
+    testbed = PendulumScenario().build()
+    starts = [Start(t0, testbed.dps_layout.take(testbed.default_context()), {THETA: 0.3}) for t0 in (1.0, 2.0)]
+    task = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA), record=["time", THETA])
+    with DaskExecutor(cluster.client) as executor:
+        _assert_right(executor, task, [{}, {}], starts)
+        _assert_right(executor, task, _points(2), starts[0])
 
 
 def test_dashboard_shows_the_workers(cluster):

@@ -11,6 +11,7 @@ from vtbdrake.rollout.executor import (
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 from vtbdrake.rollout.runner import RolloutRunner
+from vtbdrake.rollout.start import Start, StartError
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
@@ -26,6 +27,8 @@ __all__ = [
     "RolloutRunner",
     "RolloutTask",
     "SerialExecutor",
+    "Start",
+    "StartError",
     "ThreadExecutor",
     "WorkerError",
     "choose_executor",

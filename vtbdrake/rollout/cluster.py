@@ -15,8 +15,9 @@ from math import inf
 from typing import Any
 
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
-from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, unpack
+from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
 from vtbdrake.rollout.runner import failed
+from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
 
@@ -72,13 +73,16 @@ class DaskExecutor(Executor):
         self._pickler = TaskPickler()
         self._sent: OrderedDict[str, str] = OrderedDict()
 
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
         """
         name = self._send(self._pickler.pickle(task))
+        starts = pack_starts(start, len(points))
         waiting = deque(range(len(points)))
         suspects: deque[int] = deque()
         tried: set[int] = set()
@@ -91,7 +95,7 @@ class DaskExecutor(Executor):
                 batch = suspects if alone else waiting
                 for _ in range(min(room, len(batch))):
                     index = batch.popleft()
-                    future = self._submit(name, index, points[index])
+                    future = self._submit(name, index, points[index], starts[index])
                     flying[future] = index
                     landed.add(future)
                 future, outcome = next(landed)
@@ -112,10 +116,12 @@ class DaskExecutor(Executor):
             if flying and self._client.status == "running":
                 self._client.cancel(list(flying))
 
-    def _submit(self, name: str, index: int, point: Parameters) -> Future[bytes]:
+    def _submit(self, name: str, index: int, point: Parameters, start: bytes) -> Future[bytes]:
         key = f"rollout-{uuid.uuid4().hex}"
         try:
-            return self._client.submit(run_on_dask, name, index, pack(point), self._time_limit, key=key, pure=False)
+            return self._client.submit(
+                run_on_dask, name, index, pack(point), start, self._time_limit, key=key, pure=False
+            )
         except ClosedClientError as error:
             raise _given_up(error) from error
 
@@ -222,12 +228,12 @@ class _Children:
 _children = _Children()
 
 
-def run_on_dask(name: str, index: int, point: bytes, time_limit: float) -> bytes:
+def run_on_dask(name: str, index: int, point: bytes, start: bytes, time_limit: float) -> bytes:
     """Run one rollout of the task called ``name`` on a Dask worker; return what `answer` returns."""
     plugin: Any = get_worker().plugins[name]
-    return answer(index, partial(_roll, plugin.task, point, time_limit))
+    return answer(index, partial(_roll, plugin.task, point, start, time_limit))
 
 
-def _roll(task: PickledTask, point: bytes, time_limit: float) -> RolloutResult:
-    ((_, result),) = _children.get(time_limit).run_pickled(task, [unpack(point)])
+def _roll(task: PickledTask, point: bytes, start: bytes, time_limit: float) -> RolloutResult:
+    ((_, result),) = _children.get(time_limit).run_pickled(task, [unpack(point)], [start])
     return result

@@ -20,6 +20,7 @@ from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
+from vtbdrake.rollout.start import Start, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
@@ -46,13 +47,21 @@ class Executor(ABC):
     """
 
     @abstractmethod
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point, and yield (index of the point, result) as they finish.
 
         A point is a mapping address -> value; ``scenario.<field>`` is a field of the task's scenario, for which
         another testbed is built, and kept. A rollout that fails is a result, also when no testbed can be built with
-        its fields; an error in the quality function, or a field that does not exist or that the scenario refuses, is
-        raised, and ends the others.
+        its fields; an error in the quality function, a start that does not fit, or a field that does not exist or that
+        the scenario refuses, is raised, and ends the others.
+
+        Args:
+            task: what the rollouts have in common.
+            points: one per rollout.
+            start: where the rollouts begin, instead of the task's own s0: one start for all, or one for each point.
+                It is the cheap way to begin elsewhere: nothing is built, and only the start is sent to the workers.
         """
 
     def close(self) -> None:
@@ -79,9 +88,12 @@ class SerialExecutor(Executor):
     def __init__(self, testbed: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
         self._runners = Runners(Testbeds(testbed, kept=kept))
 
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        for index, point in enumerate(points):
-            yield index, self._runners.run(task, point)
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        starts = start_of_each(start, len(points))
+        for index, (point, begins) in enumerate(zip(points, starts, strict=True)):
+            yield index, self._runners.run(task, point, start=begins)
 
     def close(self) -> None:
         self._runners.clear()
@@ -94,6 +106,7 @@ class _Job:
     task: RolloutTask
     index: int
     point: Parameters
+    start: Start | None
     cancel: threading.Event
     done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException]
 
@@ -117,9 +130,12 @@ class ThreadExecutor(Executor):
         # The threads hold no reference to the executor, so that one that was not closed can be freed.
         weakref.finalize(self, _stop, self._jobs, self._threads)
 
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        starts = start_of_each(start, len(points))
         if len(points) == 1:  # Without the cost of another thread.
-            yield 0, self._runners.run(task, points[0])
+            yield 0, self._runners.run(task, points[0], start=starts[0])
             return
         while len(self._threads) < min(self._count, len(points)):
             name = f"rollout-{len(self._threads)}"
@@ -131,7 +147,7 @@ class ThreadExecutor(Executor):
         open_jobs = 0
         try:
             for index, point in enumerate(points):
-                self._jobs.put(_Job(task, index, point, cancel, done))
+                self._jobs.put(_Job(task, index, point, starts[index], cancel, done))
                 open_jobs += 1
             while open_jobs:
                 result = done.get()
@@ -162,7 +178,7 @@ def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
         try:
             if job.cancel.is_set():
                 raise CancelledError
-            job.done.put((job.index, runners.run(job.task, job.point, cancel=job.cancel)))
+            job.done.put((job.index, runners.run(job.task, job.point, start=job.start, cancel=job.cancel)))
         except BaseException as error:  # Raised again where the results are read.
             job.done.put(error)
         # Keep nothing of the last job while waiting for the next one.

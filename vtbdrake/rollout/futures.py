@@ -13,8 +13,18 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
 
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
-from vtbdrake.rollout.pickled_task import KEPT_TASKS, PickledTask, TaskPickler, answer, pack, unpack
+from vtbdrake.rollout.pickled_task import (
+    KEPT_TASKS,
+    PickledTask,
+    TaskPickler,
+    answer,
+    pack,
+    pack_starts,
+    unpack,
+    unpack_start,
+)
 from vtbdrake.rollout.runner import Runners, Testbeds, failed
+from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
@@ -49,13 +59,16 @@ class FuturesExecutor(Executor):
         self._pickler = TaskPickler()
         self._rescue: ProcessExecutor | None = None
 
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to another process, or the pool takes no more work.
         """
         pickled = self._pickler.pickle(task)
+        starts = pack_starts(start, len(points))
         waiting = deque(range(len(points)))
         flying: dict[_Future, int] = {}
         landed: queue.SimpleQueue[_Future] = queue.SimpleQueue()
@@ -66,7 +79,7 @@ class FuturesExecutor(Executor):
                 while trouble is None and waiting and len(flying) < self._in_flight:
                     point = pack(points[waiting[0]])
                     try:
-                        future = self._pool.submit(run_in_pool, pickled, waiting[0], point)
+                        future = self._pool.submit(run_in_pool, pickled, waiting[0], point, starts[waiting[0]])
                     except RuntimeError as error:  # It is broken, or was shut down.
                         trouble = error
                     else:
@@ -91,7 +104,7 @@ class FuturesExecutor(Executor):
                 future.cancel()
         rest = [*lost, *waiting]
         if isinstance(trouble, BrokenExecutor) and self._replaceable() and rest:
-            yield from self._run_without_pool(task, points, rest, trouble)
+            yield from self._run_without_pool(pickled, points, starts, rest, trouble)
         elif trouble is not None and rest:
             name = type(self._pool).__name__
             raise WorkerError(f"the pool {name} takes no more rollouts: {trouble}") from trouble
@@ -102,12 +115,17 @@ class FuturesExecutor(Executor):
         return local and getattr(self._pool, "_initializer", None) is None
 
     def _run_without_pool(
-        self, task: RolloutTask, points: Sequence[Parameters], rest: Sequence[int], trouble: BrokenExecutor
+        self,
+        task: PickledTask,
+        points: Sequence[Parameters],
+        starts: Sequence[bytes],
+        rest: Sequence[int],
+        trouble: BrokenExecutor,
     ) -> Iterator[tuple[int, RolloutResult]]:
         if self._rescue is None:
             _log.warning("the pool is broken; processes of vtbdrake take its place (%s)", trouble)
             self._rescue = ProcessExecutor(_workers(self._pool))
-        for i, result in self._rescue.run(task, [points[index] for index in rest]):
+        for i, result in self._rescue.run_pickled(task, [points[i] for i in rest], [starts[i] for i in rest]):
             yield rest[i], result
 
     def close(self) -> None:
@@ -141,7 +159,7 @@ class _Worker:
         self._tasks: OrderedDict[str, RolloutTask] = OrderedDict()
         self._lock = threading.Lock()
 
-    def run(self, pickled: PickledTask, point: bytes) -> RolloutResult:
+    def run(self, pickled: PickledTask, point: bytes, start: bytes) -> RolloutResult:
         with self._lock:
             if pickled.digest not in self._tasks:
                 self._tasks[pickled.digest] = unpack(pickled.content)
@@ -149,12 +167,12 @@ class _Worker:
                     self._tasks.popitem(last=False)
             self._tasks.move_to_end(pickled.digest)
             task = self._tasks[pickled.digest]
-        return self._runners.run(task, unpack(point))
+        return self._runners.run(task, unpack(point), start=unpack_start(start))
 
 
 _worker = _Worker()
 
 
-def run_in_pool(task: PickledTask, index: int, point: bytes) -> bytes:
+def run_in_pool(task: PickledTask, index: int, point: bytes, start: bytes) -> bytes:
     """Run one rollout in a worker of the pool; return what `answer` returns."""
-    return answer(index, partial(_worker.run, task, point))
+    return answer(index, partial(_worker.run, task, point, start))

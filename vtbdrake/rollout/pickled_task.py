@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.start import Start, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 KEPT_TASKS = 16
@@ -79,6 +81,25 @@ def pack(point: Mapping[str, Any]) -> bytes:
                     "a value that pickles, or use executor='threads' or 'serial'"
                 ) from error
         raise
+
+
+def pack_starts(start: Start | Sequence[Start] | None, count: int) -> list[bytes]:
+    """Return the start of each of ``count`` rollouts as bytes, for `unpack_start`; the task's own s0 is empty.
+
+    A start that several rollouts share is the same object for all of them.
+
+    Raises:
+        StartError: it is no start, or there are too many or too few.
+    """
+    starts = start_of_each(start, count)
+    packed = {one: pickle.dumps(one) if one is not None else b"" for one in dict.fromkeys(starts)}
+    return [packed[one] for one in starts]
+
+
+@lru_cache(maxsize=16)
+def unpack_start(content: bytes) -> Start | None:
+    """Return the start of a rollout: the same object for the same bytes, as a runner prepares each start once."""
+    return unpack(content) if content else None
 
 
 def unpack(content: bytes) -> Any:

@@ -15,6 +15,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Sim
 from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
+from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
@@ -59,25 +60,32 @@ class RolloutRunner:
             self.testbed.restore(self._s0, task.start)
             # A copy of the running robot is simulated.
             self.testbed.switch(self._s0, "sim")
-        self._instants = task.instants(self._s0.get_time(), self.testbed.event_timings())
+        self._timings = self.testbed.event_timings()
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
         self._copier = self.testbed.copier_from(self.testbed)
+        self._beginning = Beginning(self.testbed, self._s0, self._copier)
+        self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
 
-    def run(self, parameters: Mapping[str, Any], *, cancel: threading.Event | None = None) -> RolloutResult:
+    def run(
+        self, parameters: Mapping[str, Any], *, start: Start | None = None, cancel: threading.Event | None = None
+    ) -> RolloutResult:
         """Run one rollout from s0.
 
         Args:
             parameters: address -> value, set in s0.
+            start: s0; that of the task if left out. Several rollouts from the same object prepare it once.
             cancel: stops the rollout when it is set.
 
         Raises:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
+            StartError: ``start`` does not fit the testbed.
             CancelledError: ``cancel`` was set.
         """
         begin = time.perf_counter()
+        self._begin(start)
         samples = _Samples(self)
         end, message = HORIZON, ""
         with Interruptible() as interruptible:
@@ -89,7 +97,7 @@ class RolloutRunner:
                     interruptible.check()
                     status = self._advance(t, instant)
                     terminated = _terminated(status)
-                    reached = self._context.get_time() - self._s0.get_time() if terminated else float(t)
+                    reached = self._context.get_time() - self._t0 if terminated else float(t)
                     if samples.take(reached) and not self.task.run_on:
                         break
                     if terminated and status is not None:
@@ -103,12 +111,18 @@ class RolloutRunner:
                 end, message = FAILED, f"{QUALITY_FAILED}{failure}"
             return samples.result(dict(parameters), end, message, begin)
 
-    def simulate(self, parameters: Mapping[str, Any]) -> Iterator[float]:
+    def simulate(self, parameters: Mapping[str, Any], *, start: Start | None = None) -> Iterator[float]:
         """Simulate from s0 with ``parameters`` set in it, and pause at every sample time, which is yielded.
+
+        Args:
+            parameters: address -> value, set in s0.
+            start: s0; that of the task if left out.
 
         Raises:
             SimulationError: the simulation cannot go on.
+            StartError: ``start`` does not fit the testbed.
         """
+        self._begin(start)
         self._reset(parameters)
         for t, instant in zip(self._times, self._instants, strict=True):
             status = self._advance(t, instant)
@@ -122,13 +136,20 @@ class RolloutRunner:
             values = {address: read(self.context) for address, read in self._readers.items()}
         return [_sample(measure, [values[a] for a in measure.of], t) for measure in self._measures]
 
-    def state(self, parameters: Mapping[str, Any], t: float) -> Any:
+    def state(self, parameters: Mapping[str, Any], t: float, *, start: Start | None = None) -> Any:
         """Return s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
+
+        Args:
+            parameters: address -> value, set in s0.
+            t: in seconds from t0.
+            start: s0; that of the task if left out.
 
         Raises:
             ValueError: ``t`` is not a sample time.
+            StartError: ``start`` does not fit the testbed.
             RuntimeError: the simulation fails before.
         """
+        self._begin(start)
         last = int(np.argmin(np.abs(self._times - t)))
         if abs(self._times[last] - t) > 1e-9:
             raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
@@ -144,13 +165,26 @@ class RolloutRunner:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
         return self.testbed.snapshot(self._context)
 
+    def _begin(self, start: Start | None) -> None:
+        """Let the next rollouts begin at ``start``."""
+        if start is not self._beginning.start:
+            try:
+                self._beginning.set(start)
+            finally:
+                self._set_times()
+
+    def _set_times(self) -> None:
+        self._t0 = self._beginning.context.get_time()
+        self._instants = self.task.instants(self._t0, self._timings)
+
     def _reset(self, parameters: Mapping[str, Any]) -> None:
         # A new integrator: the step size of a used one would change the trajectory.
         ApplySimulatorConfig(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
-        self._copier.copy(self._s0, self._context, hidden=self._changed)
+        changed = None if self._changed is None else self._changed | self._beginning.hidden
+        self._copier.copy(self._beginning.context, self._context, hidden=changed)
         self._changed = {self._variables[a].carried_by for a in parameters} - {""}
-        restored = self.task.start is not None
+        restored = self.task.start is not None or self._beginning.start is not None
         with _FailuresAsOutcomes():
             self._variables.write(self._context, parameters)
             before = self._variables.read(self._context, list(parameters))
@@ -279,7 +313,9 @@ class _Samples:
         runner = self._runner
         # A rollout that failed after t* has gone on since: simulate it again up to t*.
         at_end = t_star == self._times[-1] and runner.context.get_time() == self._clock
-        return runner.testbed.snapshot(runner.context) if at_end else runner.state(parameters, t_star)
+        if at_end:
+            return runner.testbed.snapshot(runner.context)
+        return runner.state(parameters, t_star, start=runner._beginning.start)
 
 
 def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
@@ -429,6 +465,7 @@ class Runners:
         task: RolloutTask,
         point: Mapping[str, Any],
         *,
+        start: Start | None = None,
         cancel: threading.Event | None = None,
         begin: Callable[[], Any] | None = None,
     ) -> RolloutResult:
@@ -440,6 +477,7 @@ class Runners:
         Args:
             task: The rollout.
             point: Address, or scenario field with its prefix -> value.
+            start: s0; that of the task if left out.
             cancel: An event that ends the rollout when it is set.
             begin: Called when the testbed has been built, before the rollout.
         """
@@ -451,7 +489,7 @@ class Runners:
                 return failed(point, str(error))
             if begin is not None:
                 begin()
-            result = runner.run(variables, cancel=cancel)
+            result = runner.run(variables, start=start, cancel=cancel)
             return replace(result, parameters=dict(point)) if fields else result
 
     def clear(self) -> None:

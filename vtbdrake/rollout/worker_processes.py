@@ -18,8 +18,9 @@ from typing import Any
 from vtbdrake.argument_checks import as_number
 from vtbdrake.child_process import ChildProcess, StartError, report_ready
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
-from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, unpack
+from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.runner import KEPT, Runners, Testbeds, failed
+from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 _log = logging.getLogger(__name__)
@@ -71,16 +72,20 @@ class ProcessExecutor(Executor):
         while len(self._workers) < min(self._count, rollouts):
             self._workers.append(_Worker(self._kept, self._growth))
 
-    def run(self, task: RolloutTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
         """
-        yield from self.run_pickled(self._pickler.pickle(task), points)
+        yield from self.run_pickled(self._pickler.pickle(task), points, pack_starts(start, len(points)))
 
-    def run_pickled(self, task: PickledTask, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point, of a task that is pickled already; see `run`."""
+    def run_pickled(
+        self, task: PickledTask, points: Sequence[Parameters], starts: Sequence[bytes]
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        """Run one rollout per point, of a task and with starts that are pickled already; see `run`."""
         if self._running:
             raise WorkerError(
                 "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
@@ -88,17 +93,19 @@ class ProcessExecutor(Executor):
             )
         self._running = True
         try:
-            yield from self._run(task.content, points)
+            yield from self._run(task.content, points, starts)
         finally:
             self._running = False
 
-    def _run(self, task: bytes, points: Sequence[Parameters]) -> Iterator[tuple[int, RolloutResult]]:
+    def _run(
+        self, task: bytes, points: Sequence[Parameters], starts: Sequence[bytes]
+    ) -> Iterator[tuple[int, RolloutResult]]:
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
         error: BaseException | None = None
         self.start(len(points))
         try:
-            self._hand_out(task, waiting, points)
+            self._hand_out(task, waiting, points, starts)
             left = len(points)
             while left:
                 finished: list[tuple[int, RolloutResult]] = []
@@ -122,7 +129,7 @@ class ProcessExecutor(Executor):
                         error = error or reply
                 if error is None:
                     # Workers go on while the caller uses the finished results.
-                    self._hand_out(task, waiting, points)
+                    self._hand_out(task, waiting, points, starts)
                 left -= len(finished)
                 yield from finished
                 if error is not None:
@@ -133,27 +140,37 @@ class ProcessExecutor(Executor):
                 self._workers.remove(worker)
                 worker.kill()
 
-    def _hand_out(self, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> None:
+    def _hand_out(
+        self, task: bytes, waiting: deque[int], points: Sequence[Parameters], starts: Sequence[bytes]
+    ) -> None:
         """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
         for idle in [worker for worker in self._workers if not worker.jobs]:
             worker = self._replace(idle) if waiting and idle.grown else idle
-            while waiting and not self._give(worker, task, waiting, points):
+            while waiting and not self._give(worker, task, waiting, points, starts):
                 worker = self._replace(worker)  # It died while it was idle or starting.
         for worker in self._workers:
             if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # `_replies` notices a worker that has died.
-                self._give(worker, task, waiting, points)
+                self._give(worker, task, waiting, points, starts)
 
-    def _give(self, worker: _Worker, task: bytes, waiting: deque[int], points: Sequence[Parameters]) -> bool:
+    def _give(
+        self,
+        worker: _Worker,
+        task: bytes,
+        waiting: deque[int],
+        points: Sequence[Parameters],
+        starts: Sequence[bytes],
+    ) -> bool:
         """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
         index = waiting[0]
         kind = b"R" if self._time_limit == inf else b"L"
         message = kind + pickle.dumps((index, pack(points[index])))
-        if worker.jobs and len(message) > _SMALL:
+        start = starts[index]
+        if worker.jobs and len(message) + (0 if worker.has(start) else len(start)) > _SMALL:
             return True
         waiting.popleft()
         try:
-            worker.give(task, index, message)
+            worker.give(task, start, index, message)
         except (OSError, StartError) as error:
             worker.jobs.pop()
             waiting.appendleft(index)
@@ -214,12 +231,17 @@ class _Worker:
         self.child = ChildProcess(_run_worker, kept, growth, name="a worker process", grace=0.0)
         self.connection: Connection | None = None  # None until the worker is ready.
         self._task: bytes | None = None
+        self._start = b""  # Of the rollouts that it is given; empty if they begin at the task's own s0.
         self.jobs: deque[int] = deque()  # The rollout that it runs, and one that was given ahead.
         self.deadline = inf
         self.brief = False  # True after a short rollout.
         self.grown = False  # True when its memory has grown so much that it must be replaced.
 
-    def give(self, task: bytes, index: int, message: bytes) -> None:
+    def has(self, start: bytes) -> bool:
+        """Return whether the worker begins at ``start`` already."""
+        return self._start is start or self._start == start
+
+    def give(self, task: bytes, start: bytes, index: int, message: bytes) -> None:
         # Before anything is sent: a worker that was interrupted here must not count as idle.
         self.jobs.append(index)
         if self.connection is None:
@@ -229,6 +251,9 @@ class _Worker:
             self.brief = False
             self.connection.send_bytes(b"T" + task)
             self._task = task
+        if not self.has(start):
+            self.connection.send_bytes(b"S" + start)
+            self._start = start
         self.connection.send_bytes(message)
 
     def begin(self, time_limit: float) -> None:
@@ -267,8 +292,9 @@ def checked_time_limit(time_limit: float) -> float:
 def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
     """Run rollouts on request until the connection closes.
 
-    A task (T) has no answer. A rollout (R) has one, from `answer`. A rollout with a time limit (L) has `_BEGUN` before
-    it, unless its testbed cannot be built. Once, `_GROWN` comes before an answer.
+    A task (T) and the start of the rollouts that follow (S) have no answer. A rollout (R) has one, from `answer`. A
+    rollout with a time limit (L) has `_BEGUN` before it, unless its testbed cannot be built. Once, `_GROWN` comes
+    before an answer.
 
     Args:
         parent: the connection to the executor.
@@ -279,6 +305,7 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
     connection = Connection(parent.detach())
     runners = Runners(Testbeds(kept=kept))
     load: Callable[[], RolloutTask] | None = None
+    start = b""
     limit = inf
     while True:
         try:
@@ -288,10 +315,13 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
                 # The same object each time, as its runner is known by it. One that cannot be read raises each time.
                 load = cache(partial(unpack, content))
                 continue
+            if kind == b"S":
+                start = content
+                continue
             index, point = pickle.loads(content)
             assert load is not None, "a worker got a rollout before its task"
             begin = partial(connection.send_bytes, _BEGUN) if kind == b"L" else None
-            reply = answer(index, partial(_rollout, runners, load, point, begin))
+            reply = answer(index, partial(_rollout, runners, load, point, start, begin))
             if limit == inf:
                 limit = _memory() + growth
             elif _memory() > limit:
@@ -303,9 +333,9 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
 
 
 def _rollout(
-    runners: Runners, load: Callable[[], RolloutTask], point: bytes, begin: Callable[[], Any] | None
+    runners: Runners, load: Callable[[], RolloutTask], point: bytes, start: bytes, begin: Callable[[], Any] | None
 ) -> RolloutResult:
-    return runners.run(load(), unpack(point), begin=begin)
+    return runners.run(load(), unpack(point), start=unpack_start(start), begin=begin)
 
 
 def _memory() -> float:

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
+from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variables import X, check_address, suggestion
@@ -254,10 +255,34 @@ class AddressedDiagram:
         return StateCopier(source.diagram, source.variables(), self.diagram, self._variables)
 
     @cached_property
+    def dps_layout(self) -> StateLayout:
+        """Return the layout of the DPS: its state and its parameters."""
+        return StateLayout(self.diagram, state=is_dps, parameters=is_dps)
+
+    @cached_property
+    def start_layout(self) -> StateLayout:
+        """Return the layout of what a belief sets: all state but the switches, and the DPS's parameters."""
+        return StateLayout(self.diagram, state=_is_no_board, parameters=is_dps)
+
+    @cached_property
+    def whole_layout(self) -> StateLayout:
+        """Return the layout of all state and all parameters, but the switches."""
+        return StateLayout(self.diagram, state=_is_no_board, parameters=_is_no_board)
+
+    @cached_property
     def python_systems(self) -> tuple[str, ...]:
         """Return the paths of the systems that are written in Python and have work to do while time runs."""
         # The board of the switches has no work to do.
         return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
+
+
+def is_dps(path: str) -> bool:
+    """Return whether the system at ``path`` is the DPS or a part of it."""
+    return path == "dps" or path.startswith("dps.")
+
+
+def _is_no_board(path: str) -> bool:
+    return path != BOARD
 
 
 def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:

@@ -15,7 +15,7 @@ from vtbdrake.state import Snapshot
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.variables import html_table
-from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.signal import Feed, Interface, SignalError
 from vtbdrake.testbed.switch import COMMAND, REAL, Switches
@@ -83,7 +83,7 @@ class DpsAlone(AddressedDiagram):
                 testbed.variables(),
                 self.diagram,
                 self.variables(),
-                only=_is_dps,
+                only=is_dps,
             )
         self._copiers[id(testbed)].copy(context, own)
         commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]
@@ -98,13 +98,9 @@ class DpsAlone(AddressedDiagram):
         """
         self.check_context(context)
         self.check_scenario(snapshot)
-        snapshots.apply(snapshot, self.diagram, context, self._variables, only=_is_dps)
+        snapshots.apply(snapshot, self.diagram, context, self._variables, only=is_dps)
         commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]
         self.write(context, {a: snapshot[a] for a in commands if a in snapshot.values})
-
-
-def _is_dps(path: str) -> bool:
-    return path == "dps" or path.startswith("dps.")
 
 
 def _unpaced(config: SimulatorConfig, *, has_plant: bool = True) -> SimulatorConfig:

@@ -154,6 +154,15 @@ class Scenario(ABC):
         own.add_world(builder)
         return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
 
+    def mental(self) -> Scenario:
+        """Return the scenario that a robot of this one simulates when it reasons; by default this scenario itself.
+
+        A mental scenario may differ in its world (integrator, terrain, what an a-priori map knows, no cameras) and in
+        the periods of its sensors and of its DPS. Its DPS has the same systems, with state and parameters of the same
+        sizes, as it continues from the state of the running one.
+        """
+        return self
+
     def deployment(self) -> Deployment:
         """Return how the DPS runs on its machine; the default has no protocol. Each call returns a new one."""
         from vtbdrake.deployment import Deployment

@@ -1,0 +1,144 @@
+"""The contents of many systems as one flat array: quick to read, to send and to write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, System
+
+from vtbdrake.state.codecs import AbstractState, abstract_state
+from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
+from vtbdrake.state.systems import group_size, is_camera, is_scene_graph, leaves, write_group
+
+
+class LayoutError(ValueError):
+    """Contents that belong to systems of another layout."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatState:
+    """The contents of some leaf systems, taken by a `StateLayout`: plain data, which pickles quickly.
+
+    Attributes:
+        names: the groups and their sizes, see `StateLayout.names`.
+        numbers: all of them, one after another, shape (n,); read only.
+        abstract: the abstract states as arrays, by ``path/index/part``.
+    """
+
+    names: tuple[str, ...]
+    numbers: np.ndarray
+    abstract: Mapping[str, np.ndarray]
+
+
+class StateLayout:
+    """Reads and writes the numeric groups and the abstract states of some leaf systems of a Diagram.
+
+    What SceneGraph and cameras hold is not part of it, nor is a plant's memory of its last discrete step.
+
+    Args:
+        diagram: the Diagram.
+        state: selects the systems whose state belongs to the layout, by path.
+        parameters: selects the systems whose parameters belong to it.
+
+    Attributes:
+        names: ``path/group/index (size)`` of each numeric group, then ``path/abstract`` of each system with abstract
+            state. Layouts with the same names exchange their contents.
+
+    Raises:
+        SnapshotError: a system keeps an abstract value that no codec can carry.
+    """
+
+    def __init__(self, diagram: Diagram, *, state: Callable[[str], bool], parameters: Callable[[str], bool]) -> None:
+        self._groups: list[tuple[System, list[tuple[str, int, slice]]]] = []
+        self._abstract: list[tuple[str, System, AbstractState]] = []
+        names, start = [], 0
+        for path, system in leaves(diagram):
+            if is_scene_graph(system) or is_camera(system) or not (state(path) or parameters(path)):
+                continue
+            context = system.CreateDefaultContext()
+            counts = {
+                CONTINUOUS: min(context.num_continuous_states(), 1) if state(path) else 0,
+                DISCRETE: context.num_discrete_state_groups() if state(path) else 0,
+                PARAMETER: context.num_numeric_parameter_groups() if parameters(path) else 0,
+            }
+            groups = []
+            for group, index in ((group, index) for group, count in counts.items() for index in range(count)):
+                size = group_size(context, group, index)
+                groups.append((group, index, slice(start, start + size)))
+                names.append(f"{path}/{group}/{index} ({size})")
+                start += size
+            if groups:
+                self._groups.append((system, groups))
+            if state(path) and (codecs := abstract_state(path, system, context)):
+                self._abstract.append((path, system, codecs))
+        self.names = (*names, *(f"{path}/abstract" for path, _, _ in self._abstract))
+        self.size = start
+
+    def take(self, context: Context) -> FlatState:
+        """Return the contents in a root context.
+
+        Raises:
+            SnapshotError: an abstract state has become something that its codec does not take.
+        """
+        numbers = np.empty(self.size)
+        for system, groups in self._groups:
+            own = system.GetMyContextFromRoot(context)
+            for group, index, place in groups:
+                if group == CONTINUOUS:
+                    numbers[place] = own.get_continuous_state_vector().CopyToVector()
+                elif group == DISCRETE:
+                    numbers[place] = own.get_discrete_state(index).value()
+                else:
+                    numbers[place] = own.get_numeric_parameter(index).value()
+        numbers.flags.writeable = False
+        abstract = {
+            f"{path}/{name}": np.array(array)
+            for path, system, codecs in self._abstract
+            for name, array in codecs.read(system.GetMyContextFromRoot(context)).items()
+        }
+        return FlatState(self.names, numbers, abstract)
+
+    def put(self, context: Context, contents: FlatState) -> None:
+        """Set the contents of a root context.
+
+        Raises:
+            LayoutError: they are of another layout. Nothing has been set then.
+            SnapshotError: the arrays of an abstract state do not fit.
+        """
+        self.check(contents)
+        writers = [(system, codecs.writer(_of(path, contents.abstract))) for path, system, codecs in self._abstract]
+        for system, groups in self._groups:
+            own = system.GetMyMutableContextFromRoot(context)
+            for group, index, place in groups:
+                write_group(own, group, index, contents.numbers[place])
+        for system, write in writers:
+            write(system.GetMyMutableContextFromRoot(context))
+
+    def check(self, contents: FlatState) -> None:
+        """Raise an error if the contents are of another layout.
+
+        Raises:
+            LayoutError: they are; it names the first difference.
+        """
+        if contents.names != self.names:
+            raise LayoutError(difference(contents.names, self.names))
+        if contents.numbers.shape != (self.size,):
+            raise LayoutError(f"the contents are {self.size} numbers, not an array of shape {contents.numbers.shape}")
+
+
+def difference(found: tuple[str, ...], expected: tuple[str, ...]) -> str:
+    """Return what distinguishes the names of one layout from those of another, as text; empty if nothing does."""
+    missing = [name for name in expected if name not in found]
+    foreign = [name for name in found if name not in expected]
+    parts = [f"it lacks {missing[0]}"] if missing else []
+    parts += [f"it has {foreign[0]}, which is not part of this testbed"] if foreign else []
+    if not parts and found != expected:
+        parts = ["its systems are in another order"]
+    return "; ".join(parts)
+
+
+def _of(path: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    prefix = f"{path}/"
+    return {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
