@@ -19,7 +19,14 @@ from vtbdrake_diagrams.space_climber.walking import make_walking
 SENSOR_SIGNALS = {"imu": 6, "joint_encoders": len(JOINT_NAMES), "foot_contact": len(LEGS)}
 
 
-def make_dps(gait: str = "tripod", *, period: float, morphology: Morphology | None = None) -> Diagram:
+def make_dps(
+    gait: str = "tripod",
+    *,
+    period: float,
+    morphology: Morphology | None = None,
+    clearance: float = 0.05,
+    navigator: bool = False,
+) -> Diagram:
     """Build the DPS: ``sense`` calibrates and filters, ``env`` perceives, ``impl`` walks, ``act`` limits.
 
     Input ports: ``imu`` (gyro in rad/s, then specific force in m/s^2, in the sensor's frame, which is parallel to the
@@ -28,7 +35,9 @@ def make_dps(gait: str = "tripod", *, period: float, morphology: Morphology | No
     targets, rad, in the order of JOINT_NAMES, which is that of the model's actuators).
 
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through, and what the sensors see
-    reaches the command four periods later.
+    reaches the command four periods later. Feet are lifted by ``clearance`` (m). With a
+    `Navigator`, which takes the port ``visual_odometry`` (3, m/s), the robot keeps a line over the ground in the
+    direction of the heading, and stops when it tips.
     """
     if gait not in GAITS:
         raise ValueError(f"gait is '{gait}', but must be one of {', '.join(GAITS)}.")
@@ -36,11 +45,12 @@ def make_dps(gait: str = "tripod", *, period: float, morphology: Morphology | No
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense(period=period, morphology=morphology))
     env = builder.AddNamedSystem("env", PerceivedEnvironment(period=period, morphology=morphology))
-    impl = builder.AddNamedSystem("impl", make_walking(GAITS[gait], period=period, morphology=morphology))
+    walking = make_walking(GAITS[gait], period=period, morphology=morphology, clearance=clearance, navigator=navigator)
+    impl = builder.AddNamedSystem("impl", walking)
     act = builder.AddNamedSystem("act", CommandLimiter(period=period, morphology=morphology))
     for signal in SENSOR_SIGNALS:
         builder.ExportInput(sense.GetInputPort(signal), signal)
-    for signal in ("heading", "walk"):
+    for signal in ("heading", "walk", *(["visual_odometry"] if navigator else [])):
         builder.ExportInput(impl.GetInputPort(signal), signal)
     builder.Connect(sense.get_output_port(), env.get_input_port())
     builder.Connect(env.GetOutputPort("pose"), impl.GetInputPort("pose"))

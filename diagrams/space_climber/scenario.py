@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import Box
+from pydrake.geometry import Box, DefaultProximityProperties, SceneGraphConfig
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
@@ -110,20 +110,13 @@ class SpaceClimberScenario(Scenario):
         return make_dps(self.gait, period=self.period)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, scene_graph = builder.add_plant(self.plant_config)
+        plant, scene_graph = builder.add_plant(self.plant_config, self._contact_defaults())
         climber = add_climber(plant, joint_stops=self.joint_stops)
         if self.payload:
             add_payload(plant, climber)
-        downhill = RigidTransform(RotationMatrix.MakeYRotation(np.radians(self.slope_deg)))
-        ground = Box(200.0, 200.0, 1.0)
-        X_WG = downhill @ RigidTransform([0.0, 0.0, -0.5])
-        friction = CoulombFriction(self.friction, self.friction)
-        plant.RegisterCollisionGeometry(plant.world_body(), X_WG, ground, "ground", friction)
-        # A little lower than it is, or Meshcat's grid would shine through.
-        shown = X_WG @ RigidTransform([0.0, 0.0, -0.002])
-        plant.RegisterVisualGeometry(plant.world_body(), shown, ground, "ground", np.array([0.55, 0.53, 0.5, 1.0]))
+        X_WG = self._add_ground(plant)
         base = plant.GetBodyByName("base", climber)
-        plant.SetDefaultFloatingBaseBodyPose(base, downhill @ plant.GetDefaultFloatingBaseBodyPose(base))
+        plant.SetDefaultFloatingBaseBodyPose(base, X_WG @ plant.GetDefaultFloatingBaseBodyPose(base))
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
         plant.Finalize()
         set_foot_friction(plant, scene_graph, climber, self.friction)
@@ -142,6 +135,26 @@ class SpaceClimberScenario(Scenario):
         builder.sim_actuator("joint_position", servos.get_input_port())
         self._declare_belief(builder)
 
+    def _contact_defaults(self) -> SceneGraphConfig:
+        """Return the contact properties of geometries that have none of their own."""
+        return SceneGraphConfig(
+            default_proximity_properties=DefaultProximityProperties(
+                static_friction=self.friction, dynamic_friction=self.friction
+            )
+        )
+
+    def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
+        """Add what the robot walks on; return the pose of the plane on which it stands at first."""
+        X_WG = RigidTransform(RotationMatrix.MakeYRotation(np.radians(self.slope_deg)))
+        ground = Box(200.0, 200.0, 1.0)
+        below = X_WG @ RigidTransform([0.0, 0.0, -0.5])
+        friction = CoulombFriction(self.friction, self.friction)
+        plant.RegisterCollisionGeometry(plant.world_body(), below, ground, "ground", friction)
+        # A little lower than it is, or Meshcat's grid would shine through.
+        shown = below @ RigidTransform([0.0, 0.0, -0.002])
+        plant.RegisterVisualGeometry(plant.world_body(), shown, ground, "ground", np.array([0.55, 0.53, 0.5, 1.0]))
+        return X_WG
+
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
         """Declare that the estimated pose and the sensed joint angles set the state of the simulated robot."""
         builder.believe(
@@ -149,5 +162,8 @@ class SpaceClimberScenario(Scenario):
             of=["dps.env.position", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
             by=lambda position, roll, pitch, yaw: [*position, roll, pitch, yaw],
         )
+        self._believe_joints(builder)
+
+    def _believe_joints(self, builder: VirtualTestbedBuilder) -> None:
         for i, name in enumerate(JOINT_NAMES):
             builder.believe(f"sim.sys.climber.{name}.position", of=[f"dps.sense.calibration.joint_encoders[{i}]"])

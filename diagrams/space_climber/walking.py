@@ -12,6 +12,7 @@ from vtbdrake_diagrams.space_climber.estimation import wrap
 from vtbdrake_diagrams.space_climber.gait import Gait, advance, heights
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
+from vtbdrake_diagrams.space_climber.navigation import Navigator
 
 
 class GaitGenerator(LeafSystem):
@@ -39,7 +40,7 @@ class GaitGenerator(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, gait: Gait, *, period: float, morphology: Morphology) -> None:
+    def __init__(self, gait: Gait, *, period: float, morphology: Morphology, clearance: float = 0.05) -> None:
         super().__init__()
         self._gait = gait
         self._period = period
@@ -53,7 +54,7 @@ class GaitGenerator(LeafSystem):
         defaults = {
             "period": (2.0, "s", (0.2, 60.0)),
             "stroke": (0.2, "m", (0.0, 0.3)),
-            "clearance": (0.05, "m", (0.0, 0.15)),
+            "clearance": (clearance, "m", (0.0, 0.15)),
             "height": (morphology.torso_clearance, "m", (0.1, 0.35)),
             "ramp_time": (1.0, "s", (0.02, 60.0)),
             "heading_gain": (0.5, "1/s", (0.0, 10.0)),
@@ -110,14 +111,37 @@ class GaitGenerator(LeafSystem):
         state.set_value(1, np.array(self._legs.angles(p_BF)))
 
 
-def make_walking(gait: Gait, *, period: float, morphology: Morphology) -> Diagram:
-    """Build the subsystem ``gait`` with the input ports ``pose``, ``heading`` and ``walk``."""
+def make_walking(
+    gait: Gait, *, period: float, morphology: Morphology, clearance: float = 0.05, navigator: bool = False
+) -> Diagram:
+    """Build the subsystem ``gait`` with the input ports ``pose``, ``heading`` and ``walk``.
+
+    Args:
+        gait: the gait.
+        period: sample period in s.
+        morphology: the robot's.
+        clearance: how high the gait lifts the feet by default, in m.
+        navigator: True puts a `Navigator`, with the port ``visual_odometry``, between the commands and the gait.
+    """
     builder = DiagramBuilder()
     # One vector input costs a Python system a third of three.
     inputs = builder.AddNamedSystem("inputs", Multiplexer([6, 1, 1]))
-    generator = builder.AddNamedSystem("gait", GaitGenerator(gait, period=period, morphology=morphology))
-    for k, signal in enumerate(("pose", "heading", "walk")):
-        builder.ExportInput(inputs.get_input_port(k), signal)
+    generator = GaitGenerator(gait, period=period, morphology=morphology, clearance=clearance)
+    builder.AddNamedSystem("gait", generator)
+    ports = {signal: inputs.get_input_port(k) for k, signal in enumerate(("pose", "heading", "walk"))}
+    builder.ExportInput(ports["pose"], "pose")
+    if navigator:
+        sensed = builder.AddNamedSystem("navigator_inputs", Multiplexer([6, 1, 1, 3]))
+        system = builder.AddNamedSystem("navigator", Navigator(period=period))
+        builder.ConnectInput("pose", sensed.get_input_port(0))
+        for k, signal in enumerate(("heading", "walk", "visual_odometry"), start=1):
+            builder.ExportInput(sensed.get_input_port(k), signal)
+        builder.Connect(sensed.get_output_port(), system.get_input_port())
+        builder.Connect(system.GetOutputPort("course"), ports["heading"])
+        builder.Connect(system.GetOutputPort("walk"), ports["walk"])
+    else:
+        for signal in ("heading", "walk"):
+            builder.ExportInput(ports[signal], signal)
     builder.Connect(inputs.get_output_port(), generator.get_input_port())
     builder.ExportOutput(generator.get_output_port(), "joint_position")
     return builder.Build()

@@ -1,0 +1,159 @@
+"""The SpaceClimber on the floor of a crater, and what it simulates when it reasons about a way out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, Diagram, EventStatus, LeafSystem
+
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
+from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, Crater, add_crater
+
+PAST_RIM = 1.5
+"""How far beyond the rim the robot's centre ends a climb, in m: all of the robot is past it."""
+
+TIPPED_OVER = np.radians(60.0)
+
+
+def _cenic() -> SimulatorConfig:
+    return SimulatorConfig(integration_scheme="cenic", max_step_size=0.045, accuracy=1e-3)
+
+
+@dataclass
+class CraterScenario(SpaceClimberScenario):
+    """The robot on the floor of a `Crater`, looking along x; ``u.walk`` starts it in the direction ``u.heading``.
+
+    A simulation ends when the robot has passed the rim, or has tipped over by 60 deg: only its feet collide, so that
+    what follows would mean nothing.
+    """
+
+    # The samples of the DPS end every step, so that the largest step only has to be longer than their period.
+    simulator_config: SimulatorConfig = field(default_factory=_cenic)
+    # Static and dynamic friction of feet and ground: the middle of what friction angles of 24 to 37 deg give.
+    friction: float = 0.6
+    # The DPS runs at the period at which it can simulate itself fast enough when it reasons, because its copy starts
+    # from its state.
+    period: float = 0.04
+    payload: bool = False
+    # Clearance of the swinging feet in m: boulders and kinks that are lower do not stop the robot.
+    clearance: float = 0.1
+    # The crater, see `Crater`.
+    seed: int = 0
+    gullies: bool = True
+    boulders: bool = True
+    roughness: float = 0.0
+    roughness_seed: int = 0
+
+    def validate(self) -> None:
+        super().validate()
+        checks = {
+            "slope_deg": (self.slope_deg == 0.0, "0: the crater's ground has slopes of its own"),
+            "clearance": (0.0 <= self.clearance <= 0.15, "within [0, 0.15] m"),
+            "seed": (self.seed >= 0, "not negative"),
+            "roughness": (0.0 <= self.roughness <= 0.1, "within [0, 0.1] m"),
+            "roughness_seed": (self.roughness_seed >= 0, "not negative"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                raise ScenarioError(f"CraterScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+
+    @property
+    def crater(self) -> Crater:
+        """Return the ground."""
+        return Crater(
+            self.seed,
+            gullies=self.gullies,
+            boulders=self.boulders,
+            roughness=self.roughness,
+            roughness_seed=self.roughness_seed,
+        )
+
+    def mental(self) -> Self:
+        """Return what the robot simulates when it reasons: a map without roughness, and a faster integrator.
+
+        Drake's discrete SAP solver at the DPS's own period slips where a fine integrator does; CENIC at loose
+        accuracies and the lagged approximation climb slopes that are steeper than friction allows.
+        """
+        return replace(
+            self,
+            simulator_config=SimulatorConfig(),
+            plant_config=MultibodyPlantConfig(
+                time_step=self.period, contact_model="point", discrete_contact_approximation="sap"
+            ),
+            roughness=0.0,
+        )
+
+    def interface(self) -> Interface:
+        legs = super().interface()
+        eyes = Signal("visual_odometry", size=3, unit="m/s", max_age=5 * self._odometer_period)
+        return replace(legs, sense=[*legs.sense, eyes])
+
+    @property
+    def _odometer_period(self) -> float:
+        return 10 * self.period
+
+    def make_dps(self) -> Diagram:
+        return make_dps(self.gait, period=self.period, clearance=self.clearance, navigator=True)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        assert builder.plant is not None
+        base = builder.plant.GetBodyByName("base").index()
+        errors = ErrorModel(noise=0.01)
+        builder.add_sensor("visual_odometry", VisualOdometer(base, period=self._odometer_period, errors=errors))
+        monitor = builder.add("env", "climb", EndOfClimb(base, period=10 * self.period))
+        builder.connect(builder.plant.GetOutputPort("body_poses"), monitor.get_input_port())
+
+    def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
+        add_crater(plant, self.crater)
+        return RigidTransform()
+
+    def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
+        """Declare what the robot believes; the elevation is that of its map plus its height over the ground."""
+        ground = self.crater.height
+        builder.believe(
+            "sim.sys.climber.base.pose",
+            of=["dps.impl.navigator.position", "dps.env.position[2]", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
+            by=lambda p, height, roll, pitch, yaw: [*p, height + float(ground(*p)), roll, pitch, yaw],
+        )
+        self._believe_joints(builder)
+
+
+class EndOfClimb(LeafSystem):
+    """A system that ends the simulation when the robot has passed the rim, or has tipped over.
+
+    .. pydrake_system::
+
+        name: EndOfClimb
+        input_ports:
+        - body_poses
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, base: BodyIndex, *, period: float) -> None:
+        super().__init__()
+        self._base = int(base)
+        self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._check)
+
+    def _check(self, context: Context) -> EventStatus:
+        X_WB = self._poses.Eval(context)[self._base]
+        if np.hypot(*X_WB.translation()[:2]) > RIM_RADIUS + PAST_RIM:
+            return EventStatus.ReachedTermination(self, "the robot has passed the rim")
+        rotation = X_WB.rotation().ToRollPitchYaw()
+        if max(abs(rotation.roll_angle()), abs(rotation.pitch_angle())) > TIPPED_OVER:
+            return EventStatus.ReachedTermination(self, "the robot has tipped over")
+        return EventStatus.DidNothing()
