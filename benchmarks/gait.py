@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from math import inf, isfinite
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import Simulator
 
 import vtbdrake as vtb
 from benchmarks.measure import HIGHER, Benchmark, spread
+from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.payload import MASS, PITCH
 
@@ -129,7 +130,7 @@ def rebuilt(point: np.ndarray) -> float:
     """The quality at a point, of a testbed that is built for it."""
     testbed = SCENARIO.build()
     simulator = Simulator(testbed.diagram)
-    ApplySimulatorConfig(testbed.simulator_config, simulator)
+    apply_simulator_config(testbed.simulator_config, simulator)
     context = simulator.get_mutable_context()
     for address, value in {**CONDITION, **dict(zip(BOUNDS, point, strict=True))}.items():
         testbed.variables()[address].set(context, value)

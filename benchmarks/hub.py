@@ -20,7 +20,7 @@ from vtbdrake.lcm.hub import Hub
 
 ROOT = Path(__file__).resolve().parents[1]
 
-GOAL = 100e-6
+GOAL = 60e-6
 TIMEOUT_MS = 10_000
 SIZE = 200  # bytes, about those of a robot's state
 

@@ -8,11 +8,12 @@ import numpy as np
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, connect_to_plant
+from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.morphology import FOOT_LINKS, JOINT_NAMES
@@ -30,7 +31,7 @@ class PlainClimber:
     def simulator(self) -> Simulator:
         """A new simulator at t = 0."""
         simulator = Simulator(self.diagram)
-        ApplySimulatorConfig(self.scenario.simulator_config, simulator)
+        apply_simulator_config(self.scenario.simulator_config, simulator)
         return simulator
 
 

@@ -131,7 +131,7 @@ def replay_rtf(simulated: float = 60.0, repeats: int = 3) -> Benchmark:
         name="replay_rtf",
         value=duration / float(np.median(took)),
         unit="1",
-        goal=20.0,
+        goal=30.0,
         better=HIGHER,
         against=f"real time: {duration:.3g} s of the arm's DPS at 1 kHz in {spread(took)}",
         note=f"reading alone {spread(reading)}",

@@ -11,13 +11,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorStatus
+from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
+from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake.testbed.interrupt import Interruptible
 
 
@@ -179,7 +180,7 @@ class RolloutRunner:
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
         # A new integrator: the step size of a used one would change the trajectory.
-        ApplySimulatorConfig(self.testbed.simulator_config, self._simulator)
+        apply_simulator_config(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         changed = None if self._changed is None else self._changed | self._beginning.hidden
         self._copier.copy(self._beginning.context, self._context, hidden=changed)

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
+from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
@@ -16,6 +16,7 @@ from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_python, leaves
 from vtbdrake.state.variables import X, check_address, suggestion
+from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
 
@@ -130,7 +131,7 @@ class AddressedDiagram:
     def _give_integrator(self, simulator: Simulator) -> None:
         # The config would set the time and the pace, too.
         time, pace = simulator.get_context().get_time(), simulator.get_target_realtime_rate()
-        ApplySimulatorConfig(self.simulator_config, simulator)
+        apply_simulator_config(self.simulator_config, simulator)
         simulator.get_mutable_context().SetTime(time)
         simulator.set_target_realtime_rate(pace)
 
