@@ -39,12 +39,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 @click.option("--record", multiple=True, metavar="ADDRESS", help="Read ADDRESS after every cycle. May be repeated.")
 @click.option("--out", callback=output(*RECORDINGS), metavar="FILE", help="Write these values: .csv or .npz.")
 def replay(
-    log: Path,
-    scenario: str | None,
-    on: str,
-    values: tuple[Setting, ...],
-    record: tuple[str, ...],
-    out: Path | None,
+    log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
     """Replay a LOG and compare: the exit code is 1 unless all actuator commands are the same, to the last bit.
 

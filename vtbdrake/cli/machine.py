@@ -8,15 +8,7 @@ from math import inf
 import click
 
 from vtbdrake.cli import FailedError, one_line
-from vtbdrake.cli.options import (
-    Setting,
-    converted,
-    parse_setting,
-    scenario_argument,
-    set_option,
-    settings,
-    url_option,
-)
+from vtbdrake.cli.options import Setting, converted, parse_setting, scenario_argument, set_option, settings, url_option
 from vtbdrake.cli.output import number
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.machine import Machine, MachineConfig, MachineLoop

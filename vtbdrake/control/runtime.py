@@ -140,11 +140,7 @@ class Runtime(Stepped):
     # -- the loop
 
     def run(
-        self,
-        *,
-        cycles: int | None = None,
-        seconds: float | None = None,
-        until: Callable[[], bool] = lambda: False,
+        self, *, cycles: int | None = None, seconds: float | None = None, until: Callable[[], bool] = lambda: False
     ) -> None:
         """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
 

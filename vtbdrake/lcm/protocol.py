@@ -52,13 +52,7 @@ class Protocol:
             **options: Further arguments of `LcmBridge`.
         """
         return LcmBridge(
-            interface,
-            url,
-            sense=self.sense,
-            act=self.act,
-            commands=self.commands,
-            reported=self.reported,
-            **options,
+            interface, url, sense=self.sense, act=self.act, commands=self.commands, reported=self.reported, **options
         )
 
 

@@ -11,15 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.argument_checks import as_whole
-from vtbdrake.optimization.identity import (
-    code_changes,
-    describe,
-    differences,
-    dimensions,
-    plain,
-    revision,
-    versions,
-)
+from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.solvers import Solver, make_solver
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial

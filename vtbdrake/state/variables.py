@@ -129,10 +129,7 @@ class Variables(Mapping[str, Variable]):
     """
 
     def __init__(
-        self,
-        variables: Iterable[Variable],
-        *,
-        derived_by_demand: Mapping[str, Callable[[], Variable]] | None = None,
+        self, variables: Iterable[Variable], *, derived_by_demand: Mapping[str, Callable[[], Variable]] | None = None
     ) -> None:
         self._listed: dict[str, Variable] = {}
         for variable in variables:

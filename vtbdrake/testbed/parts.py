@@ -79,11 +79,7 @@ class DpsAlone(AddressedDiagram):
         own = self.default_context()
         if id(testbed) not in self._copiers:
             self._copiers[id(testbed)] = StateCopier(
-                testbed.diagram,
-                testbed.variables(),
-                self.diagram,
-                self.variables(),
-                only=is_dps,
+                testbed.diagram, testbed.variables(), self.diagram, self.variables(), only=is_dps
             )
         self._copiers[id(testbed)].copy(context, own)
         commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]

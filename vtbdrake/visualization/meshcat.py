@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
-from pydrake.geometry import (
-    IllustrationProperties,
-    Meshcat,
-    MeshcatParams,
-    MeshcatVisualizer,
-    Rgba,
-    Role,
-)
+from pydrake.geometry import IllustrationProperties, Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, Role
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex

@@ -61,7 +61,7 @@ def label(name: str, unit: str) -> str:
 
 def finish(axes: Axes) -> None:
     """Draw a pale grid, and remove the frame above and to the right."""
-    axes.grid(True, color="0.9", linewidth=0.8)
+    axes.grid(True, color="0.9", lw=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -90,21 +90,11 @@ def draw_trajectory(
     """Draw f' over time, with t* as a marker; a failed rollout ends with a cross."""
     times = rollout.times[: rollout.quality.size]
     steps = "steps-post" if np.unique(rollout.quality).size <= 2 else "default"
-    (line,) = axes.plot(times, rollout.quality, color=color, linewidth=width, label=name, drawstyle=steps)
+    (line,) = axes.plot(times, rollout.quality, color=color, lw=width, label=name, drawstyle=steps)
     line.set_linestyle(STYLES[style % len(STYLES)])
     line.set_gid("trajectory")
     if rollout.failed and times.size:
-        axes.plot(
-            times[-1],
-            rollout.quality[-1],
-            "x",
-            color=FAILED,
-            markersize=7,
-            markeredgewidth=2,
-            gid="failed",
-            clip_on=False,
-            zorder=3,
-        )
+        axes.plot(times[-1], rollout.quality[-1], "x", color=FAILED, ms=7, mew=2, gid="failed", clip_on=False, zorder=3)
     elif not rollout.failed:
         draw_t_star(axes, rollout.t_star, rollout.h, color=color, style=style)
 
@@ -116,9 +106,9 @@ def draw_t_star(axes: Axes, t_star: float, height: float, *, color: ColorType, s
         height,
         MARKERS[style % len(MARKERS)],
         color=color,
-        markeredgecolor="black",
-        markeredgewidth=0.6,
-        markersize=6,
+        mec="black",
+        mew=0.6,
+        ms=6,
         zorder=3,
         clip_on=False,
         gid="t_star",
@@ -141,21 +131,19 @@ def draw_bars(
     for rollout, height, color, style in zip(rollouts, heights, colors, styles, strict=True):
         times, high = rollout.times[: rollout.quality.size], rollout.quality > lower
         if not times.size:
-            axes.plot(0.0, height, "x", color=FAILED, markersize=6, markeredgewidth=2, gid="failed", clip_on=False)
+            axes.plot(0.0, height, "x", color=FAILED, ms=6, mew=2, gid="failed", clip_on=False)
             continue
-        axes.plot([0.0, times[-1]], [height, height], color=color, linewidth=1.0, alpha=0.6, gid="bar")
+        axes.plot([0.0, times[-1]], [height, height], color=color, lw=1.0, alpha=0.6, gid="bar")
         # A sample holds until the next one.
         begins, ends = times[:-1][high[:-1]], times[1:][high[:-1]]
-        axes.hlines(np.full(begins.size, height), begins, ends, colors=color, linewidth=4, alpha=0.6)
+        axes.hlines(np.full(begins.size, height), begins, ends, colors=color, lw=4, alpha=0.6)
         if rollout.failed:
-            axes.plot(
-                times[-1], height, "x", color=FAILED, markersize=6, markeredgewidth=2, gid="failed", clip_on=False
-            )
+            axes.plot(times[-1], height, "x", color=FAILED, ms=6, mew=2, gid="failed", clip_on=False)
         elif rollout.h > lower:
             draw_t_star(axes, rollout.t_star, height, color=color, style=style)
-    handles = [_key(f"f' = {lower:g}", color="0.4", linewidth=1)]
+    handles = [_key(f"f' = {lower:g}", color="0.4", lw=1)]
     if upper > lower:
-        handles.append(_key(f"f' = {upper:g}", color="0.4", linewidth=4))
+        handles.append(_key(f"f' = {upper:g}", color="0.4", lw=4))
     handles += keys(failed=any(rollout.failed for rollout in rollouts))
     axes.legend(handles=handles, fontsize="small", loc="best")
     axes.set(xlabel="time t [s]", title="Quality trajectories f'(s⁰, t) of two values")
@@ -170,18 +158,18 @@ def levels(rollouts: Sequence[RolloutResult]) -> tuple[float, float]:
 def draw_threshold(axes: Axes, threshold: float) -> None:
     """Draw f_m as a line, if it is finite."""
     if np.isfinite(threshold):
-        axes.axhline(threshold, color=THRESHOLD, linewidth=1, linestyle=(0, (4, 2)), gid="threshold", zorder=1)
+        axes.axhline(threshold, color=THRESHOLD, lw=1, ls=(0, (4, 2)), gid="threshold", zorder=1)
 
 
 def keys(*, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
     """Return the legend entries that all rollouts share."""
-    found = [_key("t*", marker="o", color="white", markeredgecolor="black", linestyle="")]
+    found = [_key("t*", marker="o", color="white", mec="black", ls="")]
     if exceedances:
-        found.append(_key("G₁: f' > f_m", color="0.6", linewidth=6, alpha=0.5))
+        found.append(_key("G₁: f' > f_m", color="0.6", lw=6, alpha=0.5))
     if np.isfinite(threshold):
-        found.append(_key(f"f_m = {threshold:g}", color=THRESHOLD, linewidth=1, linestyle=(0, (4, 2))))
+        found.append(_key(f"f_m = {threshold:g}", color=THRESHOLD, lw=1, ls=(0, (4, 2))))
     if failed:
-        found.append(_key("simulation failed", marker="x", color=FAILED, linestyle="", markeredgewidth=2))
+        found.append(_key("simulation failed", marker="x", color=FAILED, ls="", mew=2))
     return found
 
 
@@ -241,7 +229,7 @@ def draw_landscape(axes: Axes, sweep: Sweep) -> None:
         drawn: ScalarMappable = draw_mesh(axes, x, y, image, log=log, lines=min(x.size, y.size) > 2)
         if known.any() and np.nanmin(h) < threshold < np.nanmax(h):
             axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
-            axes.plot([], [], color=_THRESHOLD, linewidth=2, label=f"f_m = {threshold:g}")
+            axes.plot([], [], color=_THRESHOLD, lw=2, label=f"f_m = {threshold:g}")
     else:
         x_known, y_known = points[known].T
         drawn = axes.scatter(x_known, y_known, c=h[known], cmap="viridis", s=60, gid="h")
@@ -298,18 +286,7 @@ def _edges(centers: np.ndarray, *, log: bool) -> np.ndarray:
 
 def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: float = 18) -> None:
     """Mark the best point with a star."""
-    axes.plot(
-        x,
-        y,
-        "*",
-        color="#d6604d",
-        markersize=size,
-        markeredgecolor="white",
-        clip_on=False,
-        zorder=4,
-        label=text,
-        gid="best",
-    )
+    axes.plot(x, y, "*", color="#d6604d", ms=size, mec="white", clip_on=False, zorder=4, label=text, gid="best")
 
 
 def _draw_best(axes: Axes, sweep: Sweep) -> None:
@@ -399,7 +376,7 @@ def _draw_qualities(
             heights = rollout.quality[np.isin(rollout.times[: rollout.quality.size], rollout.exceedances)]
             axes.plot(rollout.exceedances, heights, "o", color=color, ms=10, alpha=0.3, mew=0, gid="G1")
         if not rollout.failed:
-            axes.axvline(rollout.t_star, color=color, linewidth=0.8, linestyle=":", gid="t_star_line", zorder=1)
+            axes.axvline(rollout.t_star, color=color, lw=0.8, ls=":", gid="t_star_line", zorder=1)
     threshold = rollouts[0].threshold
     draw_threshold(axes, threshold)
     handles = [line for line in axes.get_lines() if line.get_gid() == "trajectory"] if few else []
@@ -424,23 +401,21 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
         marker = MARKERS[number % len(MARKERS)]
         name = describe(condition) if many else "h(s⁰)"
         order = np.argsort(values[mine], kind="stable")
-        (line,) = axes.plot(
-            values[mine][order], h[mine][order], color=color, marker=marker, markersize=5, label=name, gid="h"
-        )
+        (line,) = axes.plot(values[mine][order], h[mine][order], color=color, marker=marker, ms=5, label=name, gid="h")
         # Between 0 and 1 of a quality that takes no other value there is nothing to be drawn.
         line.set_linestyle("none" if is_two_valued(sweep.rollouts) else STYLES[number % len(STYLES)])
         line.set_linewidth(1.2)
         # An open marker: f' exceeded f_m, or a constraint was violated.
         line.set_markerfacecolor("white")
         held = mine & ~sweep.unsafe
-        axes.plot(values[held], h[held], marker, color=color, markersize=5, gid="not_exceeded")
+        axes.plot(values[held], h[held], marker, color=color, ms=5, gid="not_exceeded")
     threshold = _threshold(sweep)
     draw_threshold(axes, threshold)
     handles = list(axes.get_legend_handles_labels()[0])
     if sweep.exceeded.any():
-        handles += axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="f_m exceeded")
+        handles += axes.plot([], [], "o", color="0.3", mfc="white", label="f_m exceeded")
     if (sweep.violated & ~sweep.exceeded).any():
-        handles += axes.plot([], [], "o", color="0.6", markerfacecolor="white", label="a constraint violated")
+        handles += axes.plot([], [], "o", color="0.6", mfc="white", label="a constraint violated")
     if sweep.failed.any():
         failed = values[sweep.failed]
         handles += axes.plot(
@@ -448,7 +423,7 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
             np.full(failed.size, 0.03),
             "x",
             color=FAILED,
-            markeredgewidth=2,
+            mew=2,
             transform=axes.get_xaxis_transform(),
             label="simulation failed",
             gid="failed",
@@ -469,9 +444,9 @@ def _draw_boundary(axes: Axes, sweep: Sweep, boundary: Boundary, handles: list[A
     lower = max(boundary.lower, float(sweep.points[:, 0].min()))
     upper = min(boundary.upper, float(sweep.points[:, 0].max()))
     if lower < upper and np.isfinite([boundary.lower, boundary.upper]).all():
-        span = axes.axvspan(lower, upper, color=_BOUNDARY, alpha=0.5, linewidth=0, label="boundary", gid="boundary")
+        span = axes.axvspan(lower, upper, color=_BOUNDARY, alpha=0.5, lw=0, label="boundary", gid="boundary")
         # A narrow interval would be lost between two markers.
-        axes.axvline((lower + upper) / 2, color=_BOUNDARY, linewidth=1.5, zorder=0)
+        axes.axvline((lower + upper) / 2, color=_BOUNDARY, lw=1.5, zorder=0)
         handles.append(span)
     text = boundary.interval_text(boundary.lower, boundary.upper)
     return text[:1].upper() + text[1:]

@@ -166,13 +166,7 @@ def scales(study: Study) -> dict[str, Scale]:
 
 
 def draw_points(
-    axes: Axes,
-    study: Study,
-    points: Points,
-    x: Callable[[Sequence[Trial]], np.ndarray],
-    *,
-    quality: int,
-    **style: Any,
+    axes: Axes, study: Study, points: Points, x: Callable[[Sequence[Trial]], np.ndarray], *, quality: int, **style: Any
 ) -> None:
     """Draw all points at the places ``x`` and their values.
 
@@ -197,40 +191,28 @@ def draw_points(
 
 
 BROKEN_STYLE: dict[str, Any] = {
-    "linestyle": "none",
+    "ls": "none",
     "marker": "o",
-    "markerfacecolor": "none",
-    "markeredgecolor": _BROKEN,
-    "markersize": 4.5,
-    "markeredgewidth": 0.8,
+    "mfc": "none",
+    "mec": _BROKEN,
+    "ms": 4.5,
+    "mew": 0.8,
     "zorder": 2,
 }
-_DROPPED_STYLE: dict[str, Any] = {
-    "linestyle": "none",
-    "marker": "v",
-    "color": _DROPPED,
-    "markersize": 4,
-    "markeredgewidth": 0,
-    "zorder": 1.5,
-}
+_DROPPED_STYLE: dict[str, Any] = {"ls": "none", "marker": "v", "color": _DROPPED, "ms": 4, "mew": 0, "zorder": 1.5}
 _FAILED_STYLE: dict[str, Any] = {
-    "linestyle": "none",
+    "ls": "none",
     "marker": "x",
     "color": FAILED,
-    "markersize": 6,
-    "markeredgewidth": 1.5,
+    "ms": 6,
+    "mew": 1.5,
     "zorder": 3,
     "clip_on": False,
 }
 
 
 # It must stand out from every colour of a map, and from white.
-_BROKEN_ON_A_MAP: dict[str, Any] = {
-    **BROKEN_STYLE,
-    "markeredgecolor": "#f4a582",
-    "markersize": 7,
-    "markeredgewidth": 1.4,
-}
+_BROKEN_ON_A_MAP: dict[str, Any] = {**BROKEN_STYLE, "mec": "#f4a582", "ms": 7, "mew": 1.4}
 
 
 def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]:
@@ -336,7 +318,7 @@ def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, qualit
             scale.places(best.known)[order],
             values(best.known, quality)[order],
             color=_SINGLE,
-            linewidth=1.2,
+            lw=1.2,
             zorder=2,
             label=text,
             gid="h",
@@ -458,7 +440,7 @@ def plot_history(study: Study) -> Figure:
                 [*best, best[-1]],
                 color=BEST,
                 drawstyle="steps-post",
-                linewidth=1.4,
+                lw=1.4,
                 gid="best so far",
                 zorder=2.5,
             )
@@ -467,11 +449,11 @@ def plot_history(study: Study) -> Figure:
         finish(axes)
     axes.set_xlabel(_ORDER_LABEL)
     handles = [
-        Line2D([], [], marker="o", linestyle="none", markersize=5, color=colors[method], label=f"{method} ({number})")
+        Line2D([], [], marker="o", ls="none", ms=5, color=colors[method], label=f"{method} ({number})")
         for method, number in methods.items()
     ]
     if points.kept:
-        handles.append(Line2D([], [], color=BEST, linewidth=1.4, label="best so far"))
+        handles.append(Line2D([], [], color=BEST, lw=1.4, label="best so far"))
     _legend(figure, [*handles, *point_keys(study, points)])
     return figure
 
@@ -562,11 +544,11 @@ def plot_pareto(study: Study) -> Figure:
             *front_xy.T,
             color=BEST,
             marker="o",
-            markersize=6,
-            markeredgecolor="white",
-            markeredgewidth=0.6,
-            linestyle="-" if count == 2 else "none",
-            linewidth=1.0,
+            ms=6,
+            mec="white",
+            mew=0.6,
+            ls="-" if count == 2 else "none",
+            lw=1.0,
             drawstyle="steps-pre" if study.signs[i] > 0.0 else "steps-post",
             zorder=4,
             gid="front",
@@ -574,8 +556,8 @@ def plot_pareto(study: Study) -> Figure:
         axes.set(xlabel=quality_label(study, i), ylabel=quality_label(study, j))
         finish(axes)
     handles = [
-        Line2D([], [], color=BEST, marker="o", linestyle="none", label=f"Pareto front ({len(front)})"),
-        Line2D([], [], color=_BARS, marker="o", linestyle="none", markersize=5, alpha=0.6, label="other points"),
+        Line2D([], [], color=BEST, marker="o", ls="none", label=f"Pareto front ({len(front)})"),
+        Line2D([], [], color=_BARS, marker="o", ls="none", ms=5, alpha=0.6, label="other points"),
     ]
     _legend(figure, [*handles, *point_keys(study, replace(points, failed=()))])
     if points.failed:
@@ -592,9 +574,7 @@ def _draw_pair(axes: Axes, study: Study, points: Points, pair: tuple[int, int]) 
 def _best_key(points: Points) -> list[Line2D]:
     if not points.kept:
         return []
-    return [
-        Line2D([], [], marker="*", linestyle="none", color=BEST, markersize=11, markeredgecolor="white", label="best")
-    ]
+    return [Line2D([], [], marker="*", ls="none", color=BEST, ms=11, mec="white", label="best")]
 
 
 def _legend(figure: Figure, handles: list[Line2D]) -> None:

@@ -16,17 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
-from vtbdrake.monitoring.live.messages import (
-    ANSWER,
-    GET,
-    RESET,
-    SET,
-    WATCH,
-    WATCHED,
-    is_number,
-    parse_request,
-    to_json,
-)
+from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, is_number, parse_request, to_json
 
 _CONNECT_TIMEOUT = 2.0  # s
 _BURST = 1000  # messages taken at a time

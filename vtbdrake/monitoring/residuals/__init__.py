@@ -4,11 +4,4 @@ from vtbdrake.monitoring.residuals.alarms import Alarm, Calibration, Calibration
 from vtbdrake.monitoring.residuals.comparison import ResidualConfig
 from vtbdrake.monitoring.residuals.monitor import ResidualError, ResidualMonitor
 
-__all__ = [
-    "Alarm",
-    "Calibration",
-    "CalibrationError",
-    "ResidualConfig",
-    "ResidualError",
-    "ResidualMonitor",
-]
+__all__ = ["Alarm", "Calibration", "CalibrationError", "ResidualConfig", "ResidualError", "ResidualMonitor"]
