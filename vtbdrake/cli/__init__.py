@@ -38,6 +38,9 @@ _COMMANDS = {
 _EXPECTED = (ValueError, OSError, ModuleNotFoundError)
 
 
+_CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True}
+
+
 class BadInputError(click.ClickException):
     """The program cannot use its input."""
 
@@ -97,7 +100,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
         ctx.exit()
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(cls=_Commands, context_settings=_CONTEXT)
 @click.option("--traceback", is_flag=True, help="Show the Python traceback of an error.")
 @click.option(
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Show the version."

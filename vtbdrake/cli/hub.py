@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vtbdrake.cli.options import converted, option, parse_scenario
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
 from vtbdrake.monitoring.live.messages import RESET, SET
 
@@ -21,68 +22,42 @@ _MEBIBYTE = 1024 * 1024
 _SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
 
 
-def _load_scenario(ctx: click.Context, param: click.Parameter, name: str | None) -> Any:
-    if name is None:
-        return None
-    # Without a scenario, the hub starts without Drake.
-    from vtbdrake.testbed import load_scenario
-
-    return load_scenario(name)
-
-
-def _option(field: str, kind: Any, metavar: str, text: str) -> Callable[[Any], Any]:
+def _option(usage: str, text: str, **settings: Any) -> Callable[[Any], Any]:
     """Return the option that sets a field of `HubConfig`."""
+    field = usage.split()[0].removeprefix("--").replace("-", "_")
     default = getattr(_DEFAULT, field)
-    if field in _SIZES:
-        default //= _MEBIBYTE
-    name = "--" + field.replace("_", "-")
-    return click.option(name, type=kind, default=default, show_default=True, metavar=metavar, help=text)
+    return option(usage, text, default=default // _MEBIBYTE if field in _SIZES else default, **settings)
 
 
 _POSITIVE = click.IntRange(min=1)
 
 
 @click.command()
-@click.argument("scenario", required=False, callback=_load_scenario)
-@_option("host", str, "ADDRESS", "Address to listen on; beyond loopback, every machine that reaches it can connect.")
-@_option("port", int, "N", "0: any free port.")
-@click.option(
-    "--protect",
-    multiple=True,
-    metavar="CHANNEL",
-    help="Let only one client publish on this channel: the first one, until another requests it on "
+@click.argument("scenario", required=False, callback=converted(parse_scenario))
+@_option("--host ADDRESS", "Address to listen on; beyond loopback, every machine that reaches it can connect.")
+@_option("--port N", "0: any free port.")
+@option(
+    "--protect CHANNEL",
+    "Let only one client publish on this channel: the first one, until another requests it on "
     "VTB_HUB_TAKE/CHANNEL while the owner pauses. May be repeated.",
-)
-@click.option("--unprotected", is_flag=True, help="Protect only the channels given by --protect.")
-@click.option(
-    "--user",
-    "users",
     multiple=True,
-    metavar="NAME",
-    help="Name or id of a user that may connect, too. May be repeated.",
 )
-@click.option("--all-users", is_flag=True, help="Let every user of this machine connect.")
-@_option("lease", float, "S", "Seconds after the owner's last message during which no other client can take over.")
-@_option("max_message", _POSITIVE, "MIB", "Largest message.")
-@_option("max_queue", _POSITIVE, "MIB", "Largest backlog of a client; beyond it, the oldest messages are dropped.")
+@option("--unprotected", "Protect only the channels given by --protect.", is_flag=True)
+@option("--user NAME", "Name or id of a user that may connect, too. May be repeated.", name="users", multiple=True)
+@option("--all-users", "Let every user of this machine connect.", is_flag=True)
+@_option("--lease S", "Seconds after the owner's last message during which no other client can take over.")
+@_option("--max-message MIB", "Largest message.", type=_POSITIVE)
+@_option("--max-queue MIB", "Largest backlog of a client; beyond it, the oldest messages are dropped.", type=_POSITIVE)
 @_option(
-    "max_memory",
-    _POSITIVE,
-    "MIB",
+    "--max-memory MIB",
     "Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
+    type=_POSITIVE,
 )
-@_option("max_clients", _POSITIVE, "N", "Maximum number of clients at a time.")
-@_option("patience", float, "S", "Seconds until a client is disconnected that does not read or complete a message.")
-@_option(
-    "priority", int, "N", "Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it; 0: none."
-)
-@click.option(
-    "--cpu",
-    "cpus",
-    type=int,
-    multiple=True,
-    metavar="N",
-    help="Processor to run on, if the system grants it. May be repeated.",
+@_option("--max-clients N", "Maximum number of clients at a time.", type=_POSITIVE)
+@_option("--patience S", "Seconds until a client is disconnected that does not read or complete a message.")
+@_option("--priority N", "Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it; 0: none.")
+@option(
+    "--cpu N", "Processor to run on, if the system grants it. May be repeated.", name="cpus", type=int, multiple=True
 )
 def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP until Ctrl-C, for networks without multicast.

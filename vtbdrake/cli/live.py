@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from vtbdrake.cli import FailedError, one_line
-from vtbdrake.cli.options import Setting, converted, parse_setting, settings, timeout_option, url_option
+from vtbdrake.cli.options import Setting, converted, option, parse_setting, settings, timeout_option, url_option
 from vtbdrake.cli.output import finite
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
@@ -57,10 +57,8 @@ def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
 @click.command()
 @_addresses
 @url_option
-@click.option(
-    "--every", type=click.IntRange(min=1), default=100, show_default=True, metavar="N", help="Print every Nth cycle."
-)
-@click.option("--count", type=click.IntRange(min=1), metavar="N", help="End after N lines.  [default: endless]")
+@option("--every N", "Print every Nth cycle.", type=click.IntRange(min=1), default=100)
+@option("--count N", "End after N lines.  [default: endless]", type=click.IntRange(min=1))
 @timeout_option
 def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
     """Print variables and output ports of a DPS that runs by vtbdrake run, until Ctrl-C or its end.

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from vtbdrake.cli import FailedError, one_line
-from vtbdrake.cli.options import Setting, output, set_option, settings
+from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
 from vtbdrake.cli.output import RECORDINGS, save_recording
 from vtbdrake.recording.export import EXPORTS
 from vtbdrake.recording.export import export as export_log
@@ -23,21 +23,19 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 
 @click.command()
 @_log
-@click.option(
-    "--scenario",
-    metavar="MODULE:CLASS",
-    help="The scenario of the log, whose fields are in the log. Its code runs, so the user has to name it.",
+@option(
+    "--scenario MODULE:CLASS",
+    "The scenario of the log, whose fields are in the log. Its code runs, so the user has to name it.",
 )
-@click.option(
+@option(
     "--on",
+    "Replay the recorded system: the DPS alone, or the whole testbed.",
     type=click.Choice(["recorded", "dps", "testbed"]),
     default="recorded",
-    show_default=True,
-    help="Replay the recorded system: the DPS alone, or the whole testbed.",
 )
 @set_option
-@click.option("--record", multiple=True, metavar="ADDRESS", help="Read ADDRESS after every cycle. May be repeated.")
-@click.option("--out", callback=output(*RECORDINGS), metavar="FILE", help="Write these values: .csv or .npz.")
+@option("--record ADDRESS", "Read ADDRESS after every cycle. May be repeated.", multiple=True)
+@option("--out FILE", "Write these values: .csv or .npz.", parse=output(*RECORDINGS))
 def replay(
     log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
@@ -71,7 +69,7 @@ def replay(
 
 @click.command()
 @_log
-@click.argument("out", callback=output(*EXPORTS))
+@click.argument("out", callback=converted(output(*EXPORTS)))
 def export(log: Path, out: Path) -> None:
     """Write a LOG as MCAP (for Foxglove), CSV or Parquet, by the suffix of OUT.
 

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import logging
 from math import inf
+from typing import Any
 
 import click
 
 from vtbdrake.cli import FailedError, one_line
-from vtbdrake.cli.options import Setting, converted, parse_setting, scenario_argument, set_option, settings, url_option
+from vtbdrake.cli.options import (
+    Setting,
+    option,
+    parse_setting,
+    scenario_argument,
+    set_option,
+    settings,
+    url_option,
+)
 from vtbdrake.cli.output import number
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.machine import Machine, MachineConfig, MachineLoop
@@ -32,95 +41,57 @@ def _parse_noise(text: str) -> tuple[str, float]:
 @click.command()
 @scenario_argument
 @url_option
-@click.option(
-    "--period",
-    type=float,
-    default=_DEFAULT.period,
-    show_default=True,
-    metavar="S",
-    help="The period of a cycle, in seconds; each cycle publishes the state once.",
+@option(
+    "--period S", "The period of a cycle, in seconds; each cycle publishes the state once.", default=_DEFAULT.period
 )
-@click.option("--lock-step", is_flag=True, help="Begin a cycle with a command on every channel, not by the clock.")
-@click.option("--cycles", type=click.IntRange(min=0), metavar="N", help="End after N cycles.  [default: endless]")
+@option("--lock-step", "Begin a cycle with a command on every channel, not by the clock.", is_flag=True)
+@option("--cycles N", "End after N cycles.  [default: endless]", type=click.IntRange(min=0))
 @set_option
-@click.option(
-    "--perturb",
-    type=float,
+@option(
+    "--perturb R",
+    "Multiply masses, damping, friction and rotor inertias by random factors from 1 - R to 1 + R.",
     default=_DEFAULT.perturb,
-    metavar="R",
-    help="Multiply masses, damping, friction and rotor inertias by random factors from 1 - R to 1 + R.",
 )
-@click.option(
-    "--noise",
-    callback=converted(_parse_noise),
+@option(
+    "--noise SIGNAL=STD",
+    "Add normal noise to a sensor signal, in its unit. May be repeated.",
+    parse=_parse_noise,
     multiple=True,
-    metavar="SIGNAL=STD",
-    help="Add normal noise to a sensor signal, in its unit. May be repeated.",
 )
-@click.option(
-    "--seed", type=int, default=_DEFAULT.seed, show_default=True, metavar="N", help="The seed of all random numbers."
-)
-@click.option(
-    "--sense-latency",
-    type=float,
-    default=0.0,
-    metavar="MS",
-    help="The latency of sensor messages, in milliseconds; whole cycles.",
-)
-@click.option(
-    "--act-latency",
-    type=float,
-    default=0.0,
-    metavar="MS",
-    help="The latency of commands, in milliseconds; whole cycles.",
-)
-@click.option(
-    "--timeout",
-    type=float,
-    default=_DEFAULT.timeout,
-    show_default=True,
-    metavar="S",
-    help="Brake after S seconds without a command.",
-)
-@click.option(
-    "--max-latency",
-    type=float,
-    default=_DEFAULT.max_latency,
-    show_default=True,
-    metavar="S",
-    help="Reject commands that took S seconds longer than the quickest one, by their sender's clock; inf rejects none. "
+@option("--seed N", "The seed of all random numbers.", type=int, default=_DEFAULT.seed)
+@option("--sense-latency MS", "The latency of sensor messages, in milliseconds; whole cycles.", default=0.0)
+@option("--act-latency MS", "The latency of commands, in milliseconds; whole cycles.", default=0.0)
+@option("--timeout S", "Brake after S seconds without a command.", default=_DEFAULT.timeout)
+@option(
+    "--max-latency S",
+    "Reject commands that took S seconds longer than the quickest one, by their sender's clock; inf rejects none. "
     "Not in lock-step.",
+    default=_DEFAULT.max_latency,
 )
-@click.option(
+@option(
     "--brake",
-    type=click.Choice(BRAKES),
-    help="Lock the joints (default for a discrete plant), apply the idle commands (default for a continuous one) "
+    "Lock the joints (default for a discrete plant), apply the idle commands (default for a continuous one) "
     "or hold the last commands.",
+    type=click.Choice(BRAKES),
 )
-@click.option(
-    "--priority",
+@option(
+    "--priority N",
+    "The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",
     type=click.IntRange(0, 99),
     default=0,
-    show_default=True,
-    metavar="N",
-    help="The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",
 )
 def machine(
     scenario: Scenario,
     url: str,
-    period: float,
     lock_step: bool,
     cycles: int | None,
     values: tuple[Setting, ...],
-    perturb: float,
     noise: tuple[tuple[str, float], ...],
-    seed: int,
     sense_latency: float,
     act_latency: float,
-    timeout: float,
-    max_latency: float,
     brake: str | None,
     priority: int,
+    **fields: Any,
 ) -> None:
     """Simulate the physical robot of a scenario over LCM, until Ctrl-C.
 
@@ -134,16 +105,12 @@ def machine(
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     config = MachineConfig(
-        period=period,
         values=settings(values),
-        perturb=perturb,
         noise=dict(noise),
-        seed=seed,
         sense_latency=1e-3 * sense_latency,
         act_latency=1e-3 * act_latency,
-        timeout=timeout,
-        max_latency=max_latency,
         brake=brake or "",
+        **fields,
     )
     simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
     for address, value in simulated.perturbed.items():

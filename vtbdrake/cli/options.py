@@ -11,11 +11,10 @@ from urllib.parse import urlsplit
 
 import click
 
-from vtbdrake.state import Snapshot
-from vtbdrake.testbed import load_scenario
-
 if TYPE_CHECKING:
     from vtbdrake.optimization import Choice, Parameter
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import Scenario
 
 # (address, value)
 Setting = tuple[str, float | list[Any]]
@@ -32,6 +31,25 @@ def converted(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Par
     return convert
 
 
+def option(
+    usage: str, text: str, *, name: str | None = None, parse: Callable[[Any], Any] | None = None, **settings: Any
+) -> Callable[[Any], Any]:
+    """Return a ``click.option``.
+
+    Args:
+        usage: Its names, and the word for its value, such as ``--horizon S``.
+        text: Its help.
+        name: The parameter of the command that gets the value; by default the last of its names.
+        parse: Makes the value of a text, or of each text if there may be several.
+        settings: Further arguments of ``click.option``.
+    """
+    names = [word for word in usage.split() if word.startswith("-")]
+    metavar = usage.removeprefix(" ".join(names)).strip() or None
+    if parse is not None:
+        settings["callback"] = converted(parse)
+    return click.option(*names, *([name] if name else []), metavar=metavar, help=text, **settings)
+
+
 def _assignment(text: str, form: str) -> tuple[str, str]:
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
@@ -44,6 +62,20 @@ def _json_or_text(value: str) -> Any:
         return json.loads(value)
     except json.JSONDecodeError:
         return value
+
+
+def parse_scenario(text: str) -> Scenario:
+    """Load a scenario. Drake is imported here: a hub without a scenario starts without it."""
+    from vtbdrake.testbed import load_scenario
+
+    return load_scenario(text)
+
+
+def parse_snapshot(path: str) -> Snapshot:
+    """Load a snapshot."""
+    from vtbdrake.state import Snapshot
+
+    return Snapshot.load(path)
 
 
 def parse_setting(text: str) -> Setting:
@@ -131,8 +163,8 @@ def positive(value: float) -> float:
     return value
 
 
-def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """Return a callback that checks that a file can be written.
+def output(*suffixes: str, new: bool = False) -> Callable[[str], Path]:
+    """Return a function that checks that a file can be written, and returns its path.
 
     Args:
         suffixes: The suffixes that its name may have; any by default.
@@ -153,7 +185,7 @@ def output(*suffixes: str, new: bool = False) -> Callable[[click.Context, click.
             raise click.BadParameter(f"{path} exists, and is not overwritten: give another name, or remove it")
         return path
 
-    return converted(parse)
+    return parse
 
 
 def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
@@ -170,43 +202,18 @@ def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-scenario_argument = click.argument("scenario", callback=converted(load_scenario))
-set_option = click.option(
-    "--set",
-    "values",
-    callback=converted(parse_setting),
+scenario_argument = click.argument("scenario", callback=converted(parse_scenario))
+set_option = option(
+    "--set ADDRESS=VALUE",
+    "Set a variable in s0 to a number or a JSON list. May be repeated.",
+    name="values",
+    parse=parse_setting,
     multiple=True,
-    metavar="ADDRESS=VALUE",
-    help="Set a variable in s0 to a number or a JSON list. May be repeated.",
 )
-url_option = click.option(
-    "--url",
-    callback=converted(parse_url),
-    required=True,
-    metavar="URL",
-    help="The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.",
+url_option = option(
+    "--url URL", "The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.", parse=parse_url, required=True
 )
-timeout_option = click.option(
-    "--timeout",
-    type=float,
-    callback=converted(positive),
-    default=5.0,
-    show_default=True,
-    metavar="S",
-    help="Give up after so many seconds without an answer.",
-)
-horizon_option = click.option("--horizon", type=float, required=True, metavar="S", help="The horizon t_m, in seconds.")
-sample_period_option = click.option(
-    "--sample-period",
-    type=float,
-    default=0.05,
-    show_default=True,
-    metavar="S",
-    help="The time between two samples, in seconds.",
-)
-start_option = click.option(
-    "--start",
-    callback=converted(Snapshot.load),
-    metavar="SNAPSHOT",
-    help="Take s0 from this file instead of the defaults.",
-)
+timeout_option = option("--timeout S", "Give up after so many seconds without an answer.", parse=positive, default=5.0)
+horizon_option = option("--horizon S", "The horizon t_m, in seconds.", type=float, required=True)
+sample_period_option = option("--sample-period S", "The time between two samples, in seconds.", default=0.05)
+start_option = option("--start SNAPSHOT", "Take s0 from this file instead of the defaults.", parse=parse_snapshot)

@@ -19,8 +19,8 @@ import numpy as np
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
-    converted,
     horizon_option,
+    option,
     output,
     parse_condition,
     parse_grid,
@@ -54,44 +54,33 @@ def _all(*options: Callable[[F], F]) -> Callable[[F], F]:
 
 problem_options: Callable[[F], F] = _all(
     scenario_argument,
-    click.option(
-        "--quality",
-        required=True,
-        metavar="ADDRESS|MODULE:FUNCTION",
-        help="f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
+    option(
+        "--quality ADDRESS|MODULE:FUNCTION",
+        "f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
         "Python function of the variables named by --of.",
+        required=True,
     ),
-    click.option("--of", multiple=True, metavar="ADDRESS", help="An argument of the function. May be repeated."),
+    option("--of ADDRESS", "An argument of the function. May be repeated.", multiple=True),
     horizon_option,
     set_option,
-    click.option(
-        "--condition",
-        "conditions",
-        callback=converted(parse_condition),
+    option(
+        "--condition ADDRESS=VALUE[;...]",
+        "Evaluate every point under this condition. May be repeated.",
+        name="conditions",
+        parse=parse_condition,
         multiple=True,
-        metavar="ADDRESS=VALUE[;...]",
-        help="Evaluate every point under this condition. May be repeated.",
     ),
     sample_period_option,
     start_option,
 )
 executor_options: Callable[[F], F] = _all(
-    click.option(
-        "--executor", type=click.Choice(NAMES), default=NAMES[0], show_default=True, help="Where rollouts run."
-    ),
-    click.option(
-        "--workers",
-        type=click.IntRange(min=1),
-        metavar="N",
-        help="The number of threads or processes.  [default: one per core]",
-    ),
+    option("--executor", "Where rollouts run.", type=click.Choice(NAMES), default=NAMES[0]),
+    option("--workers N", "The number of threads or processes.  [default: one per core]", type=click.IntRange(min=1)),
 )
 _file_options: Callable[[F], F] = _all(
-    click.option(
-        "--save", callback=output(), metavar="FILE", help="Write the sweep for vtbdrake.optimization.Sweep.load."
-    ),
-    click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write the table."),
-    click.option("--plot", callback=output(".png", ".svg", ".pdf"), metavar="FILE", help="Draw h and the qualities."),
+    option("--save FILE", "Write the sweep for vtbdrake.optimization.Sweep.load.", parse=output()),
+    option("--csv FILE", "Write the table.", parse=output(".csv")),
+    option("--plot FILE", "Draw h and the qualities.", parse=output(".png", ".svg", ".pdf")),
 )
 
 
@@ -192,15 +181,14 @@ def _function(text: str) -> Callable[..., Any]:
 
 @click.command()
 @problem_options
-@click.option(
-    "--vary",
-    callback=converted(parse_grid),
+@option(
+    "--vary ADDRESS=LOWER:UPPER:POINTS",
+    "An element of s0 and the values to evaluate. Once or twice.",
+    parse=parse_grid,
     multiple=True,
     required=True,
-    metavar="ADDRESS=LOWER:UPPER:POINTS",
-    help="An element of s0 and the values to evaluate. Once or twice.",
 )
-@click.option("--threshold", type=float, default=inf, metavar="F", help="f_m: a rollout whose f exceeds it ends there.")
+@option("--threshold F", "f_m: a rollout whose f exceeds it ends there.", default=inf)
 @executor_options
 @_file_options
 def sweep(
@@ -235,31 +223,22 @@ def sweep(
 
 @click.command()
 @problem_options
-@click.option(
-    "--vary",
-    callback=converted(parse_range),
+@option(
+    "--vary ADDRESS=LOWER:UPPER",
+    "The element of s0 whose boundary to find, and its range.",
+    parse=parse_range,
     required=True,
-    metavar="ADDRESS=LOWER:UPPER",
-    help="The element of s0 whose boundary to find, and its range.",
 )
-@click.option("--threshold", type=float, required=True, metavar="F", help="f_m: a rollout whose f exceeds it is bad.")
-@click.option("--resolution", type=float, required=True, metavar="R", help="The width of the interval to find.")
-@click.option("--coarse", type=float, required=True, metavar="C", help="The step of the first grid.")
-@click.option(
-    "--repeats",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one.  "
+@option("--threshold F", "f_m: a rollout whose f exceeds it is bad.", type=float, required=True)
+@option("--resolution R", "The width of the interval to find.", type=float, required=True)
+@option("--coarse C", "The step of the first grid.", type=float, required=True)
+@option(
+    "--repeats N",
+    "Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one.  "
     "[default: 5]",
+    type=click.IntRange(min=0),
 )
-@click.option(
-    "--jitter",
-    type=float,
-    default=1e-6,
-    show_default=True,
-    metavar="J",
-    help="The largest change of the parameter in a repetition, as a fraction of its range.",
-)
+@option("--jitter J", "The largest change of the parameter in a repetition, as a fraction of its range.", default=1e-06)
 @executor_options
 @_file_options
 def boundary(

@@ -17,9 +17,10 @@ from vtbdrake.child_process import ending_signals
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
-    converted,
+    option,
     output,
     parse_field,
+    parse_snapshot,
     positive,
     scenario_argument,
     set_option,
@@ -45,64 +46,41 @@ MOST_FAULTS = 20  # that are printed at the end
 @click.command()
 @scenario_argument
 @url_option
-@click.option(
-    "--snapshot",
-    callback=converted(Snapshot.load),
-    metavar="FILE",
-    help="Start the DPS in the state of this snapshot, of a whole testbed or of a DPS alone.",
+@option(
+    "--snapshot FILE",
+    "Start the DPS in the state of this snapshot, of a whole testbed or of a DPS alone.",
+    parse=parse_snapshot,
 )
 @set_option
-@click.option(
-    "--field",
-    "fields",
-    callback=converted(parse_field),
+@option(
+    "--field NAME=VALUE",
+    "Set a field of the scenario: a number, true, false or a text. May be repeated.",
+    name="fields",
+    parse=parse_field,
     multiple=True,
-    metavar="NAME=VALUE",
-    help="Set a field of the scenario: a number, true, false or a text. May be repeated.",
 )
-@click.option(
-    "--period", type=float, metavar="S", help="The period of a cycle, in seconds, instead of that of the scenario."
-)
-@click.option(
-    "--pace", metavar="SIGNAL", help="Begin a cycle with each message of this sensor signal, not by the clock."
-)
-@click.option(
-    "--seconds", type=float, callback=converted(positive), metavar="S", help="End after S seconds.  [default: endless]"
-)
-@click.option(
-    "--wait",
-    type=float,
-    callback=converted(positive),
-    default=60.0,
-    show_default=True,
-    metavar="S",
-    help="Give up if the machine is not ready after S seconds.",
-)
-@click.option(
+@option("--period S", "The period of a cycle, in seconds, instead of that of the scenario.", type=float)
+@option("--pace SIGNAL", "Begin a cycle with each message of this sensor signal, not by the clock.")
+@option("--seconds S", "End after S seconds.  [default: endless]", parse=positive, type=float)
+@option("--wait S", "Give up if the machine is not ready after S seconds.", parse=positive, default=60.0)
+@option(
     "--take-over",
-    "claim",
+    "Ask the hub for command channels whose owner has fallen silent, for instance a frozen DPS.",
+    name="claim",
     is_flag=True,
-    help="Ask the hub for command channels whose owner has fallen silent, for instance a frozen DPS.",
 )
-@click.option(
-    "--priority",
+@option(
+    "--priority N",
+    "The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if granted; 0 for ordinary scheduling.",
     type=click.IntRange(0, 99),
     default=PRIORITY,
-    show_default=True,
-    metavar="N",
-    help="The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if granted; 0 for ordinary scheduling.",
 )
-@click.option(
-    "--lock-memory/--no-lock-memory",
-    default=True,
-    show_default=True,
-    help="Keep all memory resident, including memory that is never used.",
+@option(
+    "--lock-memory/--no-lock-memory", "Keep all memory resident, including memory that is never used.", default=True
 )
-@click.option("--live/--no-live", default=True, show_default=True, help="Serve vtbdrake get, set, watch and reset.")
-@click.option(
-    "--record", callback=output(".lcm", new=True), metavar="FILE", help="Record the loop for vtbdrake replay: .lcm."
-)
-@click.option("--statistics", callback=output(".json"), metavar="FILE", help="Write the timing of the loop: .json.")
+@option("--live/--no-live", "Serve vtbdrake get, set, watch and reset.", default=True)
+@option("--record FILE", "Record the loop for vtbdrake replay: .lcm.", parse=output(".lcm", new=True))
+@option("--statistics FILE", "Write the timing of the loop: .json.", parse=output(".json"))
 def run(
     scenario: Scenario,
     url: str,

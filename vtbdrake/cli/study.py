@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from vtbdrake.cli import FailedError
-from vtbdrake.cli.options import converted, output, parse_choice, parse_field, parse_scaled_range, settings
+from vtbdrake.cli.options import converted, option, output, parse_choice, parse_field, parse_scaled_range, settings
 from vtbdrake.cli.output import table, write_csv
 from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, problem_options
 from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
@@ -19,6 +19,8 @@ from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint
 from vtbdrake.testbed import Scenario
 
+# The options of `Study.run`.
+_RUNNING = ("rollouts", "seconds", "target", "executor", "workers", "time_limit", "racing", "on_error")
 _LEVELS = {"quantile": Quantile, "cvar": CVaR}
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 _point = click.argument(
@@ -51,74 +53,63 @@ def study() -> None:
 
 
 @study.command()
-@click.argument("file", callback=output())
+@click.argument("file", callback=converted(output()))
 @problem_options
-@click.option(
-    "--vary",
-    callback=converted(parse_scaled_range),
+@option(
+    "--vary ADDRESS=LOWER:UPPER[:log][:integer]",
+    "A parameter and its range: on a logarithmic scale, or whole numbers only. May be repeated.",
+    parse=parse_scaled_range,
     multiple=True,
-    metavar="ADDRESS=LOWER:UPPER[:log][:integer]",
-    help="A parameter and its range: on a logarithmic scale, or whole numbers only. May be repeated.",
 )
-@click.option(
-    "--choose",
-    callback=converted(parse_choice),
-    multiple=True,
-    metavar="ADDRESS=OPTION,OPTION[,...]",
-    help="A parameter that takes one of several values without an order: numbers, words, true or false; a variable "
+@option(
+    "--choose ADDRESS=OPTION,OPTION[,...]",
+    "A parameter that takes one of several values without an order: numbers, words, true or false; a variable "
     "or scenario.<field>. May be repeated; in a point, those of --choose follow those of --vary.",
-)
-@click.option(
-    "--at-most",
-    callback=converted(partial(make_constraint, limit="at_most")),
+    parse=parse_choice,
     multiple=True,
-    metavar="ADDRESS=LIMIT",
-    help="A constraint: the variable (of an array, its largest entry) never exceeds the limit. Instead of a "
+)
+@option(
+    "--at-most ADDRESS=LIMIT",
+    "A constraint: the variable (of an array, its largest entry) never exceeds the limit. Instead of a "
     "variable, a Python function of variables: MODULE:FUNCTION(ADDRESS,...)=LIMIT. May be repeated.",
-)
-@click.option(
-    "--at-least",
-    callback=converted(partial(make_constraint, limit="at_least")),
+    parse=partial(make_constraint, limit="at_most"),
     multiple=True,
-    metavar="ADDRESS=LIMIT",
-    help="A constraint: the variable (of an array, its smallest entry) never falls below the limit. May be repeated.",
 )
-@click.option("--minimize", is_flag=True, help="The quality is a cost: smaller is better.")
-@click.option(
+@option(
+    "--at-least ADDRESS=LIMIT",
+    "A constraint: the variable (of an array, its smallest entry) never falls below the limit. May be repeated.",
+    parse=partial(make_constraint, limit="at_least"),
+    multiple=True,
+)
+@option("--minimize", "The quality is a cost: smaller is better.", is_flag=True)
+@option(
     "--risk",
-    callback=converted(_risk),
+    "How the qualities under several conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
+    parse=_risk,
     default="worst",
-    show_default=True,
-    help="How the qualities under several conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
 )
-@click.option("--solver", metavar="NAME", help="The solver.  [default: auto, or that of FILE]")
-@click.option(
-    "--option",
-    "options",
-    callback=converted(parse_field),
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="An option of the solver. May be repeated.",
+@option("--solver NAME", "The solver.  [default: auto, or that of FILE]")
+@option(
+    "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
 )
-@click.option("--seed", type=int, metavar="N", help="The seed of the solver.  [default: 0, or that of FILE]")
-@click.option("--rollouts", type=click.IntRange(min=1), metavar="N", help="End when the study has N rollouts.")
-@click.option("--seconds", type=float, metavar="S", help="End after S seconds of wall time.")
-@click.option("--target", type=float, metavar="H", help="End when a point is at least as good as H.")
+@option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int)
+@option("--rollouts N", "End when the study has N rollouts.", type=click.IntRange(min=1))
+@option("--seconds S", "End after S seconds of wall time.", type=float)
+@option("--target H", "End when a point is at least as good as H.", type=float)
 @executor_options
-@click.option("--time-limit", type=float, metavar="S", help="Fail a rollout that takes longer than S seconds.")
-@click.option(
+@option("--time-limit S", "Fail a rollout that takes longer than S seconds.", type=float)
+@option(
     "--racing/--no-racing",
+    "Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
     default=None,
-    help="Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
 )
-@click.option(
+@option(
     "--on-error",
+    "If the quality function raises: record the rollout as failed, or end the run.",
     type=click.Choice(["record", "raise"]),
     default="record",
-    show_default=True,
-    help="If the quality function raises: record the rollout as failed, or end the run.",
 )
-@click.option("--allow-changed-code", is_flag=True, help="Resume although the code of the problem has changed.")
+@option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True)
 def run(
     file: Path,
     scenario: Scenario,
@@ -127,21 +118,11 @@ def run(
     at_most: tuple[Constraint, ...],
     at_least: tuple[Constraint, ...],
     *,
-    minimize: bool,
-    risk: str | Risk,
     solver: str | None,
     options: tuple[tuple[str, Any], ...],
     seed: int | None,
-    rollouts: int | None,
-    seconds: float | None,
-    target: float | None,
-    executor: str,
-    workers: int | None,
-    time_limit: float | None,
-    racing: bool | None,
-    on_error: str,
     allow_changed_code: bool,
-    **problem: Any,
+    **others: Any,
 ) -> None:
     """Begin a study, or resume the one in FILE. Ctrl-C keeps the finished rollouts.
 
@@ -157,26 +138,11 @@ def run(
     if not (vary or choose):
         raise click.UsageError("nothing is varied: add --vary or --choose")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    stated = make_problem(
-        scenario, [*vary, *choose], **problem, minimize=minimize, risk=risk, constraints=[*at_most, *at_least]
-    )
-    with stated.study(
-        file,
-        solver=solver,
-        seed=seed,
-        options=settings(options) if options else None,
-        allow_changed_code=allow_changed_code,
-    ) as opened:
-        opened.run(
-            rollouts=rollouts,
-            seconds=seconds,
-            target=target,
-            executor=executor,
-            workers=workers,
-            time_limit=time_limit,
-            racing=racing,
-            on_error=on_error,
-        )
+    running = {name: others.pop(name) for name in _RUNNING}
+    stated = make_problem(scenario, [*vary, *choose], **others, constraints=[*at_most, *at_least])
+    chosen = settings(options) if options else None
+    with stated.study(file, solver=solver, seed=seed, options=chosen, allow_changed_code=allow_changed_code) as opened:
+        opened.run(**running)
         click.echo(opened.summary())
         if opened.reason == "interrupted":
             raise FailedError("the study was interrupted: the same command resumes it")
@@ -184,7 +150,7 @@ def run(
 
 @study.command()
 @_file
-@click.option("--csv", callback=output(".csv"), metavar="FILE", help="Write all points with their attributes.")
+@option("--csv FILE", "Write all points with their attributes.", parse=output(".csv"))
 def show(file: Path, csv: Path | None) -> None:
     """Show the results of a study, its waiting points and its attributes."""
     with Study.open(file) as opened:
@@ -231,7 +197,7 @@ def remove(file: Path, number: int) -> None:
 @study.command("attribute")
 @_file
 @click.argument("attribute", callback=converted(parse_field), metavar="KEY=VALUE")
-@click.option("--trial", type=int, metavar="NUMBER", help="Set it for the point of this trial, not for the study.")
+@option("--trial NUMBER", "Set it for the point of this trial, not for the study.", type=int)
 def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
     """Set an attribute of a study, or of a point."""
     with Study.open(file) as opened:

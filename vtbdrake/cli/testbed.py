@@ -15,6 +15,7 @@ from vtbdrake.cli import BadInputError, FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
     horizon_option,
+    option,
     output,
     sample_period_option,
     scenario_argument,
@@ -38,8 +39,8 @@ _MANY = 64
 
 @click.command()
 @scenario_argument
-@click.option("--match", default="", metavar="TEXT", help="Show only addresses that contain TEXT.")
-@click.option("--json", "as_json", is_flag=True, help="Print a JSON list of objects instead of a table.")
+@option("--match TEXT", "Show only addresses that contain TEXT.", default="")
+@option("--json", "Print a JSON list of objects instead of a table.", name="as_json", is_flag=True)
 def variables(scenario: Scenario, match: str, as_json: bool) -> None:
     """List the variables of a testbed.
 
@@ -77,10 +78,8 @@ def _plain(variable: Variable, context: Context) -> dict[str, Any]:
 
 @click.command()
 @scenario_argument
-@click.option(
-    "--mode", type=click.Choice(list(MODES)), default="sim", show_default=True, help="The positions of the switches."
-)
-@click.option("-o", "--output", "out", callback=output(), metavar="FILE", help="Write to FILE, not to the terminal.")
+@option("--mode", "The positions of the switches.", type=click.Choice(list(MODES)), default="sim")
+@option("-o --output FILE", "Write to FILE, not to the terminal.", name="out", parse=output())
 def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
     """Draw a testbed as SVG: DPS, switches, both worlds (Figure 4).
 
@@ -101,12 +100,12 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 @scenario_argument
 @horizon_option
 @set_option
-@click.option("--record", multiple=True, metavar="ADDRESS", help="Record a variable or output port. May be repeated.")
+@option("--record ADDRESS", "Record a variable or output port. May be repeated.", multiple=True)
 @sample_period_option
 @start_option
-@click.option("--save", callback=output(*RECORDINGS), metavar="FILE", help="Write the recording: .csv or .npz.")
-@click.option("--snapshot", callback=output(), metavar="FILE", help="Write s(t_end), for --start.")
-@click.option("--html", callback=output(".html"), metavar="FILE", help="Write an animation for any web browser.")
+@option("--save FILE", "Write the recording: .csv or .npz.", parse=output(*RECORDINGS))
+@option("--snapshot FILE", "Write s(t_end), for --start.", parse=output())
+@option("--html FILE", "Write an animation for any web browser.", parse=output(".html"))
 def rollout(
     scenario: Scenario,
     horizon: float,
