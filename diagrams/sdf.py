@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from xml.etree import ElementTree as ET
 
 from pydrake.multibody.tree import SpatialInertia
@@ -37,12 +38,25 @@ def add_joint(
     child: str,
     *,
     axis_J: str,
-    limits: tuple[float, float],
-    speed: float,
-    torque: float,
+    kind: str = "revolute",
+    limits: tuple[float, float] = (-inf, inf),
+    speed: float = inf,
+    torque: float = inf,
 ) -> ET.Element:
-    """Add a revolute joint; ``speed`` and ``torque`` are the limits of its drive."""
-    joint = ET.SubElement(model, "joint", name=name, type="revolute")
+    """Add a joint; ``speed`` and ``torque`` (a force, where it slides) are the limits of its drive.
+
+    Args:
+        model: The model that it belongs to.
+        name: Name of the joint.
+        parent: The link, or ``world``, that the joint's frame is fixed to.
+        child: The link that moves.
+        axis_J: Axis in the joint's frame, as text.
+        kind: SDFormat's type, ``revolute`` or ``prismatic``.
+        limits: Range of the position, in rad or m.
+        speed: Limit of the velocity, in rad/s or m/s.
+        torque: Limit of the drive, in N m or N; 0 for a joint without a drive.
+    """
+    joint = ET.SubElement(model, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent").text = parent
     ET.SubElement(joint, "child").text = child
     axis = ET.SubElement(joint, "axis")

@@ -1,0 +1,135 @@
+"""The cart-pole testbed: a cart that is pushed along a rail, and a pole that hangs from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import inf
+from operator import itemgetter
+
+import numpy as np
+from drake import lcmt_acrobot_u, lcmt_acrobot_x, lcmt_scope
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.framework import Diagram
+
+from vtbdrake.components.sensors import ErrorModel, JointEncoders, JointTachometers
+from vtbdrake.control import Zero
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.maps import vector_map
+from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.spline import Spline
+from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.cart_pole.dps import JOINTS, PERCEIVED, make_dps
+from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES
+
+
+def _plant(time_step: float) -> MultibodyPlantConfig:
+    # Unsampled: else, a step of the plant comes before the sensors of the same instant.
+    return MultibodyPlantConfig(time_step=time_step, use_sampled_output_ports=False)
+
+
+@dataclass
+class CartPoleScenario(Scenario):
+    """Drake's cart-pole under a plan of forces; the command ``u.plan`` = [t_begin, knots in N] is what is decided.
+
+    The pole hangs at the angle 0 and stands at pi. A mental copy simulates the same cart-pole with a time step that is
+    as long as the sample period.
+    """
+
+    plant_config: MultibodyPlantConfig = field(default_factory=lambda: _plant(0.005))
+    # The sample period of sensors and DPS, in seconds.
+    period: float = 0.02
+    # The largest force on the cart, in N: too little to swing up the pole in one go.
+    force_limit: float = 60.0
+    # The plan: its curve (see Spline), its knots, and its duration in seconds.
+    order: str = "linear"
+    knots: int = 10
+    duration: float = 1.0
+    # Errors of the sensors, exact by default; latency in periods.
+    position_errors: ErrorModel = field(default_factory=ErrorModel)
+    velocity_errors: ErrorModel = field(default_factory=ErrorModel)
+
+    def validate(self) -> None:
+        super().validate()
+        for name, expected in (("period", "positive, in s"), ("force_limit", "positive, in N")):
+            if not getattr(self, name) > 0.0:
+                raise ScenarioError(f"CartPoleScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        try:
+            self.plan()
+            for name in ("position_errors", "velocity_errors"):
+                getattr(self, name).check(f"CartPoleScenario.{name}")
+        except ValueError as error:
+            raise ScenarioError(str(error)) from None
+
+    def plan(self) -> Spline:
+        """Return the curve of a plan."""
+        return Spline(self.order, self.knots, self.duration)
+
+    def mental(self) -> CartPoleScenario:
+        """Return the scenario of the mental copy: one time step per sample, and sensors without random errors."""
+        errors = {
+            name: replace(getattr(self, name), noise=0.0, drift=0.0, dropout=0.0)
+            for name in ("position_errors", "velocity_errors")
+        }
+        return replace(self, plant_config=_plant(self.period), **errors)
+
+    def interface(self) -> Interface:
+        age = 5 * self.period
+        limit = np.full(self.knots, self.force_limit)
+        return Interface(
+            sense=[
+                Signal(
+                    "joint_position", size=JOINTS, unit="m, rad", lower=[-100.0, -1e3], upper=[100.0, 1e3], max_age=age
+                ),
+                Signal("joint_velocity", size=JOINTS, unit="m/s, rad/s", lower=-100.0, upper=100.0, max_age=age),
+            ],
+            act=[Signal("force", size=1, unit="N", lower=-self.force_limit, upper=self.force_limit, idle=0.0)],
+            commands=[
+                Signal(
+                    "plan", size=1 + self.knots, unit="s, N", lower=np.append(-inf, -limit), upper=np.append(inf, limit)
+                )
+            ],
+        )
+
+    def deployment(self) -> Deployment:
+        """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.
+
+        The cart-pole speaks the messages of Drake's acrobot, which has two joints and one drive, too; CART_POLE_PLAN
+        carries the plan.
+        """
+        joints = {"joint_position": ("theta1", "theta2"), "joint_velocity": ("theta1Dot", "theta2Dot")}
+        return Deployment(
+            protocol=Protocol(
+                sense=[vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp")],
+                act=[vector_map("CART_POLE_FORCE", lcmt_acrobot_u, {"force": "tau"}, stamp="timestamp")],
+                commands=[vector_map("CART_POLE_PLAN", lcmt_scope, {"plan": "value"})],
+            ),
+            period=self.period,
+            guards={"fallback": {"force": Zero()}},
+            pace="joint_velocity",
+        )
+
+    def make_dps(self) -> Diagram:
+        return make_dps(self.plan(), period=self.period, force_limit=self.force_limit)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        # Imported here: the DPS on the machine runs without a plant.
+        from pydrake.multibody.parsing import Parser
+
+        plant, _ = builder.add_plant(self.plant_config)
+        (instance,) = Parser(plant).AddModels(str(CART_POLE_SDF))
+        plant.Finalize()
+        joints = [plant.GetJointByName(name, instance) for name in JOINT_NAMES]
+        T = self.period
+        builder.add_sensor("joint_position", JointEncoders(plant, joints, period=T, errors=self.position_errors))
+        builder.add_sensor("joint_velocity", JointTachometers(plant, joints, period=T, errors=self.velocity_errors))
+        builder.sim_actuator("force", plant.get_actuation_input_port(instance))
+        for k, name in enumerate(JOINT_NAMES):
+            for i, (value, errors) in enumerate(
+                (("position", self.position_errors), ("velocity", self.velocity_errors))
+            ):
+                builder.believe(
+                    f"sim.sys.cart_pole.{name}.{value}",
+                    of=[PERCEIVED],
+                    by=itemgetter(JOINTS * i + k),
+                    age=(1 + errors.latency) * T,
+                )
