@@ -14,7 +14,7 @@ from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Vari
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
-from vtbdrake.state.systems import is_python, leaves
+from vtbdrake.state.systems import is_plant, is_python, leaves
 from vtbdrake.state.variables import X, check_address, suggestion
 from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake.testbed.signal import Interface
@@ -162,13 +162,16 @@ class AddressedDiagram:
         return snapshot
 
     def event_timings(self) -> tuple[tuple[float, float], ...]:
-        """Return (period, offset) in seconds of the periodic discrete updates of all systems, each pair once.
+        """Return (period, offset) in seconds of the periodic updates of all systems, each pair once.
 
-        The n-th update is at offset + n * period. Drake does not say so of a system with several such timings, nor of
-        unrestricted updates and publishing.
+        The n-th update is at offset + n * period. Of unrestricted updates, those of discrete plants are known; Drake
+        does not tell the timings of others, of publishing, nor of a system with several.
         """
-        attributes = (system.GetUniquePeriodicDiscreteUpdateAttribute() for _, system in leaves(self.diagram))
-        return tuple(sorted({(a.period_sec(), a.offset_sec()) for a in attributes if a is not None}))
+        systems = [system for _, system in leaves(self.diagram)]
+        attributes = (system.GetUniquePeriodicDiscreteUpdateAttribute() for system in systems)
+        timings = {(a.period_sec(), a.offset_sec()) for a in attributes if a is not None}
+        steps = {system.time_step() for system in systems if is_plant(system)}
+        return tuple(sorted(timings | {(step, 0.0) for step in steps if step > 0.0}))
 
     # -- addresses
 

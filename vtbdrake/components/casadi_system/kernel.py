@@ -18,7 +18,7 @@ from vtbdrake.components.casadi_system.handler import evaluator
 # casadi.SX or casadi.MX, for which CasADi's functions are overloaded one by one.
 Expression = Any
 
-_TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = {
+TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = {
     True: compiled,
     None: compiled_if_possible,
     False: lambda function: function,
@@ -44,8 +44,8 @@ class Kernel:
         self._name = casadi.Function.fix_name(name)
         self._arguments = list(arguments)
         self._y = y
-        self._translate = _TRANSLATIONS[compile]
-        self._jacobian: _Buffers | None = None
+        self._translate = TRANSLATIONS[compile]
+        self._jacobian: Buffers | None = None
         self.value = evaluator(self._buffers(self._name, y))
 
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
@@ -67,14 +67,14 @@ class Kernel:
         evaluate()
         return y.reshape(z.size, -1).T
 
-    def _buffers(self, name: str, expression: Expression) -> _Buffers:
+    def _buffers(self, name: str, expression: Expression) -> Buffers:
         function = casadi.Function(name, self._arguments, [expression])
         # A function of scalar operations cannot fail; others (a root finder, a solver) report it.
         may_fail = not function.is_a("SXFunction")
-        return _Buffers(self._translate(function), may_fail)
+        return Buffers(self._translate(function), may_fail)
 
 
-class _Buffers(threading.local):
+class Buffers(threading.local):
     """The arrays on which one thread evaluates a function.
 
     Attributes:

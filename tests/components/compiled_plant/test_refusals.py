@@ -1,0 +1,172 @@
+"""What cannot be compiled is refused by name."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    LinearSpringDamper,
+    PdControllerGains,
+    PrismaticJoint,
+    RevoluteJoint,
+    UniversalJoint,
+)
+from pydrake.systems.framework import DiagramBuilder
+
+from tests.components.compiled_plant.plants import cart_pole, inertia
+from vtbdrake.components.compiled_plant import (
+    UnsupportedPlantError,
+    compiled_world,
+    plant_dynamics,
+    plant_step,
+    world,
+)
+
+
+def two_bodies(time_step: float = 0.01) -> MultibodyPlant:
+    plant = MultibodyPlant(time_step)
+    for name in ("a", "b"):
+        body = plant.AddRigidBody(name, inertia(1.0))
+        joint = plant.AddJoint(RevoluteJoint(f"joint_{name}", plant.world_frame(), body.body_frame(), [0, 0, 1]))
+        plant.AddJointActuator(f"motor_{name}", joint)
+    return plant
+
+
+def _other_joint(plant):
+    body = plant.AddRigidBody("c", inertia(1.0))
+    plant.AddJoint(UniversalJoint("wrist", plant.world_frame(), body.body_frame()))
+
+
+def _coupler(plant):
+    plant.AddCouplerConstraint(plant.GetJointByName("joint_a"), plant.GetJointByName("joint_b"), 2.0)
+
+
+def _spring(plant):
+    a, b = plant.GetBodyByName("a"), plant.GetBodyByName("b")
+    plant.AddForceElement(LinearSpringDamper(a, np.zeros(3), b, np.ones(3), 1.0, 10.0, 0.0))
+
+
+def _controller(plant):
+    plant.GetJointActuatorByName("motor_b").set_controller_gains(PdControllerGains(p=1.0, d=0.1))
+
+
+def _weightless(plant):
+    plant.set_gravity_enabled(plant.GetBodyByName("a").model_instance(), False)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_other_joint, "the joint wrist is of type universal"),
+        (_coupler, "there are 1 constraints"),
+        (_spring, "a force element of type LinearSpringDamper"),
+        (_controller, "the actuator motor_b has a PD controller"),
+        (_weightless, "gravity is disabled for the model instances DefaultModelInstance"),
+    ],
+)
+def test_part_is_refused_by_name(change, reason):
+    plant = two_bodies()
+    change(plant)
+    plant.Finalize()
+    with pytest.raises(UnsupportedPlantError, match=reason):
+        plant_dynamics(plant, plant.CreateDefaultContext())
+
+
+def test_locked_joint_is_refused_by_name():
+    plant = cart_pole(0.01)
+    context = plant.CreateDefaultContext()
+    plant.GetJointByName("hinge").Lock(context)
+    with pytest.raises(UnsupportedPlantError, match="the joint hinge is locked"):
+        plant_dynamics(plant, context)
+
+
+def _spheres(filtered: bool):
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
+    for name in ("left", "right"):
+        body = plant.AddRigidBody(name, inertia(1.0))
+        plant.AddJoint(PrismaticJoint(f"rail_{name}", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+        plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", CoulombFriction(1.0, 1.0))
+    plant.Finalize()
+    if filtered:
+        shapes = GeometrySet(scene_graph.model_inspector().GetAllGeometryIds())
+        scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(shapes))
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    return diagram, plant, plant.GetMyContextFromRoot(root), root
+
+
+def test_bodies_that_can_collide_are_refused_by_name():
+    _diagram, plant, context, _root = _spheres(filtered=False)
+    with pytest.raises(UnsupportedPlantError, match="left and right can collide"):
+        plant_dynamics(plant, context)
+
+
+def test_bodies_that_a_filter_keeps_apart_are_accepted():
+    _diagram, plant, context, _root = _spheres(filtered=True)
+    assert plant_step(plant, context).size1_in("x") == 4
+
+
+def test_continuous_plant_has_no_step():
+    plant = cart_pole(0.0)
+    with pytest.raises(UnsupportedPlantError, match="time_step"):
+        plant_step(plant, plant.CreateDefaultContext())
+
+
+def test_tamsi_has_another_step():
+    plant = MultibodyPlant(0.01)
+    plant.AddRigidBody("stone", inertia(1.0))
+    plant.set_discrete_contact_approximation(_tamsi())
+    plant.Finalize()
+    with pytest.raises(UnsupportedPlantError, match="TAMSI"):
+        plant_step(plant, plant.CreateDefaultContext())
+
+
+def _tamsi():
+    plant_module = pytest.importorskip("pydrake.multibody.plant")
+    if not hasattr(plant_module.DiscreteContactApproximation, "kTamsi"):
+        pytest.skip("this Drake has no TAMSI")
+    return plant_module.DiscreteContactApproximation.kTamsi
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        (["pole.maas"], "did you mean 'pole.mass'"),
+        (["slider.position"], "cannot be an input"),
+        (["pole.mass", "pole.mass"], "more than once"),
+    ],
+)
+def test_unknown_input_is_an_error(inputs, message):
+    plant = cart_pole(0.0)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        plant_dynamics(plant, plant.CreateDefaultContext(), inputs=inputs)
+
+
+def test_pose_that_carries_other_frames_is_no_input():
+    plant = two_bodies()
+    stand = plant.AddFrame(FixedOffsetFrame("stand", plant.GetBodyByName("a").body_frame(), RigidTransform()))
+    top = plant.AddFrame(FixedOffsetFrame("top", stand, RigidTransform([0, 0, 1.0])))
+    for name, frame in (("c", stand), ("d", top)):
+        body = plant.AddRigidBody(name, inertia(1.0))
+        plant.AddJoint(RevoluteJoint(f"joint_{name}", frame, body.body_frame(), [0, 0, 1]))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    with pytest.raises(ValueError, match="the frame top is attached to it"):
+        plant_dynamics(plant, context, inputs=["stand.pose"])
+    assert plant_dynamics(plant, context, inputs=["top.pose"]).name_in() == ["x", "u", "top_pose"]
+
+
+def test_world_is_checked_against_its_plant(monkeypatch):
+    coarse = cart_pole(0.02)
+    wrong = plant_step(coarse, coarse.CreateDefaultContext())
+    monkeypatch.setattr(world, "plant_step", lambda plant, context, inputs: wrong)
+    plant = cart_pole(0.01)
+    with pytest.raises(ArithmeticError, match="differs"):
+        compiled_world(plant, plant.CreateDefaultContext())

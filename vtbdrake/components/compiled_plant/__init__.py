@@ -1,0 +1,17 @@
+"""A MultibodyPlant without contact as compiled functions: its dynamics, its steps, many rollouts in one call."""
+
+from vtbdrake.components.compiled_plant.dynamics import FrameMotion, PlantDynamics, plant_dynamics, plant_step
+from vtbdrake.components.compiled_plant.links import UnsupportedPlantError
+from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBatch
+from vtbdrake.components.compiled_plant.world import compiled_world
+
+__all__ = [
+    "FrameMotion",
+    "PlantDynamics",
+    "PlantRollouts",
+    "RolloutBatch",
+    "UnsupportedPlantError",
+    "compiled_world",
+    "plant_dynamics",
+    "plant_step",
+]

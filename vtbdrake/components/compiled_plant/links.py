@@ -1,0 +1,345 @@
+"""The bodies of a MultibodyPlant as the links of a tree; their numbers are read through a Context, or stay symbols."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, ForceElementIndex, Frame, Joint, ModelInstanceIndex, RigidBody
+from pydrake.systems.framework import Context
+
+from vtbdrake.state.multibody import bodies, element_address
+
+Expression = Any  # casadi.SX
+Pose = tuple[Expression, Expression]  # R, shape (3, 3), and p, shape (3, 1)
+
+REVOLUTE, PRISMATIC, WELD, FLOATING = "revolute", "prismatic", "weld", "quaternion_floating"
+
+
+class UnsupportedPlantError(ValueError):
+    """The plant has parts that cannot be compiled; the message names each of them."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A body with the joint that carries it. Its frame is M, of the joint on its side; F is the joint's other frame.
+
+    Attributes:
+        body: Index of the body.
+        parent: Number of the link that carries it; -1 is the world.
+        kind: Type name of the joint.
+        axis: Of the joint, in F and in M, shape (3, 1).
+        q: Where its positions lie in those of the plant.
+        v: Where its velocities lie in those of the plant.
+        X_PF: Pose of F in the frame of the parent.
+        X_MB: Pose of the body's own frame B in M.
+        inertia: M_BMo_M, [angular; linear], shape (6, 6).
+        damping: Of the joint, shape (nv, 1).
+        reflected_inertia: Of the joint's actuators, shape (nv, 1).
+    """
+
+    body: int
+    parent: int
+    kind: str
+    axis: Expression
+    q: slice
+    v: slice
+    X_PF: Pose
+    X_MB: Pose
+    inertia: Expression
+    damping: Expression
+    reflected_inertia: Expression
+
+
+@dataclass(frozen=True)
+class LinkTree:
+    """The links of a plant, parents first.
+
+    Attributes:
+        links: One for each body except the world.
+        symbols: The inputs, by address.
+        values: What the Context holds for them, by address, flat.
+    """
+
+    links: tuple[Link, ...]
+    symbols: dict[str, Expression]
+    values: dict[str, NDArray[np.float64]]
+
+
+def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = ()) -> LinkTree:
+    """Return the links of a finalized plant.
+
+    Args:
+        plant: The plant.
+        context: The plant's own Context.
+        inputs: Addresses within the plant of what becomes a symbol instead of a number: ``mass``, ``center_of_mass``
+            and ``inertia`` of a body, ``damping`` of a joint, ``pose`` of a frame that carries a joint, and
+            ``rotor_inertia`` of an actuator, as in `multibody_variables`.
+
+    Raises:
+        UnsupportedPlantError: The plant has contact, loops, springs, joints of other types, and so on.
+        ValueError: An input is not among the addresses, or given twice.
+    """
+    reasons = list(_unsupported(plant, context))
+    if reasons:
+        raise UnsupportedPlantError(f"the plant cannot be compiled: {'; '.join(reasons)}.")
+    return _Reader(plant, context, inputs).tree()
+
+
+class _Reader:
+    """Reads the links of one plant."""
+
+    def __init__(self, plant: MultibodyPlant, context: Context, inputs: Sequence[str]) -> None:
+        self._plant = plant
+        self._context = context
+        self._inputs = tuple(inputs)
+        self._symbols: dict[str, Expression] = {}
+        self._values: dict[str, NDArray[np.float64]] = {}
+        self._offered: set[str] = set()
+        self._links: list[Link] = []
+
+    def tree(self) -> LinkTree:
+        reflected = self._reflected_inertias()
+        number = {int(self._plant.world_body().index()): -1}
+        waiting = [self._plant.get_joint(index) for index in self._plant.GetJointIndices()]
+        while waiting:
+            known = [(int(j.parent_body().index()) in number, int(j.child_body().index()) in number) for j in waiting]
+            k = next((i for i, (parent, child) in enumerate(known) if parent != child), None)
+            if k is None:
+                names = ", ".join(joint.name() for joint in waiting)
+                raise UnsupportedPlantError(f"the plant cannot be compiled: a loop is closed by the joints {names}.")
+            joint = waiting.pop(k)
+            link = self._link(joint, number, reflected, reverse=known[k][1])
+            number[link.body] = len(self._links)
+            self._links.append(link)
+        self._check_inputs()
+        symbols = {address: self._symbols[address] for address in self._inputs}
+        return LinkTree(tuple(self._links), symbols, {address: self._values[address] for address in self._inputs})
+
+    def _link(self, joint: Joint, number: dict[int, int], reflected: dict[int, Expression], *, reverse: bool) -> Link:
+        inner, outer = joint.frame_on_parent(), joint.frame_on_child()
+        sign = 1.0
+        if reverse:
+            # Seen from its child, a joint turns or slides the other way.
+            inner, outer, sign = outer, inner, -1.0
+        kind = joint.type_name()
+        if reverse and kind == FLOATING:
+            raise UnsupportedPlantError(
+                f"the plant cannot be compiled: the parent of the floating joint {joint.name()} hangs on its child."
+            )
+        axis = np.zeros(3)
+        if kind == REVOLUTE:
+            axis = sign * np.asarray(joint.revolute_axis())
+        elif kind == PRISMATIC:
+            axis = sign * np.asarray(joint.translation_axis())
+        parent = number[int(inner.body().index())]
+        X_PF = self._frame_pose(inner)
+        if parent >= 0:
+            X_PF = _times(self._links[parent].X_MB, X_PF)
+        if kind == WELD:
+            X_FM = joint.X_FM()
+            X_PF = _times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM))
+        X_MB = _inverse(self._frame_pose(outer))
+        nv = joint.num_velocities()
+        start = joint.velocity_start() if nv else 0
+        damping = self._input(f"{self._address(joint)}.damping", joint.GetDampingVector(self._context))
+        return Link(
+            body=int(outer.body().index()),
+            parent=parent,
+            kind=kind,
+            axis=constant(axis),
+            q=slice(joint.position_start(), joint.position_start() + joint.num_positions()) if nv else slice(0, 0),
+            v=slice(start, start + nv),
+            X_PF=X_PF,
+            X_MB=X_MB,
+            inertia=self._inertia(outer.body(), X_MB),
+            damping=damping,
+            reflected_inertia=reflected.get(int(joint.index()), casadi.SX(nv, 1)),
+        )
+
+    def _inertia(self, body: RigidBody, X_MB: Pose) -> Expression:
+        """Return M_BMo_M, as a matrix."""
+        address = self._address(body)
+        M_BBo_B = body.CalcSpatialInertiaInBodyFrame(self._context)
+        p_BoBcm_B = M_BBo_B.get_com()
+        G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(p_BoBcm_B).CopyToFullMatrix3()
+        I_BBcm_B = M_BBo_B.get_mass() * G_BBcm_B
+        mass = self._input(f"{address}.mass", M_BBo_B.get_mass())
+        com = self._input(f"{address}.center_of_mass", p_BoBcm_B)
+        moments = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+        rotational = self._input(f"{address}.inertia", [I_BBcm_B[i, j] for i, j in moments])
+        if f"{address}.inertia" in self._inputs:
+            xx, yy, zz, xy, xz, yz = casadi.vertsplit(rotational)
+            I_cm = casadi.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        else:
+            # As in Drake, a body of another mass keeps its shape.
+            I_cm = mass * constant(G_BBcm_B)
+        R, p = X_MB
+        I_cm = R @ I_cm @ R.T
+        c = skew(p + R @ com)
+        return symmetric(casadi.blockcat([[I_cm - mass * (c @ c), mass * c], [mass * c.T, mass * casadi.SX.eye(3)]]))
+
+    def _frame_pose(self, frame: Frame) -> Pose:
+        """Return X_BF of a frame F on the body B."""
+        X_BF = frame.CalcPoseInBodyFrame(self._context)
+        if not isinstance(frame, FixedOffsetFrame):
+            return constant_pose(X_BF)
+        X_PF = frame.GetPoseInParentFrame(self._context)
+        address = f"{self._address(frame)}.pose"
+        if address not in self._inputs:
+            self._offered.add(address)
+            return constant_pose(X_BF)
+        if address not in self._symbols:
+            self._check_alone(frame, address)
+        value = np.concatenate([X_PF.translation(), X_PF.rotation().ToRollPitchYaw().vector()])
+        given = self._input(address, value)
+        return _times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(given[3:]), given[:3]))
+
+    def _check_alone(self, frame: FixedOffsetFrame, address: str) -> None:
+        """Refuse a pose on which the poses of further frames depend."""
+        moved = self._context.Clone()
+        frame.SetPoseInParentFrame(moved, frame.GetPoseInParentFrame(moved) @ RigidTransform([1.0, 0.0, 0.0]))
+        for index in self._plant.GetJointIndices():
+            joint = self._plant.get_joint(index)
+            for other in (joint.frame_on_parent(), joint.frame_on_child()):
+                before, after = (other.CalcPoseInBodyFrame(c).translation() for c in (self._context, moved))
+                if other.index() != frame.index() and not np.array_equal(before, after):
+                    raise ValueError(f"{address} cannot be an input: the frame {other.name()} is attached to it.")
+
+    def _reflected_inertias(self) -> dict[int, Expression]:
+        """Return the sum of the reflected inertias of each joint's actuators, by the joint's index."""
+        found: dict[int, Expression] = {}
+        for index in self._plant.GetJointActuatorIndices():
+            actuator = self._plant.get_joint_actuator(index)
+            rotor = self._input(f"{self._address(actuator)}.rotor_inertia", actuator.rotor_inertia(self._context))
+            joint = int(actuator.joint().index())
+            found[joint] = found.get(joint, 0) + actuator.gear_ratio(self._context) ** 2 * rotor
+        return found
+
+    def _input(self, address: str, value: ArrayLike) -> Expression:
+        """Return the symbol of an input, or the value itself, shape (n, 1)."""
+        array = np.asarray(value, dtype=float).ravel()
+        if not array.size:
+            return casadi.SX(0, 1)
+        self._offered.add(address)
+        if address not in self._inputs:
+            return constant(array)
+        self._values[address] = array
+        return self._symbols.setdefault(address, casadi.SX.sym(input_name(address), array.size))
+
+    def _check_inputs(self) -> None:
+        for address in self._inputs:
+            if address not in self._symbols:
+                near = difflib.get_close_matches(address, self._offered, n=1, cutoff=0.0)
+                raise ValueError(f"{address!r} cannot be an input of this plant; did you mean {near[0]!r}?")
+        names = [input_name(address) for address in self._inputs]
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ValueError(f"the inputs need names of their own, but {', '.join(doubled)} is given more than once.")
+
+    def _address(self, element: Any) -> str:
+        return element_address(self._plant, element, lambda instance: "")
+
+
+def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+    """Yield what the plant has and the compiled one would not."""
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if joint.type_name() not in (REVOLUTE, PRISMATIC, WELD, FLOATING):
+            yield f"the joint {joint.name()} is of type {joint.type_name()}"
+        elif joint.num_velocities() and plant.time_step() > 0.0 and joint.is_locked(context):
+            yield f"the joint {joint.name()} is locked"
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        if actuator.has_controller():
+            yield f"the actuator {actuator.name()} has a PD controller"
+    if plant.num_constraints():
+        yield f"there are {plant.num_constraints()} constraints between bodies or joints"
+    if plant.deformable_model().num_bodies():
+        yield f"there are {plant.deformable_model().num_bodies()} deformable bodies"
+    for k in range(1, plant.num_force_elements()):
+        yield f"there is a force element of type {type(plant.get_force_element(ForceElementIndex(k))).__name__}"
+    grounded = [body for body in bodies(plant) if not plant.is_gravity_enabled(body.model_instance())]
+    if grounded and np.any(plant.gravity_field().gravity_vector()):
+        instances = {plant.GetModelInstanceName(ModelInstanceIndex(body.model_instance())) for body in grounded}
+        yield f"gravity is disabled for the model instances {', '.join(sorted(instances))}"
+    yield from _contacts(plant, context)
+
+
+def _contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+    """Yield the pairs of bodies that may touch each other."""
+    port = plant.get_geometry_query_input_port()
+    if not plant.num_collision_geometries() or not port.HasValue(context):
+        return
+    inspector = port.Eval(context).inspector()
+    body_of = {
+        geometry: body.name()
+        for body in (plant.world_body(), *bodies(plant))
+        for geometry in plant.GetCollisionGeometriesForBody(body)
+    }
+    pairs = {
+        tuple(sorted((body_of[a], body_of[b])))
+        for a, b in inspector.GetCollisionCandidates()
+        if a in body_of and b in body_of
+    }
+    for first, second in sorted(pairs):
+        yield f"{first} and {second} can collide (exclude them by a CollisionFilterDeclaration)"
+
+
+# -- small algebra, which keeps structural zeros: they cost nothing later
+
+
+def constant(values: ArrayLike) -> Expression:
+    """Return numbers as an expression without structural zeros; what rounding left of a zero is zero."""
+    array = np.asarray(values, dtype=float)
+    return casadi.sparsify(casadi.SX(casadi.DM(np.where(np.abs(array) < 1e-15, 0.0, array))))
+
+
+def constant_pose(X_AB: RigidTransform) -> Pose:
+    """Return a pose of numbers."""
+    return constant(X_AB.rotation().matrix()), constant(X_AB.translation())
+
+
+def skew(a: Expression) -> Expression:
+    """Return the matrix [a] with [a] b = a x b."""
+    return casadi.sparsify(casadi.skew(casadi.densify(a)))
+
+
+def symmetric(M: Expression) -> Expression:
+    """Return M, whose lower half is not computed but copied."""
+    return casadi.sparsify(casadi.triu2symm(casadi.triu(M)))
+
+
+def roll_pitch_yaw(angles: Expression) -> Expression:
+    """Return R of the angles about the fixed axes x, y and z, one after the other, as in Drake's RollPitchYaw."""
+    roll, pitch, yaw = casadi.vertsplit(angles)
+    x, y, z = (constant(axis) for axis in np.eye(3))
+    return rotation(z, yaw) @ rotation(y, pitch) @ rotation(x, roll)
+
+
+def rotation(axis: Expression, angle: Expression) -> Expression:
+    """Return R of a turn about a unit vector, by Rodrigues' formula."""
+    along = axis @ axis.T
+    across = casadi.sparsify(casadi.SX.eye(3) - along)
+    return casadi.sparsify(along + casadi.cos(angle) * across + casadi.sin(angle) * skew(axis))
+
+
+def input_name(address: str) -> str:
+    """Return the name of an input as an argument of a casadi.Function, in which dots are not allowed."""
+    return casadi.Function.fix_name(address)
+
+
+def _times(X_AB: Pose, X_BC: Pose) -> Pose:
+    return X_AB[0] @ X_BC[0], X_AB[1] + X_AB[0] @ X_BC[1]
+
+
+def _inverse(X_AB: Pose) -> Pose:
+    R, p = X_AB
+    return R.T, -(R.T @ p)
