@@ -17,6 +17,7 @@ from tests.control.scripted import Servo as ServoSystem
 from tests.control.slow import SlowScenario, chaotic, picky
 from tests.recording.seeing import HEIGHT, WIDTH, SeeingScenario, brightness, picture
 from tests.recording.servo import Servo
+from tests.testbed.test_dps_state import PlannedScenario
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.bridge import LcmBridge
@@ -340,6 +341,28 @@ def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[.
     report = replay(log, DpsAlone(scenario))
     assert report.identical and report.digests == 60, report
     assert len(np.unique(report.actuation["velocity"], axis=0)) > 10
+
+
+def test_slow_part_that_samples_the_dps_is_replayed(tmp_path: Path) -> None:
+    scenario = PlannedScenario(period=0.004, latency=0.003)
+    clock = SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, lambda t: {"position": [np.sin(300.0 * t)]})
+    runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock)
+    runtime.cycle()
+    runtime.switch("real")
+    with Recorder(runtime, tmp_path / "run.lcm", digest_period=PERIOD):
+        for _ in range(40):
+            runtime.slow_parts.wait(60.0)
+            runtime.cycle()
+            clock.advance(PERIOD)
+    runtime.close()
+    log = read_log(tmp_path / "run.lcm")
+    results = [change.values["dps.planner"] for _, change in log.changes if change.kind == "result"]
+    # The planner has seen its own last decision: the digest of the state differs from sample to sample.
+    assert len({result["seen"][1] for result in results if "seen" in result}) >= 8
+    for target in (None, DpsAlone(scenario)):
+        report = replay(log, target)
+        assert report.identical and report.digests == 40, report
 
 
 SCENARIO = SeeingScenario()

@@ -30,7 +30,7 @@ class SlowStatistics:
     """Statistics of a slow part beside the loop."""
 
     results: int = 0  # the number of results that arrived in time
-    missed: int = 0  # the number of results that were declared missing
+    missed: int = 0  # the number of results that were declared missing or that the function did not have (None)
     late: int = 0  # the number of results that arrived after that, and were not used
     errors: int = 0  # the number of calls of its function that raised an exception
     restarts: int = 0  # the number of times its worker was replaced, because it died or did not answer
@@ -172,12 +172,13 @@ class _Part:
                 self._fail(tick, answer)
 
     def _use(self, tick: int, arrays: Arrays) -> None:
+        memory, outputs = split_memory(arrays)
         if tick in self._waiting:
-            self.statistics.results += 1
+            self.statistics.results += bool(outputs)
+            self.statistics.missed += not outputs
             self._deliver(tick, arrays)
         else:
-            self.statistics.late += 1
-            memory, _ = split_memory(arrays)
+            self.statistics.late += bool(outputs)
             if memory:
                 self._deliver(tick, memory)
 

@@ -76,6 +76,7 @@ def compute(supervisor: FrameConnection, function: bytes) -> None:
         function: A `SlowFunction`, pickled by cloudpickle.
     """
     evaluate = pickle.loads(function)
+    evaluate.prepare()
     supervisor.send(*pack((READY, None)))
     while True:
         tick, arrays = unpack(supervisor.receive())

@@ -516,7 +516,9 @@ class _BatchReplay(_Replay):
         super().__init__(log, target, {}, ())
 
     def _new_context(self) -> Context:
-        return self._diagram.CreateDefaultContext()
+        context = self._diagram.CreateDefaultContext()
+        self._target.attach(context)
+        return context
 
     def _new_simulator(self) -> Simulator:
         simulator = Simulator(self._diagram, self._context)

@@ -16,9 +16,11 @@ from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_plant, is_python, leaves
 from vtbdrake.state.variables import X, check_address, suggestion
+from vtbdrake.testbed.dps_state import DpsReader
 from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake.testbed.signal import Interface
-from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
+from vtbdrake.testbed.slow_part import SlowPart, slow_parts
+from vtbdrake.testbed.switch import BOARD, COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -78,6 +80,11 @@ class AddressedDiagram:
             skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
             extra=[clock, *extra],
         )
+        self._sampling = _sampling_part(diagram)
+        if self._sampling is not None:
+            commands = [variable for address, variable in self._variables.items() if address.startswith(COMMAND)]
+            readers = {variable.address.removeprefix(COMMAND): variable.get for variable in commands}
+            self._sampling.sample_dps_by(DpsReader(self.dps_layout, readers))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"
@@ -90,7 +97,20 @@ class AddressedDiagram:
         if self.simulator_config.use_error_control:
             # Drake uses it to find the time of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
+        self.attach(context)
         return context
+
+    def attach(self, context: Context) -> None:
+        """Give the slow part that samples the state of the DPS access to it, as `default_context` and `simulator` do.
+
+        It is for a context that was made in another way: a Clone, or the context of a Diagram around this one. Without
+        such a slow part, it does nothing.
+
+        Args:
+            context: A root context of this diagram, or of a diagram that holds it.
+        """
+        if self._sampling is not None:
+            self._sampling.attach(context)
 
     def check_context(self, context: Context) -> None:
         """Reject a context that is not the root context of this diagram, or of a diagram that holds it.
@@ -99,12 +119,19 @@ class AddressedDiagram:
             ValueError: It is another diagram's, or that of a part.
         """
         try:
-            self.diagram.ValidateContext(self.diagram.GetMyContextFromRoot(context))
+            self._validate(context)
         except (RuntimeError, TypeError) as error:
             raise ValueError(
                 "this is no context of this testbed, but of another one (or another build, or of a part), or none at "
                 "all: make one with default_context(); a snapshot takes a state from one testbed to another"
             ) from error
+
+    def _validate(self, context: Context) -> None:
+        try:
+            # pydrake keeps a context alive for ever if it is the result of GetMyContextFromRoot on itself.
+            self.diagram.ValidateContext(context)
+        except (RuntimeError, TypeError):
+            self.diagram.ValidateContext(self.diagram.GetMyContextFromRoot(context))
 
     def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
         """Return a new Drake Simulator with the integrator of ``simulator_config``.
@@ -120,6 +147,7 @@ class AddressedDiagram:
         if context is None:
             context = self.default_context()
         self.check_context(context)
+        self.attach(context)
         kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
         simulator = kind(self.diagram, context)
         self._give_integrator(simulator)
@@ -287,6 +315,16 @@ def is_dps(path: str) -> bool:
 
 def _is_no_board(path: str) -> bool:
     return path != BOARD
+
+
+def _sampling_part(diagram: Diagram) -> SlowPart | None:
+    found = {path: part for path, part in slow_parts(diagram).items() if part.samples_dps}
+    if len(found) > 1:
+        # The sample of the one would hold those of the other that are under way, and so on.
+        raise ValueError(
+            f"a DPS has one slow part that samples its state at most, not {len(found)}: {', '.join(found)}"
+        )
+    return next(iter(found.values()), None)
 
 
 def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:

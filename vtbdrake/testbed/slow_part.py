@@ -15,6 +15,7 @@ from vtbdrake.state import Codec, discrete_state
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.declarations import NO_DICT, weakly
 from vtbdrake.state.systems import leaves
+from vtbdrake.testbed.dps_state import DPS_STATE_CODEC, DpsReader, RootReference
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -33,10 +34,10 @@ class SlowFunction:
     The arrays of a value are named ``<name>`` or, where its codec makes several, ``<name>.<part>``.
 
     Attributes:
-        function: the user's, see `SlowPart`.
-        inputs, outputs: the codecs, by port.
-        memory: that of the memory, under its name; empty if there is none.
-        makes: the names of all arrays of a result.
+        function: The user's, see `SlowPart`.
+        inputs, outputs: The codecs, by port.
+        memory: That of the memory, under its name; empty if there is none.
+        makes: The names of all arrays of a result.
     """
 
     function: Callable[..., Any]
@@ -48,23 +49,35 @@ class SlowFunction:
     def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
         """Return the arrays of the outputs and the memory, for those of the inputs and the memory.
 
+        If the function returns None for the outputs, there is no result, and no arrays of outputs.
+
         Raises:
-            SlowPartError: the function did not return what it declares. Its own exceptions pass.
+            SlowPartError: The function did not return what it declares. Its own exceptions pass.
         """
         codecs = {**self.inputs, **self.memory}
         result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
+        if result is None:
+            return {}
         remembered = {}
         if self.memory:
             if not (isinstance(result, tuple) and len(result) == 2):
                 raise SlowPartError(f"a slow part with a memory returns (outputs, memory), not {result!r}")
             result, memory = result
             remembered = encode({MEMORY: memory}, self.memory)
+            if result is None:
+                return remembered
         made = encode(self._by_name(result), self.outputs) | remembered
         if made.keys() != self.makes:
             raise SlowPartError(
                 f"a result's codecs make the arrays {', '.join(sorted(self.makes))} at first, and now {', '.join(made)}"
             )
         return made
+
+    def prepare(self) -> None:
+        """Call the method ``prepare`` of the user's function, if it has one."""
+        prepare = getattr(self.function, "prepare", None)
+        if prepare is not None:
+            prepare()
 
     def _by_name(self, outputs: Any) -> Mapping[str, Any]:
         if not isinstance(outputs, Mapping) and len(self.outputs) == 1:
@@ -79,7 +92,7 @@ def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, 
     """Return the values as read-only arrays of their own.
 
     Raises:
-        SlowPartError: a value is not of its codec's type.
+        SlowPartError: A value is not of its codec's type.
     """
     arrays = {}
     for name, codec in codecs.items():
@@ -129,9 +142,9 @@ class Work:
     """The state of one sample.
 
     Attributes:
-        tick: its number.
-        status: waiting, done or missing.
-        arrays: of the inputs while it waits, of the outputs when it is done.
+        tick: Its number.
+        status: Waiting, done or missing.
+        arrays: Of the inputs while it waits, of the outputs when it is done.
     """
 
     tick: int
@@ -144,9 +157,9 @@ class Progress:
     """The samples, results and memory of a slow part: immutable, and so shared by all copies of a context.
 
     Attributes:
-        shown: the arrays of the abstract outputs.
-        memory: those of the memory.
-        under_way: the samples whose results are not due yet, in order.
+        shown: The arrays of the abstract outputs.
+        memory: Those of the memory.
+        under_way: The samples whose results are not due yet, in order.
     """
 
     shown: Arrays
@@ -198,7 +211,8 @@ MOST_UNDER_WAY = 16
 _EARLY = 1e-8  # s
 _SHORTEST = 1e-6  # s
 _SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
-_RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED)
+_REQUEST, _TAKEN, _DPS = "request", "taken", "dps"
+_RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED, _REQUEST, _TAKEN, _DPS)
 
 
 class SlowPart(LeafSystem):
@@ -209,11 +223,14 @@ class SlowPart(LeafSystem):
         name: SlowPart
         input_ports:
         - <input>
+        - request (only with ``on_request``)
+        - dps (only with ``samples_dps``; filled by `AddressedDiagram.attach`)
         output_ports:
         - <output>
         - sampled_at (s; when the inputs were sampled that the outputs belong to, at first -inf)
         - valid (1 if the result that was due last was there, else 0)
         - missed (how many were not)
+        - taken (only with ``on_request``: the request that was taken last, at first 0)
 
     At t_k = offset + k period it samples its inputs. From t_k + latency on, its outputs show ``function`` of them,
     also to systems that are updated at that very instant. Until the first result they show ``initial``.
@@ -221,29 +238,38 @@ class SlowPart(LeafSystem):
     In a simulation, the function is computed when its result is due. A runtime computes it in another process, and
     delivers the result with `deliver` at any time before. If a result is declared missing, the outputs stay unchanged.
     A result that has neither arrived nor been declared missing is computed here, so that a copy of a running context
-    can continue without a runtime.
+    can continue without a runtime. A function that returns None has no result: it is missing.
+
+    On request, it samples its inputs at the first t_k at which the request is neither 0 nor the one that was taken
+    last, and no other one is being worked on. A request that is still there when another one is done is taken then.
 
     All its memory lies in its context, as arrays: the samples and results under way, latency / period of them, and
     the memory.
 
     Args:
         function: ``function(**inputs)`` returns the outputs by name, or, if there is one only, its value. It depends
-            on nothing else, changes nothing, and travels by cloudpickle.
-        inputs: by name, the size of a vector port, or a value like those of an abstract one.
-        outputs: likewise.
-        period, latency, offset: in seconds. The latency may be longer than the period.
-        initial: outputs until the first result; by default zeros, and the values given in ``outputs``.
-        memory: what the function remembers from one call to the next, at first: it is the argument ``memory``, and
+            on nothing else, changes nothing, and travels by cloudpickle. If it has a method ``prepare``, the process
+            beside a loop calls it once, before the first sample; a simulation does not.
+        inputs: By name, the size of a vector port, or a value like those of an abstract one.
+        outputs: Likewise.
+        period, latency, offset: In seconds. The latency may be longer than the period.
+        initial: Outputs until the first result; by default zeros, and the values given in ``outputs``.
+        memory: What the function remembers from one call to the next, at first: it is the argument ``memory``, and
             the function returns ``(outputs, memory)``. A call begins with the memory of the last one whose result has
             come, be it too late to be shown.
-        codecs: by port name or ``memory``, how values become arrays, where `codec_of` has no codec.
-        patience: after how many latencies without an answer a runtime ends the other process, and starts another.
+        on_request: Whether it works on request only. The function gets the ``request``, (1,).
+        samples_dps: Whether the function gets ``dps``, the state of the whole DPS as a `DpsState`, too. A DPS has one
+            such part at most, which works on one sample at a time.
+        codecs: By port name or ``memory``, how values become arrays, where `codec_of` has no codec.
+        patience: After how many latencies without an answer a runtime ends the other process, and starts another.
 
     Attributes:
-        function: from arrays to arrays, see `SlowFunction`.
+        function: From arrays to arrays, see `SlowFunction`.
+        samples_dps: See above.
 
     Raises:
-        ValueError: a name or a time is impossible, more than 16 samples would be under way, or a value has no codec.
+        ValueError: A name or a time is impossible, more than 16 samples would be under way (or, of the state of the
+            DPS, more than one), or a value has no codec.
     """
 
     __slots__ = NO_DICT
@@ -259,16 +285,27 @@ class SlowPart(LeafSystem):
         offset: float = 0.0,
         initial: Mapping[str, Any] | None = None,
         memory: Any = None,
+        on_request: bool = False,
+        samples_dps: bool = False,
         codecs: Mapping[str, Codec] | None = None,
         patience: float = 20.0,
     ) -> None:
         super().__init__()
         _check_times(period, latency, offset, patience)
+        most = 1 if samples_dps else MOST_UNDER_WAY
+        if not on_request:
+            _check_under_way(period, latency, offset, most)
         models = {**inputs, **outputs, **({} if memory is None else {MEMORY: memory})}
-        _check_names(inputs, outputs, initial or {}, {name: models.get(name) for name in codecs or {}})
+        special = {**({_REQUEST: 1} if on_request else {}), **({_DPS: RootReference()} if samples_dps else {})}
+        _check_names(inputs, outputs, initial or {}, {name: models.get(name) for name in codecs or {}}, bool(special))
         self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
         known = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
         taken = {name: known[name] for name in inputs}
+        if on_request:
+            inputs = {**inputs, _REQUEST: 1}
+            taken[_REQUEST] = array_codec((1,))
+        if samples_dps:
+            taken[_DPS] = DPS_STATE_CODEC
         made = {name: known[name] for name in outputs}
         remembered = {MEMORY: known[MEMORY]} if MEMORY in known else {}
         first = {name: np.zeros(model) if _is_size(model) else model for name, model in outputs.items()}
@@ -276,9 +313,13 @@ class SlowPart(LeafSystem):
         remembers = encode({MEMORY: memory}, remembered)
         self.function = SlowFunction(function, taken, made, remembered, frozenset({*shown, *remembers}))
         self._inputs = {name: self._declare_input(name, model) for name, model in inputs.items()}
+        self._request = self._inputs.get(_REQUEST)
+        self.samples_dps = samples_dps
+        self._root = self._declare_input(_DPS, RootReference()) if samples_dps else None
+        self._read_dps: DpsReader | None = None
         sizes = {name: model for name, model in outputs.items() if _is_size(model)}
         self._vectors = {name: self.DeclareDiscreteState(shown.pop(name)) for name in sizes}
-        told = {_SAMPLED_AT: -inf, _VALID: 0.0, _MISSED: 0.0}
+        told = {_SAMPLED_AT: -inf, _VALID: 0.0, _MISSED: 0.0, **({_TAKEN: 0.0} if on_request else {})}
         self._told = {name: self.DeclareDiscreteState([value]) for name, value in told.items()}
         self._progress = self.DeclareAbstractState(Value(Progress(shown, remembers)))
         for name, model in outputs.items():
@@ -291,6 +332,7 @@ class SlowPart(LeafSystem):
             discrete_state(_SAMPLED_AT, self._told[_SAMPLED_AT], unit="s"),
             discrete_state(_VALID, self._told[_VALID], bounds=(0.0, 1.0)),
             discrete_state(_MISSED, self._told[_MISSED], bounds=(0.0, inf)),
+            *(discrete_state(name, self._told[name]) for name in (_TAKEN,) if on_request),
         )
         self.codecs = {int(self._progress): PROGRESS_CODEC}
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, max(0.0, offset - _EARLY), self._sample)
@@ -322,10 +364,29 @@ class SlowPart(LeafSystem):
         progress: Progress = value.get_value()
         tick = round((context.get_time() - self.offset) / self.period)
         # After an exception in one of them, the events of an instant are repeated.
-        if progress.find(tick) is None:
+        if progress.find(tick) is None and self._is_wanted(context, progress):
             sample = {name: port.Eval(context) for name, port in self._inputs.items()}
+            if self._read_dps is not None:
+                sample[_DPS] = self._read_dps(self._root_of(context))
+            if self._request is not None:
+                self._take_request(context, state)
             work = Work(tick, WAITING, encode(sample, self.function.inputs))
             value.set_value(replace(progress, under_way=(*progress.under_way, work)))
+
+    def _is_wanted(self, context: Context, progress: Progress) -> bool:
+        if self._request is None:
+            return True
+        request, taken = self._request.Eval(context)[0], context.get_discrete_state(self._told[_TAKEN]).value()[0]
+        return abs(request) > 0.0 and request != taken and not progress.under_way  # NaN is no request.
+
+    def _take_request(self, context: Context, state: State) -> None:
+        assert self._request is not None
+        state.get_mutable_discrete_state().set_value(int(self._told[_TAKEN]), self._request.Eval(context))
+
+    def _root_of(self, context: Context) -> Context:
+        assert self._root is not None
+        reference: RootReference = self._root.Eval(context) if self._root.HasValue(context) else RootReference()
+        return reference.find(self, context)
 
     def _show(self, context: Context, state: State) -> None:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
@@ -351,6 +412,21 @@ class SlowPart(LeafSystem):
         for index, number in numbers.items():
             state.get_mutable_discrete_state().set_value(int(index), number)
         value.set_value(progress)
+
+    # -- the state of the whole DPS, for a part that samples it
+
+    def sample_dps_by(self, read: DpsReader) -> None:
+        """Set how the state of the DPS is read; the Diagram that is ready calls it once."""
+        self._read_dps = read
+
+    def attach(self, context: Context) -> None:
+        """Make the state of the DPS in ``context`` known to this part; see `AddressedDiagram.attach`.
+
+        Args:
+            context: A root context of the whole Diagram.
+        """
+        assert self._root is not None
+        self._root.FixValue(self.GetMyMutableContextFromRoot(context), Value(RootReference(context)))
 
     # -- results from outside
 
@@ -424,17 +500,30 @@ def _check_times(period: float, latency: float, offset: float, patience: float) 
             raise ValueError(f"the {name} of a slow part is finite, and at least {_SHORTEST:g}, not {value}")
     if not 0.0 <= offset < inf:
         raise ValueError(f"a slow part begins at a finite time that is not negative, not at {offset} s")
-    if ceil(latency / period) > MOST_UNDER_WAY:
+
+
+def _check_under_way(period: float, latency: float, offset: float, most: int) -> None:
+    if ceil(latency / period) > most:
+        what = "a slow part" if most > 1 else "a slow part that samples the state of the DPS"
         raise ValueError(
-            f"with a period of {period:g} s and a latency of {latency:g} s, {ceil(latency / period)} samples of a slow "
-            f"part would be under way; choose a period of at least {latency / MOST_UNDER_WAY:g} s"
+            f"with a period of {period:g} s and a latency of {latency:g} s, {ceil(latency / period)} samples of {what} "
+            f"would be under way; choose a period of at least {latency / most:g} s"
+        )
+    if most == 1 and offset > 0.0 and latency >= period:
+        raise ValueError(
+            f"a slow part that samples the state of the DPS at an offset of {offset:g} s needs a period longer than "
+            f"its latency of {latency:g} s, so that a result is shown before the next sample"
         )
 
 
 def _check_names(
-    inputs: Mapping[str, Any], outputs: Mapping[str, Any], initial: Mapping[str, Any], coded: Mapping[str, Any]
+    inputs: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+    initial: Mapping[str, Any],
+    coded: Mapping[str, Any],
+    special: bool,
 ) -> None:
-    if not inputs or not outputs:
+    if not (inputs or special) or not outputs:
         raise ValueError("a slow part has at least one input and one output")
     for name, model in [*inputs.items(), *outputs.items()]:
         if not name.isidentifier() or name in _RESERVED:

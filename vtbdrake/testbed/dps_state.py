@@ -1,0 +1,102 @@
+"""The state of the whole DPS, as a slow part of it samples it."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, LeafSystem
+
+from vtbdrake.state import Codec
+from vtbdrake.state.layout import FlatState, StateLayout
+
+
+@dataclass(frozen=True, eq=False)
+class DpsState:
+    """The state of a DPS at one instant, before the updates of that instant.
+
+    Attributes:
+        time: In seconds.
+        contents: State and parameters of the DPS's systems.
+        commands: The commands u that are set from outside, by name.
+    """
+
+    time: float
+    contents: FlatState
+    commands: Mapping[str, np.ndarray]
+
+
+def _encode(state: DpsState) -> dict[str, np.ndarray]:
+    names = np.frombuffer("\n".join(state.contents.names).encode(), dtype=np.uint8)
+    numbers = {"time": np.array(state.time), "names": names, "numbers": state.contents.numbers}
+    commands = {f"u.{name}": value for name, value in state.commands.items()}
+    return numbers | commands | {f"abstract.{key}": array for key, array in state.contents.abstract.items()}
+
+
+def _decode(arrays: Mapping[str, np.ndarray]) -> DpsState:
+    names = tuple(arrays["names"].tobytes().decode().split("\n"))
+    contents = FlatState(names, arrays["numbers"], _below("abstract.", arrays))
+    return DpsState(arrays["time"].item(), contents, _below("u.", arrays))
+
+
+def _below(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+
+
+DPS_STATE_CODEC = Codec(_encode, _decode)
+
+
+class DpsReader:
+    """Reads the state of a DPS in root contexts of its Diagram.
+
+    Args:
+        layout: That of the DPS's systems.
+        commands: Reads the commands u that are set from outside, by name.
+    """
+
+    def __init__(self, layout: StateLayout, commands: Mapping[str, Callable[[Context], Any]]) -> None:
+        self._layout = layout
+        self._commands = dict(commands)
+
+    def __call__(self, root: Context) -> DpsState:
+        commands = {name: np.array(read(root), dtype=float) for name, read in self._commands.items()}
+        return DpsState(root.get_time(), self._layout.take(root), commands)
+
+
+class RootReference:
+    """Leads from the context of one system to the root context, which Drake does not show to a system.
+
+    It is the value of an input port of that system. A Clone of the root context shares it, which is noticed.
+
+    Args:
+        root: The root context, which is not kept alive; None is a reference to nothing.
+    """
+
+    def __init__(self, root: Context | None = None) -> None:
+        self._find: Callable[[], Context | None] = weakref.ref(root) if root is not None else lambda: None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RootReference:
+        return self
+
+    def find(self, system: LeafSystem, context: Context) -> Context:
+        """Return the root context.
+
+        Args:
+            system: The system.
+            context: Its own context.
+
+        Raises:
+            ValueError: ``context`` is not part of the root context.
+        """
+        root = self._find()
+        # There is one Python object for one context of Drake's, as long as that object is alive.
+        if root is None or system.GetMyContextFromRoot(root) is not context:
+            raise ValueError(
+                f"{system.GetSystemPathname()} samples the state of the whole DPS, which it does not find from this "
+                "context (a Clone, or one that Drake has made): make the context with testbed.default_context(), or "
+                "the simulator with testbed.simulator(context)"
+            )
+        return root
