@@ -13,6 +13,7 @@ from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 from vtbdrake.optimization.study_file import Outcome, RolloutKey
+from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.derivative import DerivativeRunner
 from vtbdrake.rollout.runner import split
 from vtbdrake.rollout.task import FAILED
@@ -49,7 +50,7 @@ class Evaluator:
     def __init__(
         self,
         problem: Problem,
-        known: Mapping[RolloutKey, Outcome],
+        known: Mapping[RolloutKey, Outcome | RolloutResult],
         run: Callable[[Sequence[RolloutKey]], None],
         *,
         racing: bool = False,

@@ -1,3 +1,9 @@
 """The public names for reasoning."""
 
+from vtbdrake.reasoning.decision import Candidate as Candidate
+from vtbdrake.reasoning.decision import Decision as Decision
+from vtbdrake.reasoning.decision import Health as Health
+from vtbdrake.reasoning.reasoner import Budget as Budget
+from vtbdrake.reasoning.reasoner import Reasoner as Reasoner
+from vtbdrake.reasoning.reasoner import ReasonerError as ReasonerError
 from vtbdrake.reasoning.trajectory import Trajectory as Trajectory

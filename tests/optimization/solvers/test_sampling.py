@@ -44,7 +44,7 @@ def test_predictive_sampling_stays_at_the_best_point_so_far():
 def test_cem_takes_mean_and_deviation_of_the_elites_of_a_slope(elites):
     # The best share of a normal distribution is a truncated one: mean sigma phi(z) / share.
     z = norm.isf(elites)
-    points = second_batch("CEM", lambda p: -p[0], population=MANY, sigma=3.0, elites=elites)
+    points = second_batch("CEM", lambda p: -p[0], population=MANY, sigma=3.0, elites=elites, smoothing=1.0)
     assert points[0, 0] == pytest.approx(3.0 * norm.pdf(z) / elites, rel=0.03)
     assert points.std() == pytest.approx(3.0 * truncnorm.std(z, np.inf), rel=0.03)
 
@@ -52,13 +52,15 @@ def test_cem_takes_mean_and_deviation_of_the_elites_of_a_slope(elites):
 def test_cem_shrinks_about_the_minimum_of_a_parabola():
     # Elites of x^2 about 0 are the points with |x| < z, symmetrical.
     z = norm.ppf(0.625)
-    points = second_batch("CEM", lambda p: p[0] ** 2, population=MANY, sigma=3.0, elites=0.25, sigma_min=0.0)
+    points = second_batch(
+        "CEM", lambda p: p[0] ** 2, population=MANY, sigma=3.0, elites=0.25, sigma_min=1e-6, smoothing=1.0
+    )
     assert points[0, 0] == pytest.approx(0.0, abs=0.05)
     assert points.std() == pytest.approx(3.0 * truncnorm.std(-z, z), rel=0.03)
 
 
 def test_cem_with_smoothing_goes_a_part_of_the_way():
-    whole = second_batch("CEM", lambda p: -p[0], population=50, sigma=3.0)
+    whole = second_batch("CEM", lambda p: -p[0], population=50, sigma=3.0, smoothing=1.0)
     half = second_batch("CEM", lambda p: -p[0], population=50, sigma=3.0, smoothing=0.5)
     assert half[0, 0] == pytest.approx(0.5 * whole[0, 0])
 

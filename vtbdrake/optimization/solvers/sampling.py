@@ -1,7 +1,7 @@
 """Sampling-based predictive control as solvers: predictive sampling, the cross-entropy method, MPPI.
 
-All three draw each batch from a normal distribution over the unit cube, N(mu, diag(sigma)^2), clip it to the cube, and
-move mu to where points are good. They need few points per batch, no derivatives, and take noise and discontinuities.
+All three draw each batch from a normal distribution over the unit cube, N(mu, diag(sigma)^2), and move mu to where the
+points are good. They need few points per batch, no derivatives, and take noise and discontinuities.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from vtbdrake.optimization.solvers.evolution import default_population
 from vtbdrake.optimization.solvers.solver import (
@@ -53,9 +54,12 @@ class SamplingSolver(Solver):
         self._U = np.empty((0, search.size))
 
     def _next(self) -> list[Point]:
-        noise = self._generator.standard_normal((self.population - 1, self.search.size))
-        self._U = np.clip(np.vstack([self._mu, self._mu + self._sigma * noise]), 0.0, 1.0)
+        self._U = np.vstack([self._mu, self._draw((self.population - 1, self.search.size))])
         return [self.search.point(u) for u in self._U]
+
+    def _draw(self, shape: tuple[int, int]) -> np.ndarray:
+        """Return points of the distribution, clipped to the unit cube."""
+        return np.clip(self._mu + self._sigma * self._generator.standard_normal(shape), 0.0, 1.0)
 
     def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
         if any(evaluation.usable for evaluation in asked):
@@ -85,7 +89,7 @@ class PredictiveSampling(SamplingSolver):
     Howell, T. et al. (2022): Predictive Sampling: Real-time Behaviour Synthesis with MuJoCo, arXiv:2212.00541.
     """
 
-    def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.15) -> None:
+    def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.1) -> None:
         super().__init__(search, name=name, population=population, sigma=sigma)
         self._best: Evaluation | None = None
 
@@ -100,8 +104,9 @@ class PredictiveSampling(SamplingSolver):
 class Cem(SamplingSolver):
     """The cross-entropy method: the normal distribution of the best points of each batch.
 
-    Of the K best points (elites) of a batch, by Deb's rule, with their mean m and standard deviation s per coordinate:
-    mu <- (1 - a) mu + a m, sigma <- max((1 - a) sigma + a s, sigma_min).
+    The distribution is truncated to the unit cube. The elites are the K best points, by Deb's rule, of a batch and the
+    best point before it. With their mean m and standard deviation s, per coordinate: mu <- (1 - a) mu + a m,
+    sigma <- max((1 - a) sigma + a s, sigma_min).
 
     Args:
         search: see `SamplingSolver`.
@@ -123,26 +128,35 @@ class Cem(SamplingSolver):
         name: str,
         population: int | None = None,
         sigma: float = 0.3,
-        elites: float = 0.25,
-        smoothing: float = 1.0,
+        elites: float = 0.34,
+        smoothing: float = 0.7,
         sigma_min: float = 0.005,
     ) -> None:
         super().__init__(search, name=name, population=population, sigma=sigma)
         for option, value in (("elites", elites), ("smoothing", smoothing)):
             if not 0.0 < value <= 1.0:
                 raise SolverError(f"{option} of {name} lies in (0, 1], unlike {value}")
-        if not sigma_min >= 0.0:
-            raise SolverError(f"sigma_min is a part of the ranges, at least 0, not {sigma_min}")
+        if not sigma_min > 0.0:
+            raise SolverError(f"sigma_min is a part of the ranges, above 0, not {sigma_min}")
         self._elites = max(2, round(elites * self.population))
         self._smoothing = smoothing
         self._sigma_min = sigma_min
+        # The best point so far, once there is one.
+        self._best: list[tuple[np.ndarray, Evaluation]] = []
+
+    def _draw(self, shape: tuple[int, int]) -> np.ndarray:
+        # Truncated, not clipped: many equal points at an end of the range would be elite together.
+        low, high = (ndtr((end - self._mu) / self._sigma) for end in (0.0, 1.0))
+        drawn = self._mu + self._sigma * ndtri(low + (high - low) * self._generator.random(shape))
+        return np.clip(drawn, 0.0, 1.0)
 
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
-        order = sorted(range(len(evaluations)), key=lambda i: rank_key(evaluations[i]))
-        elite = U[[i for i in order if evaluations[i].usable][: self._elites]]
-        a = self._smoothing
-        self._mu = (1.0 - a) * self._mu + a * elite.mean(axis=0)
-        self._sigma = np.maximum((1.0 - a) * self._sigma + a * elite.std(axis=0), self._sigma_min)
+        known = [(u, evaluation) for u, evaluation in zip(U, evaluations, strict=True) if evaluation.usable]
+        elites = sorted([*self._best, *known], key=lambda pair: rank_key(pair[1]))[: self._elites]
+        self._best = elites[:1]
+        X, a = np.array([u for u, _ in elites]), self._smoothing
+        self._mu = (1.0 - a) * self._mu + a * X.mean(axis=0)
+        self._sigma = np.maximum((1.0 - a) * self._sigma + a * X.std(axis=0), self._sigma_min)
 
 
 class Mppi(SamplingSolver):

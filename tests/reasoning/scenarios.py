@@ -1,0 +1,112 @@
+"""Small testbeds of which the best decision is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.primitives import LinearSystem
+
+from tests.testbeds import PENDULUM
+from vtbdrake.state import discrete_state
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
+
+PERIOD = 0.01
+
+
+class BangBang(LeafSystem):
+    """Pushes with all its force until the switching time, then pulls with it, until twice that time.
+
+    .. pydrake_system::
+
+        name: BangBang
+        input_ports:
+        - state
+        - switch
+        output_ports:
+        - force
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, strength: float, *, ends: bool = True) -> None:
+        super().__init__()
+        self._strength, self._ends = strength, ends
+        # Force; the estimate of position and velocity.
+        force, estimate = self.DeclareDiscreteState(1), self.DeclareDiscreteState(2)
+        self._sensor = self.DeclareVectorInputPort("state", BasicVector(2))
+        self._switch = self.DeclareVectorInputPort("switch", BasicVector(1))
+        self.DeclareStateOutputPort("force", force)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
+        self.variables = (
+            discrete_state("force", force, unit="N"),
+            discrete_state("estimate", estimate, shape=(2,), unit="m, m/s"),
+        )
+
+    def _update(self, context: Context, discrete: object) -> None:
+        (switch,) = self._switch.Eval(context)
+        t = context.get_time() + 1e-9
+        force = self._strength * (1.0 if t < switch else -1.0 if t < 2.0 * switch or not self._ends else 0.0)
+        discrete.set_value(0, [force])
+        discrete.set_value(1, self._sensor.Eval(context))
+
+
+@dataclass
+class MassScenario(Scenario):
+    """A mass of 1 kg that a force of 1 N moves from rest: after t it is t^2 / 2 further.
+
+    Sampled every 10 ms; the force acts a period after it was decided. When twice the switching time has passed, the
+    mass rests switch^2 further.
+    """
+
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
+    mass: float = 1.0
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[Signal("state", size=2, unit="m, m/s")],
+            act=[Signal("force", size=1, unit="N", idle=0.0)],
+            commands=[Signal("switch", size=1, unit="s", lower=0.0)],
+        )
+
+    def make_dps(self) -> LeafSystem:
+        return BangBang(1.0)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        h = PERIOD
+        A, B = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h / 2.0], [h]]) / self.mass
+        mass = builder.add("sys", "mass", LinearSystem(A, B, np.eye(2), np.zeros((2, 1)), h))
+        builder.sim_sensor("state", mass.get_output_port())
+        builder.sim_actuator("force", mass.get_input_port())
+
+
+@dataclass
+class SwingUpScenario(Scenario):
+    """Drake's pendulum (1 kg at 0.5 m, damping 0.1 N m s), swung up by one torque that changes its sign once."""
+
+    simulator_config: SimulatorConfig = field(
+        default_factory=lambda: SimulatorConfig(accuracy=1e-6, max_step_size=0.05)
+    )
+    torque: float = 2.5
+
+    def interface(self) -> Interface:
+        return Interface(
+            sense=[Signal("state", size=2, unit="rad, rad/s")],
+            act=[Signal("force", size=1, unit="N m", idle=0.0)],
+            commands=[Signal("switch", size=1, unit="s", lower=0.0)],
+        )
+
+    def make_dps(self) -> LeafSystem:
+        return BangBang(self.torque, ends=False)
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=0.0))
+        Parser(plant).AddModelsFromUrl(PENDULUM)
+        plant.Finalize()
+        builder.sim_sensor("state", plant.get_state_output_port())
+        builder.sim_actuator("force", plant.get_actuation_input_port())

@@ -1,0 +1,406 @@
+"""Decisions whose answers are known; budgets, candidates, methods, executors; what is refused."""
+
+import threading
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
+
+from tests.reasoning.scenarios import MassScenario, SwingUpScenario
+from vtbdrake.optimization import Choice, Parameter
+from vtbdrake.reasoning import Budget, Reasoner, ReasonerError
+from vtbdrake.rollout import Constraint, Quality
+
+SWITCH = Parameter("u.switch", 0.0, 3.0)
+STATE = "sim.sys.mass.y0"
+
+
+def distance(state):
+    """Distance from rest at 1 m: of position and velocity."""
+    return abs(state[0] - 1.0) + abs(state[1])
+
+
+MISS = Quality(distance, of=STATE, minimize=True, reading="end")
+
+
+def make(scenario=None, **changes):
+    settings = {
+        "decision": [SWITCH],
+        "quality": MISS,
+        "horizon": 3.0,
+        "sample_period": 0.5,
+        "budget": Budget(rollouts=30),
+        "executor": "serial",
+    }
+    return Reasoner(scenario=scenario or MassScenario(), **{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def mass():
+    return MassScenario().build()
+
+
+def decide(reasoner, testbed, *, values=None, at=0.0, **options):
+    """A decision from the defaults, or after ``at`` seconds with ``values`` set."""
+    context = testbed.default_context()
+    testbed.write(context, values or {})
+    if at:
+        simulator = testbed.simulator(context)
+        simulator.AdvanceTo(at)
+    with reasoner:
+        return reasoner.decide(testbed, context, **options)
+
+
+# -- known answers
+
+
+@pytest.mark.parametrize("method", ["CEM", "predictive-sampling", "MPPI", "CMA-ES", "LN_COBYLA"])
+def test_a_double_integrator_switches_at_half_the_time_of_bang_bang(method, mass):
+    # 1 m from rest to rest with 1 m/s^2 takes 2 s.
+    decision = decide(make(method=method, budget=Budget(rollouts=60)), mass)
+    assert decision
+    assert decision.values["u.switch"] == pytest.approx(1.0, abs=0.05)
+    assert decision.quality < 0.1
+
+
+def test_a_pendulum_is_swung_up_by_the_switching_time_that_an_ode_solver_finds():
+    torque, horizon = 2.5, 1.6
+
+    def height(switch):
+        state, best = np.zeros(2), 0.0
+        for begin, end, u in ((0.0, switch, torque), (switch, horizon, -torque)):
+            # 0.25 kg m^2, m g l = 4.905 N m, damping 0.1 N m s
+            done = solve_ivp(
+                lambda t, y, u=u: [y[1], (u - 4.905 * np.sin(y[0]) - 0.1 * y[1]) / 0.25],
+                (begin, end),
+                state,
+                max_step=0.01,
+                rtol=1e-8,
+            )
+            state, best = done.y[:, -1], max(best, np.max(1.0 - np.cos(done.y[0])))
+        return best
+
+    expected = minimize_scalar(lambda t: -height(t), bounds=(0.3, 1.0), method="bounded", options={"xatol": 1e-3})
+    reasoner = make(
+        SwingUpScenario(),
+        decision=[Parameter("u.switch", 0.0, horizon)],
+        quality=Quality(lambda q: 1.0 - np.cos(q), of="sim.sys.Pendulum.theta.position"),
+        horizon=horizon,
+        sample_period=0.02,
+        budget=Budget(rollouts=40),
+        method="MPPI",
+    )
+    decision = decide(reasoner, reasoner.problem.testbed)
+    assert decision.values["u.switch"] == pytest.approx(expected.x, abs=0.04)
+    assert decision.quality == pytest.approx(-expected.fun, abs=0.01)
+    assert decision.quality > 1.8  # 2 is upright; either torque alone reaches 0.5.
+
+
+def test_what_is_left_to_decide_depends_on_the_state_in_which_it_is_asked(mass):
+    # After 1 s with full force the mass is at 0.5 m: switching now stops it at 1 m, and nothing can stop it earlier.
+    reasoner = make(method="grid", options={"points": 25})
+    decision = decide(reasoner, mass, values={"u.switch": 3.0}, at=1.0)
+    assert decision.time == 1.0
+    assert decision.values["u.switch"] == 1.0
+    assert decision.candidates[0].values == {"u.switch": 3.0}
+
+
+def test_a_choice_is_decided_by_a_grid(mass):
+    reasoner = make(decision=[Choice("u.switch", [0.5, 1.0, 2.0])], method="grid")
+    decision = decide(reasoner, mass)
+    assert decision.values == {"u.switch": 1.0}
+    assert decision.end == "method"
+
+
+# -- candidate 0
+
+
+def test_candidate_0_is_the_plan_in_use_and_changes_nothing(mass):
+    decision = decide(make(method="random"), mass, values={"u.switch": 0.7})
+    first = decision.candidates[0]
+    assert first.values == {"u.switch": 0.7}
+    assert first.rollouts[0].parameters == {}
+    # It rests at 0.49 m.
+    assert first.quality == pytest.approx(0.51, abs=1e-9)
+
+
+def test_a_plan_in_use_that_is_best_is_kept(mass):
+    for seed in range(4):
+        decision = decide(make(method="random", budget=Budget(rollouts=10), seed=seed), mass, values={"u.switch": 1.0})
+        assert decision.keeps_plan
+        assert decision.values == {"u.switch": 1.0}
+        assert decision.health.improvement == 0.0
+
+
+def test_a_plan_in_use_beyond_the_ranges_is_tried_all_the_same(mass):
+    decision = decide(make(decision=[Parameter("u.switch", 2.0, 3.0)]), mass, values={"u.switch": 1.0})
+    assert decision.keeps_plan
+    assert decision.values == {"u.switch": 1.0}
+    assert min(candidate.values["u.switch"] for candidate in decision.candidates[1:]) >= 2.0
+
+
+def test_a_given_plan_is_tried_beside_the_one_in_use_and_starts_the_method(mass):
+    reasoner = make(method="predictive-sampling", options={"sigma": 0.01, "population": 4}, budget=Budget(rollouts=6))
+    decision = decide(reasoner, mass, plan={"u.switch": 1.05})
+    values = [candidate.values["u.switch"] for candidate in decision.candidates]
+    assert values[:2] == [0.0, 1.05]
+    assert all(abs(value - 1.05) < 0.2 for value in values[2:])
+
+
+# -- budgets
+
+
+@pytest.mark.parametrize("method", ["CEM", "predictive-sampling", "MPPI", "random"])
+def test_the_quality_never_falls_with_the_budget(method, mass):
+    for seed in range(3):
+        costs = [
+            decide(make(method=method, budget=Budget(rollouts=budget), seed=seed), mass).quality
+            for budget in (1, 2, 5, 12, 30)
+        ]
+        assert costs == sorted(costs, reverse=True)
+        assert costs[-1] < costs[0]
+
+
+@pytest.mark.parametrize("method", ["CEM", "MPPI", "random", "sobol", "CMA-ES"])
+def test_a_budget_of_rollouts_is_spent_and_not_exceeded(method, mass):
+    decision = decide(make(method=method, budget=Budget(rollouts=13)), mass)
+    assert decision.health.rollouts == 13
+    assert len({tuple(c.values.items()) for c in decision.candidates}) == 13
+    assert decision.health.used == 1.0
+
+
+def test_a_decision_is_a_function_of_state_and_seed(mass):
+    def tried(**changes):
+        return [c.values["u.switch"] for c in decide(make(budget=Budget(rollouts=8), **changes), mass).candidates]
+
+    assert tried() == tried()
+    assert tried() != tried(seed=1)
+
+
+def test_decisions_at_other_times_try_other_candidates(mass):
+    def tried(at):
+        decision = decide(make(budget=Budget(rollouts=8), method="random"), mass, at=at)
+        return [c.values["u.switch"] for c in decision.candidates[1:]]
+
+    assert not set(tried(0.0)) & set(tried(0.02))
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_all_executors_give_the_same_decision(executor, mass):
+    serial, other = (
+        decide(make(executor=name, workers=workers, budget=Budget(rollouts=20)), mass, at=0.3)
+        for name, workers in (("serial", None), (executor, 2))
+    )
+    assert other.values == serial.values
+    assert other.quality == serial.quality
+    assert [c.values for c in other.candidates] == [c.values for c in serial.candidates]
+    assert all(a.rollouts[0].identical(b.rollouts[0]) for a, b in zip(other.candidates, serial.candidates, strict=True))
+
+
+# -- eligible or not
+
+
+def test_a_candidate_that_violates_a_constraint_is_not_chosen(mass):
+    slow = Constraint(lambda state: state[1], of=STATE, at_most=0.5)
+    decision = decide(make(constraints=[slow], sample_period=0.05), mass)
+    # At 1 m/s^2, 0.5 m/s is reached after 0.5 s.
+    assert decision.values["u.switch"] == pytest.approx(0.5, abs=0.03)
+    assert decision.values["u.switch"] <= 0.51
+    assert {c.status for c in decision.candidates} == {"eligible", "violates"}
+
+
+def test_without_an_eligible_candidate_the_decision_is_false_and_says_why(mass):
+    impossible = Constraint(lambda state: state[0], of=STATE, at_least=9.0)
+    decision = decide(make(constraints=[impossible], budget=Budget(rollouts=5)), mass)
+    assert not decision
+    assert decision.values == {}
+    assert decision.chosen is None
+    assert "5 violated a constraint" in decision.message
+    context = mass.default_context()
+    with pytest.raises(ValueError, match="there is no decision to apply .*5 violated"):
+        decision.apply(mass, context)
+
+
+def test_a_quality_that_fails_fails_its_candidates_only(mass):
+    def picky(state):
+        assert state[0] < 1.0, "too far"
+        return state[0]
+
+    quality = Quality(picky, of=STATE, reading="end")
+    decision = decide(make(quality=quality, sample_period=0.05, method="grid"), mass)
+    assert 0.5 < decision.quality < 1.0
+    assert decision.poor
+    assert "rollouts failed, the first: QualityError: " in decision.doubts[0]
+    assert decision.health.failed == sum(c.status == "failed" for c in decision.candidates) > 0
+
+
+def test_if_all_rollouts_fail_there_is_no_decision(mass):
+    decision = decide(make(quality=Quality(lambda state: -1.0, of=STATE), budget=Budget(rollouts=3)), mass)
+    assert not decision
+    assert "3 failed; the first failure: QualityError" in decision.message
+
+
+def test_a_mental_world_that_diverges_is_no_good_score():
+    class Diverging(MassScenario):
+        def mental(self):
+            return MassScenario(mass=1e-310)
+
+    reasoner = make(Diverging(), quality=Quality(lambda state: abs(state[0]), of=STATE), budget=Budget(rollouts=4))
+    decision = decide(reasoner, MassScenario().build(), values={"u.switch": 1.0})
+    assert not decision
+    assert "4 failed" in decision.message
+
+
+# -- health and display
+
+
+def test_health_tells_improvement_margin_and_time(mass):
+    decision = decide(make(decision=[Choice("u.switch", [0.5, 1.0])], method="grid"), mass)
+    # They rest at 0, 0.25 and 1 m.
+    assert decision.health.improvement == pytest.approx(1.0)
+    assert decision.health.margin == pytest.approx(0.75)
+    assert decision.health.rollouts == 3
+    assert decision.health.used == pytest.approx(0.1)
+    assert 0.0 < decision.health.rollout_time * 3 <= decision.health.elapsed
+
+
+def test_a_quality_that_ignores_the_decision_is_reported(mass):
+    decision = decide(make(horizon=0.01, sample_period=0.01, budget=Budget(rollouts=6)), mass)
+    assert decision.keeps_plan
+    assert any("all 6 eligible candidates are equally good" in doubt for doubt in decision.doubts)
+
+
+def test_a_budget_for_the_plan_in_use_alone_is_reported(mass):
+    decision = decide(make(budget=Budget(rollouts=1)), mass)
+    assert decision.keeps_plan
+    assert decision.end == "rollouts"
+    assert any("nothing but the plan in use was tried" in doubt for doubt in decision.doubts)
+
+
+def test_a_decision_is_applied_and_carried_out(mass):
+    decision = decide(make(), mass)
+    context = mass.default_context()
+    decision.apply(mass, context)
+    simulator = mass.simulator(context)
+    simulator.AdvanceTo(3.0)
+    assert distance(mass.read(context, STATE)) == decision.quality
+
+
+def test_a_decision_shows_itself(mass):
+    decision = decide(make(decision=[Choice("u.switch", [0.5, 1.0])], method="grid"), mass)
+    assert repr(decision).startswith("Decision(u.switch = 1: distance = ")
+    lines = str(decision).split("\n")
+    assert [line.split()[0] for line in lines[1:5]] == ["candidate", "2*", "1", "0"]
+    html = decision._repr_html_()
+    assert "<img" in html
+    assert "margin to the second best" in html
+    assert len(decision.plot().axes[0].lines) >= 3
+
+
+# -- what is refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "a budget is given as"),
+        ({"rollouts": 0}, "at least one rollout, not 0"),
+        ({"rollouts": 1.5}, "whole number, not 1.5"),
+        ({"rollouts": "many"}, "is a number, not 'many'"),
+        ({"seconds": 0.0}, "positive and finite, not 0.0 s"),
+        ({"seconds": -1.0}, "positive and finite"),
+        ({"seconds": float("nan")}, "positive and finite"),
+        ({"seconds": float("inf")}, "positive and finite"),
+    ],
+)
+def test_a_senseless_budget_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Budget(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"budget": 70}, "a budget is Budget.*not 70"),
+        ({"samples": 0}, "at least one sample, not 0"),
+        ({"samples": 8, "budget": Budget(rollouts=7)}, "7 rollouts does not suffice for one candidate, which takes 8"),
+        ({"decision": []}, "a reasoner decides something"),
+        ({"decision": SWITCH}, "give decision as"),
+        ({"decision": [Parameter("sim.sys.mass.discrete_state_0[0]", 0.0, 1.0)]}, "is neither"),
+        ({"decision": [Parameter("scenario.mass", 0.5, 1.0)]}, "is neither"),
+        ({"decision": [Parameter("u.swich", 0.0, 1.0)]}, "u.swich.*u.switch"),
+        ({"decision": [Parameter("u.switch", -1.0, 1.0)]}, "exceeds its bounds"),
+        ({"decision": [SWITCH, SWITCH]}, "given twice"),
+        ({"quality": [MISS, MISS]}, "a decision has one quality"),
+        ({"quality": Quality(abs, of="sim.nothing")}, "sim.nothing"),
+        ({"method": "simulated annealing"}, "there is no solver 'simulated annealing'"),
+        ({"method": "CEM", "options": {"popsize": 3}}, "CEM has no option 'popsize'"),
+        ({"method": "CEM", "decision": [Choice("u.switch", [0.5, 1.0])]}, "CEM varies numbers"),
+        ({"method": "grid", "options": {"points": 50}}, "the grid has 50 points, and the budget is 29"),
+        ({"horizon": -1.0}, "horizon t_m must be positive"),
+        ({"executor": "gpu"}, "an executor is one of"),
+    ],
+)
+def test_a_reasoner_that_cannot_work_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make(**changes)
+
+
+def test_a_mental_scenario_with_other_commands_is_refused():
+    class Strange(MassScenario):
+        def mental(self):
+            return SwingUpScenario()
+
+    class Stranger(SwingUpScenario):
+        def interface(self):
+            return super().interface().__class__(super().interface().sense, super().interface().act)
+
+    Strange.mental = lambda self: Stranger()
+    with pytest.raises(ValueError, match=r"Stranger has other commands than Strange \(switch\)"):
+        make(Strange())
+
+
+def test_a_plan_that_cannot_be_decided_is_refused(mass):
+    with pytest.raises(ValueError, match="u.switch = 9 lies outside its range"):
+        decide(make(), mass, plan={"u.switch": 9.0})
+    with pytest.raises(ValueError, match="wrong about u.other"):
+        decide(make(), mass, plan={"u.switch": 1.0, "u.other": 1.0})
+
+
+def test_a_second_decision_at_the_same_time_is_refused_and_the_first_is_finished(mass):
+    begun, go_on, refused = threading.Event(), threading.Event(), []
+
+    def slow(state):
+        begun.set()
+        go_on.wait()
+        return distance(state)
+
+    reasoner = make(quality=Quality(slow, of=STATE, minimize=True, reading="end"), budget=Budget(rollouts=3))
+    context = mass.default_context()
+
+    def ask():
+        begun.wait()
+        try:
+            reasoner.decide(mass, mass.default_context())
+        except ReasonerError as error:
+            refused.append(str(error))
+        finally:
+            go_on.set()
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    with reasoner:
+        decision = reasoner.decide(mass, context)
+        thread.join()
+        assert decision
+        assert "a decision is under way in another thread" in refused[0]
+        assert reasoner.decide(mass, context).values == decision.values
+
+
+def test_a_closed_reasoner_decides_nothing(mass):
+    reasoner = make()
+    reasoner.close()
+    reasoner.close()
+    with pytest.raises(ReasonerError, match="the reasoner is closed"):
+        reasoner.decide(mass, mass.default_context())

@@ -1,0 +1,224 @@
+"""What a reasoner answers: the best candidate of those that it tried, how sure it is, and why it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import isnan, nan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from vtbdrake.rollout import RolloutResult
+from vtbdrake.testbed.addressed import AddressedDiagram
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# What became of a candidate.
+ELIGIBLE, VIOLATES, CUT_OFF, FAILED, UNFINISHED = "eligible", "violates", "cut off", "failed", "unfinished"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One alternative that was tried.
+
+    Attributes:
+        number: in the order of trying; 0 is the plan in use.
+        values: address -> value that it sets; of candidate 0 what is set already.
+        status: ``eligible``, ``violates`` (a constraint), ``cut off`` (it could not win any more), ``failed`` (a
+            simulation did), ``unfinished`` (the budget ended before all its samples were simulated).
+        quality: over all samples, in the user's terms: a cost as a cost. NaN if a simulation failed or is missing; of a
+            candidate that was cut off, the best that it could still have reached.
+        violations: one per constraint, the worst over the samples: at most 0 where it holds.
+        rollouts: one per sample of the belief, as far as they have finished.
+    """
+
+    number: int
+    values: Mapping[str, Any]
+    status: str
+    quality: float
+    violations: tuple[float, ...] = ()
+    rollouts: tuple[RolloutResult, ...] = field(default=(), repr=False)
+
+    @property
+    def spread(self) -> float:
+        """Return the standard deviation of the quality over the samples; 0 for one sample."""
+        return float(np.std([rollout.value for rollout in self.rollouts])) if self.rollouts else nan
+
+    @property
+    def text(self) -> str:
+        """Return its values as text."""
+        return ", ".join(f"{address} = {_short(value)}" for address, value in self.values.items())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """How a decision was reached, to tell a planner that is too slow from a quality that is wrong.
+
+    Attributes:
+        rollouts: how many have finished.
+        failed: how many of them failed.
+        cut_off: how many of them ended early because their candidate could not win any more.
+        rollout_time: the mean wall time of one, in seconds.
+        elapsed: the wall time of the decision, in seconds.
+        used: the share of the budget that was used, of rollouts or of time; of both the larger one.
+        improvement: by how much the quality is better than that of the plan in use, in the unit of the quality; at
+            least 0. NaN without a decision, or if the plan in use is not eligible.
+        margin: by how much it is better than the best other eligible candidate; NaN if there is none.
+        spread: the standard deviation of the quality over the samples of the belief.
+    """
+
+    rollouts: int
+    failed: int
+    cut_off: int
+    rollout_time: float
+    elapsed: float
+    used: float
+    improvement: float
+    margin: float
+    spread: float
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Decision:
+    """The answer of a reasoner; false if no candidate is eligible.
+
+    Attributes:
+        values: address -> value of the chosen candidate; empty if none is eligible.
+        quality: of the chosen candidate, over all samples, in the user's terms; NaN if none is eligible.
+        chosen: the number of the chosen candidate; None if none is eligible.
+        candidates: all that were tried; the first is the plan in use.
+        health: how it was reached.
+        end: why it ended: ``rollouts`` or ``time`` (the budget was spent), ``method`` (the method has finished).
+        message: the same in a sentence; without a decision, why no candidate is eligible.
+        time: the DPS's time for which it was made, in seconds.
+        doubts: what speaks against it, one sentence each; empty if nothing does.
+        name: of the quality.
+        minimize: whether the quality is a cost.
+    """
+
+    values: Mapping[str, Any]
+    quality: float
+    chosen: int | None
+    candidates: tuple[Candidate, ...]
+    health: Health
+    end: str
+    message: str
+    time: float
+    doubts: tuple[str, ...]
+    name: str
+    minimize: bool = False
+
+    def __bool__(self) -> bool:
+        return self.chosen is not None
+
+    @property
+    def poor(self) -> bool:
+        """Return whether something speaks against it, see ``doubts``."""
+        return bool(self.doubts)
+
+    @property
+    def keeps_plan(self) -> bool:
+        """Return whether the plan in use is the best."""
+        return self.chosen == 0
+
+    def apply(self, testbed: AddressedDiagram, context: Context) -> None:
+        """Set the chosen values in a context of the running testbed, or of its DPS alone.
+
+        Raises:
+            ValueError: no candidate is eligible.
+        """
+        if not self:
+            raise ValueError(
+                f"there is no decision to apply ({self.message}): ask `if decision:` first, and keep the plan in use "
+                "or fall back"
+            )
+        testbed.write(context, self.values)
+
+    def __repr__(self) -> str:
+        tried = f"{len(self.candidates)} candidates, {self.health.rollouts} rollouts, {self.health.elapsed:.3g} s"
+        if self.chosen is None:
+            return f"Decision(none at t = {self.time:g} s: {self.message}; {tried})"
+        kept = ", the plan in use" if self.keeps_plan else ""
+        poor = ", poor" if self.poor else ""
+        chosen = self.candidates[self.chosen].text
+        return f"Decision({chosen}{kept}: {self.name} = {self.quality:.6g}{poor}; {tried})"
+
+    def __str__(self) -> str:
+        """Show the best candidates, the health and the doubts as text."""
+        shown, marks = self.ranked[:_SHOWN], {self.chosen: "*"}
+        table = [("candidate", "values", self.name, "status")]
+        table += [(f"{c.number}{marks.get(c.number, '')}", c.text, _number(c), c.status) for c in shown]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
+        if len(self.candidates) > len(shown):
+            lines.append(f"... and {len(self.candidates) - len(shown)} more")
+        facts = [f"{name}: {text}" for name, text in self._facts().items()]
+        return "\n".join([repr(self), *lines, *facts])
+
+    @property
+    def ranked(self) -> list[Candidate]:
+        """Return the candidates: the chosen one, the other eligible ones by their quality, then the rest by number."""
+        better = 1.0 if self.minimize else -1.0
+
+        def key(candidate: Candidate) -> tuple[bool, bool, float, int]:
+            eligible = candidate.status == ELIGIBLE
+            value = better * candidate.quality if eligible else 0.0
+            return candidate.number != self.chosen, not eligible, value, candidate.number
+
+        return sorted(self.candidates, key=key)
+
+    def _facts(self) -> dict[str, str]:
+        health = self.health
+        facts = {
+            "rollouts": f"{health.rollouts}, of which {health.failed} failed and {health.cut_off} were cut off; "
+            f"{health.rollout_time * 1e3:.3g} ms each",
+            "time": f"{health.elapsed:.3g} s, {health.used:.0%} of the budget",
+            "end": f"{self.end}: {self.message}",
+        }
+        if not isnan(health.improvement):
+            facts["improvement over the plan in use"] = f"{health.improvement:.4g}"
+        if not isnan(health.margin):
+            facts["margin to the second best"] = f"{health.margin:.4g}"
+        if health.spread > 0.0:
+            facts["spread over the samples"] = f"{health.spread:.4g}"
+        return facts | ({"doubts": "; ".join(self.doubts)} if self.doubts else {})
+
+    def _repr_html_(self) -> str:
+        """Show the facts and the quality trajectories of the candidates in a notebook."""
+        from vtbdrake.visualization.plots import summary_html
+
+        rows = {c.text or "none": f"{_number(c)} ({c.status})" for c in self.ranked[:_SHOWN]}
+        drawn = any(_drawable(candidate) for candidate in self.candidates)
+        return summary_html(repr(self), {**rows, **self._facts()}, self.plot() if drawn else None)
+
+    def plot(self) -> Figure:
+        """Plot the quality of the best candidates over time, each by its first sample (Figure 5).
+
+        Raises:
+            ValueError: no rollout has a quality.
+        """
+        from vtbdrake.visualization import plot_quality
+
+        return plot_quality([c.rollouts[0] for c in self.ranked if _drawable(c)][:_SHOWN])
+
+
+# So many candidates are shown at most.
+_SHOWN = 10
+
+
+def _drawable(candidate: Candidate) -> bool:
+    return bool(candidate.rollouts) and candidate.rollouts[0].quality.size > 0
+
+
+def _number(candidate: Candidate) -> str:
+    return "-" if isnan(candidate.quality) else f"{candidate.quality:.6g}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, str | bool):
+        return repr(value)
+    with np.printoptions(precision=4, threshold=6, edgeitems=2):
+        return f"{value:.6g}" if np.ndim(value) == 0 else " ".join(str(np.asarray(value)).split())

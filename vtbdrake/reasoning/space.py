@@ -1,0 +1,115 @@
+"""What is decided: elements of the DPS, as a search sees them (numbers in ranges) and as the DPS takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.argument_checks import all_of
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
+from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.reasoning.trajectory import Trajectory
+from vtbdrake.state import Variables
+
+Element = Parameter | Choice | Trajectory
+
+
+class DecisionSpace:
+    """The elements of a decision, and the parameters that a search varies for them.
+
+    Args:
+        decision: commands (``u.<name>``) and other elements of the DPS, each a `Parameter`, a `Choice` or a
+            `Trajectory`.
+
+    Attributes:
+        elements: the elements.
+        parameters: what a search varies: one number for a parameter or a choice, the knots of a trajectory.
+
+    Raises:
+        ValueError: there is no element, or one is not a part of the DPS.
+    """
+
+    def __init__(self, decision: Sequence[Element]) -> None:
+        form = "[Parameter(address, lower, upper), ...]"
+        self.elements: tuple[Element, ...] = all_of(Element, decision, name="decision", form=form)
+        if not self.elements:
+            raise ValueError(f"a reasoner decides something: give decision={form}")
+        for element in self.elements:
+            if not element.address.startswith(("u.", "dps.")):
+                raise ValueError(
+                    f"a decision sets a command (u.<name>) or another element of the DPS (dps.<...>), but "
+                    f"{element.address} is neither; what it depends on besides is for vtb.Problem"
+                )
+        parts = [e.parameters if isinstance(e, Trajectory) else (e,) for e in self.elements]
+        self.parameters: tuple[Dimension, ...] = tuple(parameter for part in parts for parameter in part)
+        ends = np.cumsum([len(part) for part in parts]).tolist()
+        self._parts = [slice(end - len(part), end) for end, part in zip(ends, parts, strict=True)]
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Return the addresses that a decision sets."""
+        return tuple(element.address for element in self.elements)
+
+    def find(self, variables: Variables) -> None:
+        """Check that a testbed has the trajectories; `Problem` checks the parameters.
+
+        Raises:
+            ValueError: there is no such variable, or one of another size or with narrower bounds.
+        """
+        for element in self.elements:
+            if isinstance(element, Trajectory):
+                element.find(variables)
+
+    def point(self, plan: Mapping[str, Any], time: float) -> Point:
+        """Return the point of the search that a plan is.
+
+        Args:
+            plan: address -> value, as the DPS takes it; a trajectory is shifted so that it begins at ``time``.
+            time: the time of the decision in seconds.
+
+        Raises:
+            ValueError: the plan lacks an element or has others, or a value lies outside its range.
+        """
+        wrong = set(plan) ^ set(self.addresses)
+        if wrong:
+            raise ValueError(f"a plan sets each element of the decision; this one is wrong about {', '.join(wrong)}")
+        point: list[Any] = []
+        for element in self.elements:
+            value = plan[element.address]
+            if isinstance(element, Trajectory):
+                begin, knots = float(value[0]), np.asarray(value[1:], dtype=float)
+                point += element.shifted(knots, time - begin).tolist()
+            else:
+                point.append(element.check(value))
+        return tuple(point)
+
+    def values(self, point: Point, plan: Mapping[str, Any], time: float) -> dict[str, Any]:
+        """Return what a point of the search sets, address -> value as the DPS takes it.
+
+        Args:
+            point: one value per parameter.
+            plan: the plan in use, address -> value; where the rate of a trajectory is limited, it goes on from there.
+            time: the time of the decision in seconds, at which a trajectory begins.
+        """
+        values = {}
+        for element, part in zip(self.elements, self._parts, strict=True):
+            if isinstance(element, Trajectory):
+                knots = element.limited(point[part], start=_value_at(element, plan[element.address], time))
+                values[element.address] = element.plan(knots, time)
+            else:
+                (values[element.address],) = point[part]
+        return values
+
+
+def _value_at(trajectory: Trajectory, plan: np.ndarray, time: float) -> np.ndarray | None:
+    """Return the value of a plan at ``time``, if new plans begin there."""
+    if not trajectory.is_continued:
+        return None
+    return trajectory.values(plan[1:], [time - float(plan[0])])[0]
+
+
+def same_values(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Return whether two mappings address -> value are equal, to the last bit."""
+    return a.keys() == b.keys() and all(np.array_equal(a[address], b[address]) for address in a)
