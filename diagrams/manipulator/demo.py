@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import threading
+import socket
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from vtbdrake.child_process import ChildProcess
 from vtbdrake.cli.output import table
 from vtbdrake.control import RealTime, Runtime, SimulatedClock, SwitchRefusedError
 from vtbdrake.control.stepping import Cycle
@@ -23,6 +25,7 @@ from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
 from vtbdrake_diagrams.manipulator.safety import CARRY
+from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
 
 LAWS = ("cartesian_impedance", "admittance")
@@ -36,7 +39,8 @@ MAX_MISSED = 50
 # With more latches than this, the figures of a trial mean nothing: the motions were interrupted too often.
 MANY_LATCHES = 30
 
-HUB_PRIORITY, LOOP_PRIORITY, MACHINE_PRIORITY = 80, 75, 70
+HUB_PRIORITY, LOOP_PRIORITY = 80, 75
+MACHINE: dict[str, Any] = {"priority": 70, "perturb": PERTURB, "seed": SEED}
 
 # Times in the press at which the force is printed, in seconds from its beginning.
 INSTANTS = (0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6)
@@ -70,7 +74,7 @@ class Demo:
         self.scenario = trial_scenario(law)
         self.testbed = self.scenario.build()
         self.along_x = LawAlongX.of(self.testbed)
-        self.machine = MachineProcess(self.scenario, hub.url, priority=MACHINE_PRIORITY, perturb=PERTURB, seed=SEED)
+        self.machine = MachineProcess(self.scenario, hub.url, **MACHINE)
         self.bridge: LcmBridge = protocol_of(self.scenario).bridge(self.scenario.interface(), hub.url)
         self.attendant = Attendant()
 
@@ -80,7 +84,8 @@ class Demo:
         self.bridge.open()
         try:
             simulated, loop = self._simulate()
-            with self.machine, RealTime(priority=LOOP_PRIORITY) as rights:
+            successor = ChildProcess(_succeed, self.scenario, self.bridge.url, name="the machine's successor")
+            with self.machine, closing(successor), RealTime(priority=LOOP_PRIORITY) as rights:
                 if death:
                     print("\n".join(f"  {line}" for line in str(rights).splitlines()))
                 loop = self._strip(self._shadow(loop))
@@ -88,7 +93,7 @@ class Demo:
                 self._report(simulated, real)
                 self._report_timing(loop)
                 if death:
-                    self._die_and_recover(loop)
+                    self._die_and_recover(loop, successor)
         finally:
             self.bridge.close()
 
@@ -141,7 +146,7 @@ class Demo:
         self._print_latches()
         return track
 
-    def _die_and_recover(self, loop: Runtime) -> None:
+    def _die_and_recover(self, loop: Runtime, successor: ChildProcess) -> None:
         print("\nThe machine is killed in the middle of a circle:")
         loop.target.write(loop.context, {"u.motion": float(CIRCLE)})
         loop.run(seconds=2.2)
@@ -163,12 +168,10 @@ class Demo:
         with suppress(SwitchRefusedError):
             loop.reset()
         print(f"  a reset is {'rejected' if loop.guards.latched else 'ACCEPTED'} as long as the sensors are silent")
-        birth = threading.Thread(target=self.machine.start)
-        birth.start()
+        successor.connection.sendall(b"begin")
         # The reference follows the arm, wherever the machine starts.
         loop.target.write(loop.context, {"u.motion": float(FOLLOW)})
-        loop.run(until=lambda: not birth.is_alive() and not _sensor_faults(loop), seconds=60.0)
-        birth.join()
+        loop.run(until=lambda: not _sensor_faults(loop), seconds=60.0)
         loop.run(seconds=0.1)
         print("  the machine is restarted: its sensors are fresh, the arm floats in place")
         _reset_guards(loop)
@@ -218,6 +221,16 @@ class Demo:
             f"{1e6 * answer.percentile(99.0):.0f} us; the machine itself missed {machine.loop.misses} deadlines and "
             f"lost {1e3 * machine.lost:.0f} ms"
         )
+
+
+def _succeed(connection: socket.socket, scenario: ManipulatorScenario, url: str) -> None:
+    """Start a machine when a message comes, and run it until the connection closes.
+
+    This process is there before the loop runs: starting a process holds up the interpreter of the one that starts it.
+    """
+    if connection.recv(16):
+        with MachineProcess(scenario, url, **MACHINE):
+            connection.recv(16)
 
 
 def _reset_guards(loop: Runtime) -> None:

@@ -8,8 +8,8 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 def apply_simulator_config(config: SimulatorConfig, simulator: Simulator) -> None:
     """Apply ``config`` as Drake does, and let the solver of CENIC use a factorized Hessian more than once.
 
-    CENIC takes each step from the minimum of a convex function. By default its solver, Newton's method, factorizes a new
-    Hessian in every iteration; here it keeps one, from step to step too, as long as it converges quickly with it
+    CENIC takes each step from the minimum of a convex function. By default its solver, Newton's method, factorizes a
+    new Hessian in every iteration; here it keeps one, from step to step too, as long as it converges quickly with it
     (Hairer and Wanner, "Solving Ordinary Differential Equations II", section IV.8). It converges to the same tolerance.
     A walking robot takes three fifths of the factorizations less, and an eighth of the time.
 
