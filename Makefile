@@ -16,7 +16,7 @@ ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
 # What is compiled.
-SOURCES := $(shell find vtbdrake -name '*.pyx' -o -name '*.pxd')
+SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd')
 
 .DEFAULT_GOAL := help
 .PHONY: help python setup demo demo-control test check answers bench clean stale

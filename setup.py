@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: every .pyx of the package becomes a compiled module, with numpy at hand."""
+"""What pyproject.toml cannot say: every .pyx of both packages becomes a compiled module, with numpy at hand."""
 
 from pathlib import Path
 
@@ -6,8 +6,10 @@ import numpy as np
 from setuptools import Extension, setup
 
 _ROOT = Path(__file__).parent
+_PACKAGES = ("vtbdrake", "vtbdrake_diagrams")
 _SOURCES, _DECLARATIONS = (
-    sorted(path.relative_to(_ROOT) for path in (_ROOT / "vtbdrake").rglob(name)) for name in ("*.pyx", "*.pxd")
+    sorted(path.relative_to(_ROOT) for package in _PACKAGES for path in (_ROOT / package).rglob(name))
+    for name in ("*.pyx", "*.pxd")
 )
 
 setup(

@@ -14,7 +14,9 @@ from sysconfig import get_config_var, get_path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMPILED = sorted(path.relative_to(ROOT) for path in (ROOT / "vtbdrake").rglob("*.pyx"))
+COMPILED = sorted(
+    path.relative_to(ROOT) for package in ("vtbdrake", "vtbdrake_diagrams") for path in (ROOT / package).rglob("*.pyx")
+)
 EXT_SUFFIX = get_config_var("EXT_SUFFIX")
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from math import exp
-
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import Multiplexer
 
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.space_climber.conditioning import calibrate, limit
 from vtbdrake_diagrams.space_climber.estimation import PerceivedEnvironment
 from vtbdrake_diagrams.space_climber.gait import GAITS
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
@@ -113,12 +112,8 @@ class Calibration(LeafSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         parameters = context.get_numeric_parameter(0).value()
-        measurements = self._raw.Eval(context) - parameters[:-1]
-        tau = float(parameters[-1])
-        if tau > 0.0:
-            imu = measurements[:6]
-            imu += exp(-self._period / tau) * (context.get_discrete_state(0).value()[:6] - imu)
-        state.set_value(0, measurements)
+        raw, measurements = self._raw.Eval(context), state.get_mutable_value(0)
+        calibrate(parameters, raw, measurements, filtered=SENSOR_SIGNALS["imu"], period=self._period)
 
 
 class CommandLimiter(LeafSystem):
@@ -157,8 +152,4 @@ class CommandLimiter(LeafSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         limits = context.get_numeric_parameter(0).value()
-        size = len(JOINT_NAMES)
-        lower, upper, reach = limits[:size], limits[size : 2 * size], limits[-1] * self._period
-        last = context.get_discrete_state(0).value()
-        step = np.minimum(np.maximum(self._target.Eval(context) - last, -reach), reach)
-        state.set_value(0, np.minimum(np.maximum(last + step, lower), upper))
+        limit(limits, self._target.Eval(context), state.get_mutable_value(0), period=self._period)

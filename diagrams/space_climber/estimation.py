@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import asin, atan2, copysign, cos, exp, hypot, pi, sin
+from math import pi
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
@@ -11,11 +11,7 @@ from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
-
-
-def wrap(angle: float) -> float:
-    """Return ``angle`` wrapped to [-pi, pi)."""
-    return (angle + pi) % (2.0 * pi) - pi
+from vtbdrake_diagrams.space_climber.pose_filter import PoseFilter
 
 
 class PerceivedEnvironment(LeafSystem):
@@ -48,9 +44,7 @@ class PerceivedEnvironment(LeafSystem):
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
-        self._period = period
-        self._foot_radius = morphology.foot_radius
-        self._legs = LegKinematics(morphology)
+        self._filter = PoseFilter(LegKinematics(morphology), foot_radius=morphology.foot_radius, period=period)
         legs = len(LEGS)
         self._measurements = self.DeclareVectorInputPort("measurements", 6 + 4 * legs)
         pose = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, morphology.torso_clearance]))
@@ -71,60 +65,9 @@ class PerceivedEnvironment(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        measurements = self._measurements.Eval(context).tolist()
-        imu, encoders, standing = measurements[:6], measurements[6:24], measurements[24:]
-        *attitude, x, y, height = context.get_discrete_state(0).value().tolist()
-        known, *memory = context.get_discrete_state(1).value().tolist()
-        if any(imu[3:]):
-            tau = context.get_numeric_parameter(0)[0]
-            trust = 1.0 - exp(-self._period / tau) if known and tau > 0.0 else 1.0
-            attitude = complementary_filter(attitude, imu, period=self._period, trust=trust)
-            known = 1.0
-
-        dx = dy = drop = 0.0
-        still = down = 0
-        remembered = [known, *standing]
-        for k, (foot_x, foot_y, foot_z) in enumerate(self._feet_in_world(attitude, encoders)):
-            remembered += (foot_x, foot_y)
-            if standing[k]:
-                down += 1
-                drop += foot_z
-                if memory[k]:
-                    still += 1
-                    dx += memory[6 + 2 * k] - foot_x
-                    dy += memory[7 + 2 * k] - foot_y
-        if still:
-            x, y = x + dx / still, y + dy / still
-        if down:
-            height = self._foot_radius - drop / down
-        state.set_value(0, np.array((*attitude, x, y, height)))
-        state.set_value(1, np.array(remembered))
-
-    def _feet_in_world(self, attitude: list[float], q: list[float]) -> list[tuple[float, float, float]]:
-        """Return p_BF_W of the six feet."""
-        roll, pitch, yaw = attitude
-        sr, cr, sp, cp, sy, cy = sin(roll), cos(roll), sin(pitch), cos(pitch), sin(yaw), cos(yaw)
-        feet = []
-        for x, y, z in self._legs.feet(q):
-            y, z = cr * y - sr * z, sr * y + cr * z
-            x, z = cp * x + sp * z, cp * z - sp * x
-            feet.append((cy * x - sy * y, sy * x + cy * y, z))
-        return feet
-
-
-def complementary_filter(attitude: list[float], imu: list[float], *, period: float, trust: float) -> list[float]:
-    """Return (roll, pitch, yaw) after one period; ``trust`` in [0, 1] is the weight of the specific force."""
-    roll, pitch, yaw = attitude
-    wx, wy, wz, fx, fy, fz = imu
-    sr, cr = sin(roll), cos(roll)
-    cp = cos(pitch)
-    cp = cp if abs(cp) > 0.05 else copysign(0.05, cp)  # the angles' rates are singular at +-90 deg
-    yaw_rate = (sr * wy + cr * wz) / cp
-    roll += period * (wx + sin(pitch) * yaw_rate)
-    pitch += period * (cr * wy - sr * wz)
-    yaw += period * yaw_rate
-    roll += trust * wrap(atan2(fy, fz) - roll)
-    pitch += trust * (atan2(-fx, hypot(fy, fz)) - pitch)
-    if abs(pitch) > pi / 2:  # over the top: the same orientation with its pitch in [-90, 90] deg
-        roll, pitch, yaw = roll + pi, asin(sin(pitch)), yaw + pi
-    return [wrap(roll), pitch, wrap(yaw)]
+        self._filter.step(
+            context.get_numeric_parameter(0)[0],
+            self._measurements.Eval(context),
+            state.get_mutable_value(0),
+            state.get_mutable_value(1),
+        )

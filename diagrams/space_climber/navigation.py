@@ -14,7 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from vtbdrake.components.sensors import ErrorModel, SampledSensor
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake_diagrams.space_climber.estimation import wrap
+from vtbdrake_diagrams.space_climber.pose_filter import wrap
 
 
 class VisualOdometer(SampledSensor):

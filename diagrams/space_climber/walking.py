@@ -8,11 +8,11 @@ from pydrake.systems.primitives import Multiplexer
 
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake_diagrams.space_climber.estimation import wrap
-from vtbdrake_diagrams.space_climber.gait import Gait, advance, heights
+from vtbdrake_diagrams.space_climber.gait import Gait
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake_diagrams.space_climber.navigation import Navigator
+from vtbdrake_diagrams.space_climber.walker import Walker
 
 
 class GaitGenerator(LeafSystem):
@@ -42,14 +42,12 @@ class GaitGenerator(LeafSystem):
 
     def __init__(self, gait: Gait, *, period: float, morphology: Morphology, clearance: float = 0.05) -> None:
         super().__init__()
-        self._gait = gait
-        self._period = period
-        self._foot_radius = morphology.foot_radius
-        self._legs = LegKinematics(morphology)
-        self._nominal: list[tuple[float, float]] = [(x, y) for x, y, _ in morphology.stance.tolist()]
+        legs = LegKinematics(morphology)
+        foot_radius = morphology.foot_radius
+        self._walker = Walker(gait, legs, stance=morphology.stance, foot_radius=foot_radius, period=period)
         self._input = self.DeclareVectorInputPort("input", 8)
         self.DeclareDiscreteState(np.concatenate([np.zeros(4), morphology.stance[:, :2].ravel()]))
-        command = self.DeclareDiscreteState(self._legs.inverse(morphology.stance).ravel())
+        command = self.DeclareDiscreteState(legs.inverse(morphology.stance).ravel())
         self.DeclareStateOutputPort("joint_position", command)
         defaults = {
             "period": (2.0, "s", (0.2, 60.0)),
@@ -77,38 +75,12 @@ class GaitGenerator(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        gait, sample = self._gait, self._period
-        period, stroke, clearance, height, ramp_time, heading_gain, yaw_rate_limit, posture_gain, lean_limit = (
-            context.get_numeric_parameter(0).value().tolist()
+        self._walker.step(
+            context.get_numeric_parameter(0).value(),
+            self._input.Eval(context),
+            state.get_mutable_value(0),
+            state.get_mutable_value(1),
         )
-        roll, pitch, yaw, _, _, _, heading, walk = self._input.Eval(context).tolist()
-        phase, level, lean_roll, lean_pitch, *feet = context.get_discrete_state(0).value().tolist()
-        lean_roll = clamp(lean_roll + posture_gain * sample * roll, lean_limit)
-        lean_pitch = clamp(lean_pitch + posture_gain * sample * pitch, lean_limit)
-        level += clamp(min(max(walk, 0.0), 1.0) - level, sample / ramp_time)
-        if level > 0.0:
-            next_phase = phase + sample / period
-            turn = clamp(heading_gain * wrap(heading - yaw), yaw_rate_limit)
-            scale = level * sample
-            feet = advance(
-                gait,
-                feet,
-                nominal=self._nominal,
-                phase=phase,
-                next_phase=next_phase,
-                step=(scale * gait.speed(stroke=stroke, period=period), 0.0, scale * turn),
-                stance_steps=gait.duty * period / sample,
-            )
-            phase = next_phase % 1.0
-        state.set_value(0, np.array((phase, level, lean_roll, lean_pitch, *feet)))
-
-        ground = self._foot_radius - height
-        lifted = level * clearance
-        p_BF = [
-            (x, y, ground + lifted * up - lean_pitch * x + lean_roll * y)
-            for x, y, up in zip(feet[::2], feet[1::2], heights(gait, phase), strict=True)
-        ]
-        state.set_value(1, np.array(self._legs.angles(p_BF)))
 
 
 def make_walking(
@@ -145,8 +117,3 @@ def make_walking(
     builder.Connect(inputs.get_output_port(), generator.get_input_port())
     builder.ExportOutput(generator.get_output_port(), "joint_position")
     return builder.Build()
-
-
-def clamp(value: float, limit: float) -> float:
-    """Return ``value`` limited to +- ``limit``."""
-    return limit if value > limit else (-limit if value < -limit else value)

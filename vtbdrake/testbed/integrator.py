@@ -11,7 +11,7 @@ def apply_simulator_config(config: SimulatorConfig, simulator: Simulator) -> Non
     CENIC takes each step from the minimum of a convex function. By default its solver, Newton's method, factorizes a
     new Hessian in every iteration; here it keeps one, from step to step too, as long as it converges quickly with it
     (Hairer and Wanner, "Solving Ordinary Differential Equations II", section IV.8). It converges to the same tolerance.
-    A walking robot takes three fifths of the factorizations less, and an eighth of the time.
+    For a walking robot this saves three of five factorizations, and an eighth of the time.
 
     Like Drake's function it gives the simulator a new integrator, which remembers nothing of an earlier one.
     """

@@ -8,9 +8,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, LeafSystem
 
 from vtbdrake_diagrams.space_climber.dps import make_dps
-from vtbdrake_diagrams.space_climber.estimation import complementary_filter, wrap
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import Morphology
+from vtbdrake_diagrams.space_climber.pose_filter import complementary_filter, wrap
 
 PERIOD = 0.02
 MORPHOLOGY = Morphology()

@@ -5,29 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.space_climber.gait import GAITS, Gait, advance, glide, heights, lift
+from vtbdrake_diagrams.space_climber.gait import GAITS, Gait, glide, lift
 from vtbdrake_diagrams.space_climber.morphology import Morphology
 
-NOMINAL = [(x, y) for x, y, _ in Morphology().stance.tolist()]
+NOMINAL = Morphology().stance[:, :2]
 STEPS = 60  # a cycle; every duty factor is a whole number of steps
+
+
+def leg_phases(gait: Gait, phase: float) -> list[float]:
+    return [gait.leg_phase(leg, phase) for leg in range(6)]
 
 
 def walk(gait: Gait, *, forward: float, turn: float = 0.0, cycles: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Phases (n,) and feet (n, 6, 2) of the last of ``cycles`` cycles of constant steps (forward m, turn rad)."""
-    feet = [c for foot in NOMINAL for c in foot]
+    feet = NOMINAL.flatten()
     phases, path = [], []
     for k in range(cycles * STEPS):
-        feet = advance(
-            gait,
-            feet,
-            nominal=NOMINAL,
-            phase=k / STEPS,
-            next_phase=(k + 1) / STEPS,
-            step=(forward, 0.0, turn),
-            stance_steps=gait.duty * STEPS,
-        )
+        gait.advance(feet, NOMINAL.ravel(), k / STEPS, (k + 1) / STEPS, forward, turn, gait.duty * STEPS)
         phases.append((k + 1) / STEPS)
-        path.append(np.reshape(feet, (6, 2)))
+        path.append(feet.reshape(6, 2).copy())
     return np.array(phases[-STEPS:]), np.array(path[-STEPS:])
 
 
@@ -35,7 +31,7 @@ def walk(gait: Gait, *, forward: float, turn: float = 0.0, cycles: int = 3) -> t
 def test_number_of_standing_feet(name: str) -> None:
     gait = GAITS[name]
     for phase in np.linspace(0, 1, 97, endpoint=False) + 1e-3:
-        standing = sum(leg < gait.duty for leg in gait.leg_phases(phase))
+        standing = sum(leg < gait.duty for leg in leg_phases(gait, phase))
         assert standing == {"tripod": 3, "ripple": 4, "wave": 5}[name]
 
 
@@ -47,7 +43,7 @@ def test_standing_feet_move_at_one_stroke_per_stance(name: str) -> None:
     phases, feet = walk(gait, forward=gait.speed(stroke=stroke, period=period) * dt)
     velocity = np.diff(feet, axis=0) / dt
     for k in range(1, STEPS):
-        for leg, phase in enumerate(gait.leg_phases(phases[k])):
+        for leg, phase in enumerate(leg_phases(gait, phases[k])):
             if 1e-9 < phase <= gait.duty:
                 np.testing.assert_allclose(velocity[k - 1, leg], [-stroke / (gait.duty * period), 0.0], atol=1e-12)
 
@@ -56,10 +52,10 @@ def test_standing_feet_move_at_one_stroke_per_stance(name: str) -> None:
 def test_feet_span_the_stroke_about_their_nominal_place(name: str) -> None:
     gait = GAITS[name]
     _, feet = walk(gait, forward=0.2 / (gait.duty * STEPS))
-    travel = feet[:, :, 0] - np.array(NOMINAL)[:, 0]
+    travel = feet[:, :, 0] - NOMINAL[:, 0]
     np.testing.assert_allclose(travel.max(axis=0), 0.1, atol=0.01)
     np.testing.assert_allclose(travel.min(axis=0), -0.1, atol=0.01)
-    np.testing.assert_allclose(feet[:, :, 1], np.broadcast_to(np.array(NOMINAL)[:, 1], (STEPS, 6)), atol=1e-12)
+    np.testing.assert_allclose(feet[:, :, 1], np.broadcast_to(NOMINAL[:, 1], (STEPS, 6)), atol=1e-12)
 
 
 def test_turning_feet_circle_the_body() -> None:
@@ -67,7 +63,7 @@ def test_turning_feet_circle_the_body() -> None:
     turn = 0.2 / (gait.duty * STEPS)
     phases, feet = walk(gait, forward=0.0, turn=turn)
     for k in range(1, STEPS):
-        for leg, phase in enumerate(gait.leg_phases(phases[k])):
+        for leg, phase in enumerate(leg_phases(gait, phases[k])):
             if 1e-9 < phase <= gait.duty:
                 angle = np.arctan2(*feet[k, leg, ::-1]) - np.arctan2(*feet[k - 1, leg, ::-1])
                 assert (angle + np.pi) % (2 * np.pi) - np.pi == pytest.approx(-turn, rel=1e-3)
@@ -79,7 +75,7 @@ def test_feet_and_heights_are_continuous(name: str) -> None:
     _, feet = walk(gait, forward=0.2 / (gait.duty * STEPS))
     swing_steps = (1 - gait.duty) * STEPS
     assert np.abs(np.diff(feet, axis=0)).max() < 1.6 * 0.2 / swing_steps  # glide's greatest slope is 1.5
-    up = np.array([heights(gait, phase) for phase in np.linspace(0, 1, 2001)])
+    up = np.array([[gait.height(leg, phase) for leg in range(6)] for phase in np.linspace(0, 1, 2001)])
     assert np.abs(np.diff(up, axis=0)).max() < 3.2 / (2000 * (1 - gait.duty))  # lift's greatest slope is 3.08
     assert up.min() == 0.0
     assert up.max() == pytest.approx(1.0, abs=1e-4)
@@ -97,7 +93,7 @@ def test_wave_is_statically_stable_at_every_phase() -> None:
     gait = GAITS["wave"]
     phases, feet = walk(gait, forward=0.2 / (gait.duty * STEPS))
     for phase, at in zip(phases, feet, strict=True):
-        standing = [leg for leg, p in enumerate(gait.leg_phases(phase)) if p <= gait.duty]
+        standing = [leg for leg, p in enumerate(leg_phases(gait, phase)) if p <= gait.duty]
         corners = sorted((at[leg] for leg in standing), key=lambda p: np.arctan2(p[1], p[0]))
         # Counter-clockwise about the origin: all cross products positive, so the origin is inside.
         margins = [a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]

@@ -1,0 +1,1 @@
+cpdef double wrap(double angle) noexcept
