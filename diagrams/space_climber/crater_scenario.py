@@ -11,9 +11,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, Diagram, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus, LeafSystem
 
 from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
@@ -24,7 +25,14 @@ from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, Crater, add_crat
 PAST_RIM = 1.5
 """How far beyond the rim the robot's centre ends a climb, in m: all of the robot is past it."""
 
+PROGRESS = 0.5
+"""How far a robot that is under way gets at least within its patience, in m: a tenth of what it walks in 30 s."""
+
+PASSED = "the robot has passed the rim"
+"""What a simulation says that ends there."""
+
 TIPPED_OVER = np.radians(60.0)
+"""From which roll or pitch on the robot has tipped over."""
 
 
 def _cenic() -> SimulatorConfig:
@@ -55,6 +63,8 @@ class CraterScenario(SpaceClimberScenario):
     boulders: bool = True
     roughness: float = 0.0
     roughness_seed: int = 0
+    # A simulation ends when the robot has come no further from the axis (by `PROGRESS`) for so long, in s; 0: never.
+    patience: float = 0.0
 
     def validate(self) -> None:
         super().validate()
@@ -64,6 +74,7 @@ class CraterScenario(SpaceClimberScenario):
             "seed": (self.seed >= 0, "not negative"),
             "roughness": (0.0 <= self.roughness <= 0.1, "within [0, 0.1] m"),
             "roughness_seed": (self.roughness_seed >= 0, "not negative"),
+            "patience": (self.patience >= 0.0, "not negative, in s"),
         }
         for name, (good, expected) in checks.items():
             if not good:
@@ -113,7 +124,7 @@ class CraterScenario(SpaceClimberScenario):
         base = builder.plant.GetBodyByName("base").index()
         errors = ErrorModel(noise=0.01)
         builder.add_sensor("visual_odometry", VisualOdometer(base, period=self._odometer_period, errors=errors))
-        monitor = builder.add("env", "climb", EndOfClimb(base, period=10 * self.period))
+        monitor = builder.add("env", "climb", EndOfClimb(base, period=10 * self.period, patience=self.patience))
         builder.connect(builder.plant.GetOutputPort("body_poses"), monitor.get_input_port())
 
     def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
@@ -132,7 +143,7 @@ class CraterScenario(SpaceClimberScenario):
 
 
 class EndOfClimb(LeafSystem):
-    """A system that ends the simulation when the robot has passed the rim, or has tipped over.
+    """A system that ends the simulation when the robot has passed the rim, has tipped over, or is stuck.
 
     .. pydrake_system::
 
@@ -143,17 +154,37 @@ class EndOfClimb(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, base: BodyIndex, *, period: float) -> None:
+    def __init__(self, base: BodyIndex, *, period: float, patience: float = 0.0) -> None:
+        """Declare the system.
+
+        Args:
+            base: index of the robot's torso in the plant.
+            period: of its checks, in s.
+            patience: for how long a robot that is stuck has come no further from the axis (by `PROGRESS`), in s; 0: no
+                robot is stuck.
+        """
         super().__init__()
         self._base = int(base)
+        self._checks = patience / period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
-        self.DeclarePeriodicPublishEvent(period, 0.0, self._check)
+        self.DeclareDiscreteState(2)
+        self.variables = (
+            discrete_state("farthest", 0, unit="m"),
+            discrete_state("checks_since", 0, start=1),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
 
-    def _check(self, context: Context) -> EventStatus:
+    def _check(self, context: Context, state: DiscreteValues) -> EventStatus:
         X_WB = self._poses.Eval(context)[self._base]
-        if np.hypot(*X_WB.translation()[:2]) > RIM_RADIUS + PAST_RIM:
-            return EventStatus.ReachedTermination(self, "the robot has passed the rim")
+        distance = np.hypot(*X_WB.translation()[:2])
+        if distance > RIM_RADIUS + PAST_RIM:
+            return EventStatus.ReachedTermination(self, PASSED)
         rotation = X_WB.rotation().ToRollPitchYaw()
         if max(abs(rotation.roll_angle()), abs(rotation.pitch_angle())) > TIPPED_OVER:
             return EventStatus.ReachedTermination(self, "the robot has tipped over")
-        return EventStatus.DidNothing()
+        farthest, checks = context.get_discrete_state(0).value()
+        moved = distance > farthest + PROGRESS
+        state.set_value(0, [distance, 0.0] if moved else [farthest, checks + 1.0])
+        if self._checks and not moved and checks + 1.0 >= self._checks:
+            return EventStatus.ReachedTermination(self, "the robot is stuck")
+        return EventStatus.Succeeded()

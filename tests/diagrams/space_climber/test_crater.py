@@ -6,11 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.analysis import Simulator
 
 import vtbdrake as vtb
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
+from vtbdrake_diagrams.space_climber.crater_scenario import EndOfClimb
 from vtbdrake_diagrams.space_climber.terrain import BEYOND, DEPTH, RIM_RADIUS, SECTOR, WALL_DEG, Crater
 
 AROUND = np.linspace(-np.pi, np.pi, 721)
@@ -177,6 +182,22 @@ def test_a_climb_ends_past_the_rim_or_tipped_over(mental: VirtualTestbed, pose: 
     status = mental.simulator(context).AdvanceTo(0.1)
     assert message in status.FormatMessage()
     assert context.get_time() < 0.1
+
+
+@pytest.mark.parametrize(("patience", "end"), [(0.0, 15.7), (4.0, 6.8)])
+def test_a_robot_that_stands_is_stuck_after_its_patience(patience: float, end: float) -> None:
+    """The system alone, with a robot that walks 0.2 m/s for 5 s and then stands."""
+    system = EndOfClimb(BodyIndex(0), period=0.4, patience=patience)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for k in range(40):
+        pose = RigidTransform([0.2 * min(0.4 * k, 5.0), 0.0, 0.2])
+        system.get_input_port().FixValue(context, Value[list[RigidTransform]]([pose]))
+        status = simulator.AdvanceTo(0.4 * k + 0.1)
+        if "stuck" in status.FormatMessage():
+            break
+    # At 2.8 s it has come 0.56 m; the next 0.5 m would be reached at 1.06 m, but it stands at 1 m.
+    assert context.get_time() == pytest.approx(end)
 
 
 def test_the_believed_elevation_is_that_of_the_map(mental: VirtualTestbed) -> None:
