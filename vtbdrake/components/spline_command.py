@@ -69,7 +69,7 @@ class SplineCommand(LeafSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         plan, spline = self._plan.Eval(context), self._spline
-        if not isfinite(plan.sum()):
+        if not isfinite(plan @ plan):
             raise ValueError(f"SplineCommand: the plan is [t_begin, knots] in finite numbers, not {plan.tolist()}")
         t = context.get_time() - float(plan[0])
         if t < -_ROUNDING:

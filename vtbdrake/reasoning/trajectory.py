@@ -187,9 +187,9 @@ class Trajectory:
         w = np.clip(self._matrix(knots), lower, upper)
         if start is not None:
             w[0] = np.clip(start, lower, upper)
-        for j in range(self.size):
-            if any(value[j] > 0.0 for value in self._beyond(w).values()):
-                w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+        exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
+        for j in np.flatnonzero(exceeded).tolist():
+            w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
         return w.reshape(np.shape(knots))
 
     def _projected(self, w: Array, j: int, *, fixed: int) -> Array:
@@ -218,15 +218,15 @@ class Trajectory:
 
     def _beyond(self, w: Array) -> dict[str, Array]:
         """Return by how much each limit is exceeded, shape (m,) each; not positive where it is kept."""
-        (least, most), speeds, changes = (self.spline.extremes(w, derivative) for derivative in range(3))
-        lower, upper, rate, acceleration = self._limits
+        lower, upper, *rates = self._limits
+        least, most = self.spline.extremes(w)
         tolerance = _ROUNDING * (upper - lower)
-        return {
-            "lower": lower - least - tolerance,
-            "upper": most - upper - tolerance,
-            "rate": np.max(np.abs(speeds), axis=0) - (1.0 + _ROUNDING) * rate,
-            "acceleration": np.max(np.abs(changes), axis=0) - (1.0 + _ROUNDING) * acceleration,
-        }
+        beyond = {"lower": lower - least - tolerance, "upper": most - upper - tolerance}
+        for derivative, (name, limit) in enumerate(zip(_LIMITS[2:], rates, strict=True), 1):
+            if (limit < inf).any():
+                largest = np.max(np.abs(self.spline.extremes(w, derivative)), axis=0)
+                beyond[name] = largest - (1.0 + _ROUNDING) * limit
+        return beyond
 
     def _matrix(self, knots: ArrayLike) -> Array:
         w = np.array(knots, dtype=float)

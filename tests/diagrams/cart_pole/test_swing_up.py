@@ -1,0 +1,70 @@
+"""The swing-up by decisions at a receding horizon, in simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlantConfig
+
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.swing_up import cost, make_reasoner, plan_of, swing_up
+
+UPRIGHT, HANGING = np.array([0.0, np.pi, 0.0, 0.0]), np.zeros(4)
+
+
+def test_the_cost_is_zero_where_the_pole_stands_still_in_the_middle() -> None:
+    assert cost(UPRIGHT) == pytest.approx(0.0, abs=1e-15)
+    assert cost(HANGING) == pytest.approx(2.0)
+    assert all(cost(UPRIGHT + step) > 0.0 for step in 1e-3 * np.eye(4))
+
+
+def test_the_pole_is_swung_up_and_kept_upright() -> None:
+    scenario = CartPoleScenario()
+    with make_reasoner(scenario, rollouts=20, seed=2, executor="serial") as reasoner:
+        swing = swing_up(reasoner, scenario, seconds=4.5)
+    assert swing.tilt[0] == pytest.approx(np.pi)
+    assert swing.tilt[-5:].max() < 0.4
+    assert np.abs(swing.states[:, 0]).max() < 2.0
+    # The force is too small to lift the pole in one go: it swings to both sides.
+    angles = swing.states[: int(np.argmin(swing.tilt > 0.3)), 1]
+    assert angles.min() < -0.2
+    assert angles.max() > 0.2
+    # The plan in use is a candidate, so that no decision is worse by its own prediction.
+    assert all(decision.health.improvement >= 0.0 for decision in swing.decisions)
+    knots = np.array([decision.values["u.plan"][1:] for decision in swing.decisions])
+    assert (np.abs(knots) <= scenario.force_limit).all()
+
+
+def test_the_same_seed_decides_the_same_and_another_one_does_not() -> None:
+    scenario = CartPoleScenario()
+    swings = []
+    for seed in (1, 1, 2):
+        with make_reasoner(scenario, rollouts=8, seed=seed, executor="serial") as reasoner:
+            swings.append(swing_up(reasoner, scenario, seconds=0.5))
+    np.testing.assert_array_equal(swings[0].states, swings[1].states)
+    assert not np.array_equal(swings[0].states, swings[2].states)
+
+
+def test_the_chosen_plan_predicts_the_true_future_where_the_mental_copy_is_as_fine() -> None:
+    scenario = CartPoleScenario(plant_config=MultibodyPlantConfig(time_step=0.02, use_sampled_output_ports=False))
+    testbed = scenario.build()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(10 * scenario.period)
+    with make_reasoner(scenario, rollouts=8, executor="serial") as reasoner:
+        decision = reasoner.decide(testbed, context)
+    decision.apply(testbed, context)
+    assert not decision.keeps_plan
+    times = scenario.period * np.arange(10, 61, 2)
+    costs = []
+    for time in times:
+        simulator.AdvanceTo(time)
+        costs.append(cost(np.array(testbed.reader("plant.state")(context))))
+    assert decision.quality == pytest.approx(np.trapezoid(costs, times), rel=1e-12)
+
+
+def test_the_plan_is_a_trajectory_of_the_testbed() -> None:
+    scenario = CartPoleScenario(order="cubic", knots=6, force_limit=30.0)
+    plan = plan_of(scenario)
+    plan.find(scenario.build().variables())
+    assert (plan.lower, plan.upper, plan.duration) == ((-30.0,), (30.0,), scenario.duration)
