@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 
 import casadi
 
-from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, TipMotion
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, FrameMotion
 from vtbdrake_diagrams.manipulator.motions import Reference
 
 # Name -> (value, unit, bounds).
@@ -117,7 +117,7 @@ def _joint_impedance(
 
 def _cartesian(
     model: ArmDynamics, q: Expression, v: Expression, r: Reference
-) -> tuple[TipMotion, _Projection, Expression, Expression, Expression, Expression]:
+) -> tuple[FrameMotion, _Projection, Expression, Expression, Expression, Expression]:
     """Return the tip, its projection and bias, and e, V_r - J v and A_r for the reference."""
     tip, goal = model.tip(q), model.tip(r.q)
     error = _pose_error(tip.R, tip.p, goal.R, goal.p + r.dp)

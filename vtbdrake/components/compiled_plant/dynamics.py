@@ -32,6 +32,7 @@ from vtbdrake.components.compiled_plant.links import (
     rotation,
     skew,
     symmetric,
+    times,
 )
 
 
@@ -110,7 +111,7 @@ class PlantDynamics:
         tree = read_links(plant, context, inputs)
         self._links = tree.links
         self._symbols = tree.symbols
-        self._number = {link.body: k for k, link in enumerate(tree.links)}
+        self._mounts = tree.mounts
         self._context = context
         self._gravity = constant(np.concatenate([np.zeros(3), plant.gravity_field().gravity_vector()]))
         self._actuation = constant(plant.MakeActuationMatrix())
@@ -209,6 +210,17 @@ class PlantDynamics:
             potential -= casadi.dot(self._gravity[3:], mass * p + R @ moment)
         return kinetic, potential
 
+    def momentum(self, q: Expression, v: Expression, *, rotors: bool = True) -> tuple[Expression, Expression]:
+        """Return the momentum p = M(q) v, and dL/dq of the Lagrangian L = v' M v / 2 - U; ``rotors`` as above.
+
+        Lagrange's equation is then dp/dt = dL/dq + tau (but not for a floating joint, whose v is not qdot).
+        """
+        position, velocity, _ = self.symbols()
+        kinetic, potential = self.energy(position, velocity, rotors=rotors)
+        results = casadi.gradient(kinetic, velocity), casadi.gradient(kinetic - potential, position)
+        p, slope = casadi.substitute(list(results), [position, velocity], [q, v])
+        return casadi.densify(p), casadi.densify(slope)
+
     def step(self, q: Expression, v: Expression, tau: Expression, period: float) -> tuple[Expression, Expression]:
         """Return q and v after one step of Drake's discrete plant: semi-implicit Euler with implicit damping."""
         v_next = v + period * self.acceleration(q, v, tau, period=period)
@@ -252,8 +264,8 @@ class PlantDynamics:
     def frame(self, frame: Frame, q: Expression) -> FrameMotion:
         """Return pose and Jacobian of a frame of the plant."""
         poses = self._poses(q)
-        k, (R_MF, p_MF) = self._on_link(frame)
-        R, p = poses[k][0] @ R_MF, poses[k][1] + poses[k][0] @ p_MF
+        k, X_MF = self._on_link(frame)
+        R, p = X_MF if k < 0 else times(poses[k], X_MF)
         J = casadi.SX(6, self.nv)
         while k >= 0:
             link, (R_WM, p_WM) = self._links[k], poses[k]
@@ -271,6 +283,8 @@ class PlantDynamics:
         for link, move in zip(self._links, moves, strict=True):
             accelerations.append(move.X @ self._of_parent(accelerations, link, casadi.SX(6, 1)) + move.bias)
         k, (_, p_MF) = self._on_link(frame)
+        if k < 0:
+            return casadi.SX(6, 1)
         (R, _), omega = self._poses(q)[k], skew(moves[k].V[:3])
         alpha = accelerations[k][:3]
         # A spatial acceleration is that of a point fixed in space; F's origin moves through it with the link.
@@ -298,17 +312,14 @@ class PlantDynamics:
     def _poses(self, q: Expression) -> list[Pose]:
         poses: list[Pose] = []
         for link in self._links:
-            R, p = (casadi.SX.eye(3), casadi.SX(3, 1)) if link.parent < 0 else poses[link.parent]
-            for R_next, p_next in (link.X_PF, _joint_pose(link, q)):
-                R, p = R @ R_next, p + R @ p_next
-            poses.append((R, p))
+            X_WF = link.X_PF if link.parent < 0 else times(poses[link.parent], link.X_PF)
+            poses.append(times(X_WF, _joint_pose(link, q)))
         return poses
 
     def _on_link(self, frame: Frame) -> tuple[int, Pose]:
-        """Return the number of the link that a frame F is on, and X_MF."""
-        k = self._number[int(frame.body().index())]
-        (R_MB, p_MB), (R_BF, p_BF) = self._links[k].X_MB, constant_pose(frame.CalcPoseInBodyFrame(self._context))
-        return k, (R_MB @ R_BF, p_MB + R_MB @ p_BF)
+        """Return the number of the link that a frame F is on (-1 is the world), and X_MF."""
+        k, X_MB = self._mounts[int(frame.body().index())]
+        return k, times(X_MB, constant_pose(frame.CalcPoseInBodyFrame(self._context)))
 
     @staticmethod
     def _of_parent(values: list[Expression], link: Link, world: Expression) -> Expression:
@@ -345,7 +356,7 @@ class _Factor:
 
     def solve(self, b: Expression) -> Expression:
         if self._root is None:
-            return b / self._D if self._D.numel() else b
+            return b / self._D
         return casadi.solve(self._root, casadi.solve(self._root.T, b))
 
 
@@ -356,9 +367,7 @@ def _joint_pose(link: Link, q: Expression) -> Pose:
         return rotation(link.axis, own), casadi.SX(3, 1)
     if link.kind == PRISMATIC:
         return casadi.SX.eye(3), link.axis * own
-    if link.kind == FLOATING:
-        return _quaternion_rotation(own[:4]), own[4:]
-    return casadi.SX.eye(3), casadi.SX(3, 1)
+    return _quaternion_rotation(own[:4]), own[4:]
 
 
 def _subspace(link: Link, q: Expression) -> Expression:
@@ -367,10 +376,8 @@ def _subspace(link: Link, q: Expression) -> Expression:
         return casadi.vertcat(link.axis, casadi.SX(3, 1))
     if link.kind == PRISMATIC:
         return casadi.vertcat(casadi.SX(3, 1), link.axis)
-    if link.kind == FLOATING:
-        R = _quaternion_rotation(q[link.q][:4])
-        return casadi.diagcat(R.T, R.T)
-    return casadi.SX(6, 0)
+    R = _quaternion_rotation(q[link.q][:4])
+    return casadi.diagcat(R.T, R.T)
 
 
 def _quaternion_rotation(e: Expression) -> Expression:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -29,30 +29,28 @@ class UnsupportedPlantError(ValueError):
 
 @dataclass(frozen=True)
 class Link:
-    """A body with the joint that carries it. Its frame is M, of the joint on its side; F is the joint's other frame.
+    """Bodies that are welded together, and the joint that carries them.
+
+    The frame of the link is M, the frame of the joint on its side; F is the joint's frame on the other side.
 
     Attributes:
-        body: Index of the body.
-        parent: Number of the link that carries it; -1 is the world.
+        parent: Number of the link that carries the joint; -1 is the world.
         kind: Type name of the joint.
         axis: Of the joint, in F and in M, shape (3, 1).
         q: Where its positions lie in those of the plant.
         v: Where its velocities lie in those of the plant.
         X_PF: Pose of F in the frame of the parent.
-        X_MB: Pose of the body's own frame B in M.
-        inertia: M_BMo_M, [angular; linear], shape (6, 6).
+        inertia: M_LMo_M of the link L, [angular; linear], shape (6, 6).
         damping: Of the joint, shape (nv, 1).
         reflected_inertia: Of the joint's actuators, shape (nv, 1).
     """
 
-    body: int
     parent: int
     kind: str
     axis: Expression
     q: slice
     v: slice
     X_PF: Pose
-    X_MB: Pose
     inertia: Expression
     damping: Expression
     reflected_inertia: Expression
@@ -63,12 +61,14 @@ class LinkTree:
     """The links of a plant, parents first.
 
     Attributes:
-        links: One for each body except the world.
+        links: One for each joint that moves.
+        mounts: Number of the link that a body B belongs to, and X_MB, by the index of the body. The world's is -1.
         symbols: The inputs, by address.
         values: What the Context holds for them, by address, flat.
     """
 
     links: tuple[Link, ...]
+    mounts: dict[int, tuple[int, Pose]]
     symbols: dict[str, Expression]
     values: dict[str, NDArray[np.float64]]
 
@@ -103,65 +103,68 @@ class _Reader:
         self._symbols: dict[str, Expression] = {}
         self._values: dict[str, NDArray[np.float64]] = {}
         self._offered: set[str] = set()
+        self._mounts: dict[int, tuple[int, Pose]] = {}
         self._links: list[Link] = []
 
     def tree(self) -> LinkTree:
         reflected = self._reflected_inertias()
-        number = {int(self._plant.world_body().index()): -1}
+        self._mounts[int(self._plant.world_body().index())] = -1, constant_pose(RigidTransform())
         waiting = [self._plant.get_joint(index) for index in self._plant.GetJointIndices()]
         while waiting:
-            known = [(int(j.parent_body().index()) in number, int(j.child_body().index()) in number) for j in waiting]
-            k = next((i for i, (parent, child) in enumerate(known) if parent != child), None)
+            reached = [[int(b.index()) in self._mounts for b in (j.parent_body(), j.child_body())] for j in waiting]
+            k = next((i for i, (parent, child) in enumerate(reached) if parent != child), None)
             if k is None:
                 names = ", ".join(joint.name() for joint in waiting)
                 raise UnsupportedPlantError(f"the plant cannot be compiled: a loop is closed by the joints {names}.")
-            joint = waiting.pop(k)
-            link = self._link(joint, number, reflected, reverse=known[k][1])
-            number[link.body] = len(self._links)
-            self._links.append(link)
+            self._mount(waiting.pop(k), reflected, reverse=reached[k][1])
         self._check_inputs()
         symbols = {address: self._symbols[address] for address in self._inputs}
-        return LinkTree(tuple(self._links), symbols, {address: self._values[address] for address in self._inputs})
+        values = {address: self._values[address] for address in self._inputs}
+        return LinkTree(tuple(self._links), self._mounts, symbols, values)
 
-    def _link(self, joint: Joint, number: dict[int, int], reflected: dict[int, Expression], *, reverse: bool) -> Link:
+    def _mount(self, joint: Joint, reflected: dict[int, Expression], *, reverse: bool) -> None:
+        """Add the body that a joint carries; its child, or its parent in ``reverse``."""
         inner, outer = joint.frame_on_parent(), joint.frame_on_child()
-        sign = 1.0
         if reverse:
-            # Seen from its child, a joint turns or slides the other way.
-            inner, outer, sign = outer, inner, -1.0
+            inner, outer = outer, inner
+        body = outer.body()
+        parent, X_PB = self._mounts[int(inner.body().index())]
+        X_PF = times(X_PB, self._frame_pose(inner))
+        X_MB = _inverse(self._frame_pose(outer))
         kind = joint.type_name()
+        if kind == WELD:
+            X_FM = joint.X_FM()
+            X_PB = times(times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM)), X_MB)
+            self._mounts[int(body.index())] = parent, X_PB
+            inertia = self._inertia(body, X_PB)
+            if parent >= 0:
+                link = self._links[parent]
+                self._links[parent] = replace(link, inertia=link.inertia + inertia)
+            return
         if reverse and kind == FLOATING:
             raise UnsupportedPlantError(
                 f"the plant cannot be compiled: the parent of the floating joint {joint.name()} hangs on its child."
             )
         axis = np.zeros(3)
         if kind == REVOLUTE:
-            axis = sign * np.asarray(joint.revolute_axis())
+            axis = np.asarray(joint.revolute_axis())
         elif kind == PRISMATIC:
-            axis = sign * np.asarray(joint.translation_axis())
-        parent = number[int(inner.body().index())]
-        X_PF = self._frame_pose(inner)
-        if parent >= 0:
-            X_PF = _times(self._links[parent].X_MB, X_PF)
-        if kind == WELD:
-            X_FM = joint.X_FM()
-            X_PF = _times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM))
-        X_MB = _inverse(self._frame_pose(outer))
-        nv = joint.num_velocities()
-        start = joint.velocity_start() if nv else 0
-        damping = self._input(f"{self._address(joint)}.damping", joint.GetDampingVector(self._context))
-        return Link(
-            body=int(outer.body().index()),
-            parent=parent,
-            kind=kind,
-            axis=constant(axis),
-            q=slice(joint.position_start(), joint.position_start() + joint.num_positions()) if nv else slice(0, 0),
-            v=slice(start, start + nv),
-            X_PF=X_PF,
-            X_MB=X_MB,
-            inertia=self._inertia(outer.body(), X_MB),
-            damping=damping,
-            reflected_inertia=reflected.get(int(joint.index()), casadi.SX(nv, 1)),
+            axis = np.asarray(joint.translation_axis())
+        q, v, nv = joint.position_start(), joint.velocity_start(), joint.num_velocities()
+        self._mounts[int(body.index())] = len(self._links), X_MB
+        self._links.append(
+            Link(
+                parent=parent,
+                kind=kind,
+                # Seen from its child, a joint turns or slides the other way.
+                axis=constant(-axis if reverse else axis),
+                q=slice(q, q + joint.num_positions()),
+                v=slice(v, v + nv),
+                X_PF=X_PF,
+                inertia=self._inertia(body, X_MB),
+                damping=self._input(f"{self._address(joint)}.damping", joint.GetDampingVector(self._context)),
+                reflected_inertia=reflected.get(int(joint.index()), casadi.SX(nv, 1)),
+            )
         )
 
     def _inertia(self, body: RigidBody, X_MB: Pose) -> Expression:
@@ -200,7 +203,7 @@ class _Reader:
             self._check_alone(frame, address)
         value = np.concatenate([X_PF.translation(), X_PF.rotation().ToRollPitchYaw().vector()])
         given = self._input(address, value)
-        return _times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(given[3:]), given[:3]))
+        return times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(given[3:]), given[:3]))
 
     def _check_alone(self, frame: FixedOffsetFrame, address: str) -> None:
         """Refuse a pose on which the poses of further frames depend."""
@@ -226,8 +229,6 @@ class _Reader:
     def _input(self, address: str, value: ArrayLike) -> Expression:
         """Return the symbol of an input, or the value itself, shape (n, 1)."""
         array = np.asarray(value, dtype=float).ravel()
-        if not array.size:
-            return casadi.SX(0, 1)
         self._offered.add(address)
         if address not in self._inputs:
             return constant(array)
@@ -336,7 +337,8 @@ def input_name(address: str) -> str:
     return casadi.Function.fix_name(address)
 
 
-def _times(X_AB: Pose, X_BC: Pose) -> Pose:
+def times(X_AB: Pose, X_BC: Pose) -> Pose:
+    """Return X_AC."""
     return X_AB[0] @ X_BC[0], X_AB[1] + X_AB[0] @ X_BC[1]
 
 
