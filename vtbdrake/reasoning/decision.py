@@ -11,6 +11,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout.start import Start
 from vtbdrake.testbed.addressed import AddressedDiagram
 
 if TYPE_CHECKING:
@@ -97,6 +98,7 @@ class Decision:
         doubts: what speaks against it, one sentence each; empty if nothing does.
         name: of the quality.
         minimize: whether the quality is a cost.
+        starts: where the rollouts began, one per sample of the belief.
     """
 
     values: Mapping[str, Any]
@@ -110,6 +112,7 @@ class Decision:
     doubts: tuple[str, ...]
     name: str
     minimize: bool = False
+    starts: tuple[Start, ...] = field(default=(), repr=False)
 
     def __bool__(self) -> bool:
         return self.chosen is not None
@@ -195,14 +198,14 @@ class Decision:
         return summary_html(repr(self), {**rows, **self._facts()}, self.plot() if drawn else None)
 
     def plot(self) -> Figure:
-        """Plot the quality of the best candidates over time, each by its first sample (Figure 5).
+        """Plot the quality of the candidates over time (Figure 5), and over what is decided (Figure 6).
 
         Raises:
             ValueError: no rollout has a quality.
         """
-        from vtbdrake.visualization import plot_quality
+        from vtbdrake.visualization import plot_decision
 
-        return plot_quality([c.rollouts[0] for c in self.ranked if _drawable(c)][:_SHOWN])
+        return plot_decision(self)
 
 
 # So many candidates are shown at most.

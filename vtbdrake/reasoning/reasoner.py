@@ -17,14 +17,14 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.evaluator import Evaluator
-from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.problem import Motion, Problem
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.reasoning.decision import ELIGIBLE, FAILED, UNFINISHED, VIOLATES, Candidate, Decision, Health
 from vtbdrake.reasoning.space import DecisionSpace, Element, same_values
-from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, make_executor
+from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, RolloutRunner, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Start
 from vtbdrake.testbed import Scenario, VirtualTestbed
@@ -233,6 +233,20 @@ class Reasoner:
             given = None if plan is None else self.space.point(plan, start.time)
             return _Thinking(self, [start] * self.samples, held, given, begin).decision()
 
+    def motion(self, decision: Decision, candidate: int) -> Motion:
+        """Return the motion of the mental world under a candidate, from the first sample of the belief.
+
+        Its rollout is simulated again, with the same result.
+
+        Args:
+            decision: a decision of this reasoner.
+            candidate: the number of the candidate.
+        """
+        task = replace(self.task, record=("plant.state",))
+        values = decision.candidates[candidate].values if candidate else {}
+        result = RolloutRunner(task, self.problem.testbed).run(values, start=decision.starts[0])
+        return Motion(task.scenario, result.times, result.record["plant.state"])
+
     @contextmanager
     def _only_one(self) -> Iterator[None]:
         if not self._alone.acquire(blocking=False):
@@ -432,6 +446,7 @@ class _Thinking:
             doubts=tuple(_doubts(candidates, ranked, results)),
             name=problem.objectives[0].name,
             minimize=problem.objectives[0].minimize,
+            starts=tuple(self._starts),
         )
 
     def _keys(self) -> Iterator[RolloutKey]:

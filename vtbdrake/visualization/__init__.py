@@ -1,7 +1,19 @@
 """Pictures: plots of sweeps, studies and rollouts, recordings in Meshcat, the drawing of a testbed."""
 
+from vtbdrake.visualization.decisions import plot_decision, show_decision
 from vtbdrake.visualization.diagram import svg
-from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions
+from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions, show_poses
 from vtbdrake.visualization.plots import plot_quality, plot_sweep
 
-__all__ = ["Scene", "make_meshcat", "plot_quality", "plot_sweep", "show_motion", "show_motions", "svg"]
+__all__ = [
+    "Scene",
+    "make_meshcat",
+    "plot_decision",
+    "plot_quality",
+    "plot_sweep",
+    "show_decision",
+    "show_motion",
+    "show_motions",
+    "show_poses",
+    "svg",
+]

@@ -1,20 +1,29 @@
-"""Recordings of motions in Meshcat, one or several overlaid (Figure 7), in a notebook or as a web page."""
+"""Motions in Meshcat, recorded (Figure 7) or as poses at several instants (Figure 8), in a notebook or a web page."""
 
 from __future__ import annotations
 
 import html
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
-from pydrake.geometry import IllustrationProperties, Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, Role
+from pydrake.geometry import (
+    GeometryId,
+    IllustrationProperties,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    Rgba,
+    Role,
+    SceneGraphInspector,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
@@ -133,12 +142,7 @@ def show_motions(
     Raises:
         ValueError: There is no motion, a label or opacity makes no sense, or as in `show_motion`.
     """
-    if not motions:
-        raise ValueError("there is no motion to show")
-    tints = {name: to_hex(c) for name, c in (zip(motions, cycle(_PALETTE)) if colors is None else colors.items())}
-    opacities = dict(opacity) if isinstance(opacity, Mapping) else dict.fromkeys(motions, float(opacity))
-    for unknown in (tints.keys() | opacities.keys()) - motions.keys():
-        raise ValueError(f"there is no motion {unknown!r}; there are: {', '.join(motions)}")
+    tints, opacities = _looks(motions, colors, opacity)
     step = np.asarray(spacing, dtype=float)
     if step.shape != (3,):
         raise ValueError(f"spacing is a displacement of shape (3,) in metres, not of shape {step.shape}")
@@ -146,18 +150,120 @@ def show_motions(
     for number, (name, motion) in enumerate(motions.items()):
         path = f"{prefix}/{name}"
         _check(motion, path, rate)
-        if not name or "/" in name:
-            raise ValueError(f"a label is part of a Meshcat path and has no '/', unlike {name!r}")
-        strength = opacities.get(name, 1.0)
-        if not 0.0 < strength <= 1.0:
-            raise ValueError(f"the opacity of {name} must lie in (0, 1], not be {strength}")
         drawn = any(other.motion.scenario == motion.scenario for other in actors) and not step.any()
         actors.append(
-            _Actor(motion, path, tint=tints.get(name), opacity=strength, offset=number * step, surroundings=not drawn)
+            _Actor(
+                motion,
+                path,
+                tint=tints.get(name),
+                opacity=opacities.get(name, 1.0),
+                offset=number * step,
+                surroundings=not drawn,
+            )
         )
     meshcat.Delete(prefix)
     _record(meshcat, actors, rate)
     return Scene(meshcat, legend=tints)
+
+
+def show_poses(
+    meshcat: Meshcat,
+    motions: Mapping[str, Motion],
+    *,
+    count: int = 8,
+    prefix: str = "poses",
+    colors: Mapping[str, ColorType] | None = None,
+    opacity: float | Mapping[str, float] = 1.0,
+    title: str = "",
+) -> Scene:
+    """Draw motions as poses at several instants, like a photograph that is exposed several times (Figure 8).
+
+    Each motion is drawn under ``<prefix>/<label>``, its surroundings once per scenario under ``<prefix>/surroundings``.
+
+    Args:
+        meshcat: The server that shows them.
+        motions: Label -> motion.
+        count: The number of instants per motion, equally spaced from its begin to its end.
+        prefix: The Meshcat path under which they are drawn.
+        colors: Label -> tint, as in `show_motions`.
+        opacity: Opacity of the moving bodies, in (0, 1], for all or by label.
+        title: A caption of the scene.
+
+    Returns:
+        The scene, whose legend names the tints; it shows itself in a notebook.
+
+    Raises:
+        ValueError: There is no motion or instant, a label or opacity makes no sense, or as in `show_motion`.
+    """
+    tints, opacities = _looks(motions, colors, opacity)
+    if count < 1:
+        raise ValueError(f"a motion is drawn at one instant at least, not at {count}")
+    for name, motion in motions.items():
+        _check(motion, f"{prefix}/{name}", 1.0)
+    meshcat.Delete(prefix)
+    built: list[tuple[Motion, VirtualTestbed]] = []
+    for name, motion in motions.items():
+        testbed = next((t for other, t in built if other.scenario == motion.scenario), None)
+        if testbed is None:
+            testbed = motion.scenario.build()
+            _draw(meshcat, testbed, f"{prefix}/surroundings/{len(built)}", moving=False)
+            built.append((motion, testbed))
+        states = _states(motion, testbed, f"{prefix}/{name}")
+        instants = np.linspace(0, len(states) - 1, count).round().astype(int)
+        for k, sample in enumerate(dict.fromkeys(instants.tolist())):
+            _draw(
+                meshcat,
+                testbed,
+                f"{prefix}/{name}/{k}",
+                moving=True,
+                state=states[sample],
+                tint=tints.get(name),
+                opacity=opacities.get(name, 1.0),
+            )
+    return Scene(meshcat, title=title, legend=tints)
+
+
+def _draw(
+    meshcat: Meshcat,
+    testbed: VirtualTestbed,
+    path: str,
+    *,
+    moving: bool,
+    state: np.ndarray | None = None,
+    tint: str | None = None,
+    opacity: float = 1.0,
+) -> None:
+    """Draw the moving or the anchored bodies of a plant, in the state [q; v] if one is given."""
+    plant, scene_graph = testbed.plant, testbed.scene_graph
+    assert plant is not None and scene_graph is not None
+    inspector, context = scene_graph.model_inspector(), testbed.default_context()
+    own = plant.GetMyMutableContextFromRoot(context)
+    if state is not None:
+        plant.SetPositionsAndVelocities(own, state)
+    for body, geometry in _visible(plant):
+        if plant.IsAnchored(body) != moving:
+            part = f"{path}/{body.scoped_name()}/{geometry.get_value()}".replace("::", "/")
+            meshcat.SetObject(part, inspector.GetShape(geometry), _tinted(_color(inspector, geometry), tint, opacity))
+            meshcat.SetTransform(part, plant.EvalBodyPoseInWorld(own, body) @ inspector.GetPoseInFrame(geometry))
+
+
+def _looks(
+    motions: Mapping[str, Motion], colors: Mapping[str, ColorType] | None, opacity: float | Mapping[str, float]
+) -> tuple[dict[str, str], dict[str, float]]:
+    """Return the tints and the opacities by label."""
+    if not motions:
+        raise ValueError("there is no motion to show")
+    tints = {name: to_hex(c) for name, c in (zip(motions, cycle(_PALETTE)) if colors is None else colors.items())}
+    opacities = dict(opacity) if isinstance(opacity, Mapping) else dict.fromkeys(motions, float(opacity))
+    for unknown in (tints.keys() | opacities.keys()) - motions.keys():
+        raise ValueError(f"there is no motion {unknown!r}; there are: {', '.join(motions)}")
+    for name in motions:
+        if not name or "/" in name:
+            raise ValueError(f"a label is part of a Meshcat path and has no '/', unlike {name!r}")
+    for name, strength in opacities.items():
+        if not 0.0 < strength <= 1.0:
+            raise ValueError(f"the opacity of {name} must lie in (0, 1], not be {strength}")
+    return tints, opacities
 
 
 def _check(motion: Motion, path: str, rate: float) -> None:
@@ -165,6 +271,41 @@ def _check(motion: Motion, path: str, rate: float) -> None:
         raise ValueError(f"the motion for {path} has no sample: its simulation failed at once")
     if not rate > 0.0:
         raise ValueError(f"rate is a positive number of keyframes per second, not {rate}")
+
+
+def _states(motion: Motion, testbed: VirtualTestbed, path: str) -> np.ndarray:
+    """Return the states of a motion, shape (n, nq + nv)."""
+    plant = testbed.plant
+    if plant is None:
+        raise ValueError(f"the scenario of the motion for {path} has no plant, so that there is nothing to draw")
+    states, size = np.asarray(motion.states), plant.num_positions() + plant.num_velocities()
+    if states.shape != (len(motion.times), size):
+        raise ValueError(
+            f"the motion for {path} has states of shape {states.shape}, but its {len(motion.times)} samples and the "
+            f"scenario's plant make ({len(motion.times)}, {size})"
+        )
+    return states
+
+
+def _visible(plant: MultibodyPlant) -> Iterator[tuple[RigidBody, GeometryId]]:
+    for index in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(index))
+        for geometry in plant.GetVisualGeometriesForBody(body):
+            yield body, geometry
+
+
+def _color(inspector: SceneGraphInspector, geometry: GeometryId) -> Rgba:
+    properties = inspector.GetIllustrationProperties(geometry)
+    color: Rgba = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
+    return color
+
+
+def _tinted(color: Rgba, tint: str | None, opacity: float) -> Rgba:
+    rgb = np.array([color.r(), color.g(), color.b()])
+    if tint is not None:
+        # The old colour's brightness stays, so that the parts of a robot can be distinguished.
+        rgb = 0.75 * np.array(to_rgb(tint)) + 0.25 * rgb @ _BRIGHTNESS
+    return Rgba(*rgb, color.a() * opacity)
 
 
 def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> None:
@@ -194,7 +335,7 @@ class _Actor:
     ) -> None:
         self.motion = motion
         self.path = path
-        self._tint = to_rgb(tint) if tint is not None else None
+        self._tint = tint
         self._opacity = opacity
         self._offset = offset if offset is not None else np.zeros(3)
         self._surroundings = surroundings
@@ -202,13 +343,8 @@ class _Actor:
     def play(self, meshcat: Meshcat, end: float, rate: float) -> None:
         testbed = self.motion.scenario.build(meshcat=meshcat, prefix=self.path)
         plant = testbed.plant
+        states = _states(self.motion, testbed, self.path)
         assert plant is not None
-        states, size = np.asarray(self.motion.states), plant.num_positions() + plant.num_velocities()
-        if states.shape != (len(self.motion.times), size):
-            raise ValueError(
-                f"the motion for {self.path} has states of shape {states.shape}, but its {len(self.motion.times)} "
-                f"samples and the scenario's plant make ({len(self.motion.times)}, {size})"
-            )
         self._paint(testbed, plant)
         context = testbed.default_context()
         visualizer = next(s for s in testbed.diagram.GetSystems() if isinstance(s, MeshcatVisualizer))
@@ -225,25 +361,16 @@ class _Actor:
         scene_graph = testbed.scene_graph
         assert scene_graph is not None
         inspector, source = scene_graph.model_inspector(), plant.get_source_id()
-        for index in range(plant.num_bodies()):
-            body = plant.get_body(BodyIndex(index))
-            for geometry in plant.GetVisualGeometriesForBody(body):
-                if plant.IsAnchored(body):
-                    if not self._surroundings:
-                        scene_graph.RemoveRole(source, geometry, Role.kIllustration)
-                elif self._tint is not None or self._opacity < 1.0:
-                    properties = IllustrationProperties(inspector.GetIllustrationProperties(geometry))
-                    color = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
-                    properties.UpdateProperty("phong", "diffuse", self._paint_over(color))
+        for body, geometry in _visible(plant):
+            if plant.IsAnchored(body):
+                if not self._surroundings:
                     scene_graph.RemoveRole(source, geometry, Role.kIllustration)
-                    scene_graph.AssignRole(source, geometry, properties)
-
-    def _paint_over(self, color: Rgba) -> Rgba:
-        rgb = np.array([color.r(), color.g(), color.b()])
-        if self._tint is not None:
-            # The old colour's brightness stays, so that the parts of a robot can be distinguished.
-            rgb = 0.75 * np.array(self._tint) + 0.25 * rgb @ _BRIGHTNESS
-        return Rgba(*rgb, color.a() * self._opacity)
+            elif self._tint is not None or self._opacity < 1.0:
+                properties = IllustrationProperties(inspector.GetIllustrationProperties(geometry))
+                color = _tinted(_color(inspector, geometry), self._tint, self._opacity)
+                properties.UpdateProperty("phong", "diffuse", color)
+                scene_graph.RemoveRole(source, geometry, Role.kIllustration)
+                scene_graph.AssignRole(source, geometry, properties)
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
