@@ -3,6 +3,7 @@
 from vtbdrake.reasoning.decision import Candidate as Candidate
 from vtbdrake.reasoning.decision import Decision as Decision
 from vtbdrake.reasoning.decision import Health as Health
+from vtbdrake.reasoning.onboard import OnboardReasoner as OnboardReasoner
 from vtbdrake.reasoning.reasoner import Budget as Budget
 from vtbdrake.reasoning.reasoner import Reasoner as Reasoner
 from vtbdrake.reasoning.reasoner import ReasonerError as ReasonerError

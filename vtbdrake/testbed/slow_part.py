@@ -362,7 +362,7 @@ class SlowPart(LeafSystem):
     def _sample(self, context: Context, state: State) -> None:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
         progress: Progress = value.get_value()
-        tick = round((context.get_time() - self.offset) / self.period)
+        tick = self._tick(context, 0.0)
         # After an exception in one of them, the events of an instant are repeated.
         if progress.find(tick) is None and self._is_wanted(context, progress):
             sample = {name: port.Eval(context) for name, port in self._inputs.items()}
@@ -391,7 +391,7 @@ class SlowPart(LeafSystem):
     def _show(self, context: Context, state: State) -> None:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
         progress: Progress = value.get_value()
-        tick = round((context.get_time() - self.offset - self.latency) / self.period)
+        tick = self._tick(context, self.latency)
         work = progress.find(tick)
         if work is None:
             return
@@ -401,17 +401,28 @@ class SlowPart(LeafSystem):
             assert work is not None
         if work.status == DONE:
             outputs = dict(work.arrays)
-            numbers: dict[Any, Any] = {index: outputs.pop(name) for name, index in self._vectors.items()}
-            numbers[self._told[_SAMPLED_AT]] = [self.offset + tick * self.period]
+            self._show_vectors(state, tick, {name: outputs.pop(name) for name in self._vectors})
             progress = progress.after(work, shown=outputs)
         else:
             missed = context.get_discrete_state(self._told[_MISSED]).value()
-            numbers = {self._told[_MISSED]: missed + 1.0}
+            self._set_numbers(state, {self._told[_MISSED]: missed + 1.0, self._told[_VALID]: [0.0]})
             progress = progress.after(work, shown=progress.shown)
-        numbers[self._told[_VALID]] = [float(work.status == DONE)]
+        value.set_value(progress)
+
+    def _tick(self, context: Context, delay: float) -> int:
+        """Return the number of the sample that was taken ``delay`` seconds ago."""
+        return round((context.get_time() - self.offset - delay) / self.period)
+
+    def _show_vectors(self, state: State, tick: int, vectors: Arrays) -> None:
+        """Show vector outputs of the result of sample number ``tick``."""
+        numbers: dict[Any, Any] = {self._vectors[name]: vector for name, vector in vectors.items()}
+        numbers |= {self._told[_SAMPLED_AT]: [self.offset + tick * self.period], self._told[_VALID]: [1.0]}
+        self._set_numbers(state, numbers)
+
+    @staticmethod
+    def _set_numbers(state: State, numbers: Mapping[Any, Any]) -> None:
         for index, number in numbers.items():
             state.get_mutable_discrete_state().set_value(int(index), number)
-        value.set_value(progress)
 
     # -- the state of the whole DPS, for a part that samples it
 

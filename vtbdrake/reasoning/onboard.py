@@ -1,0 +1,290 @@
+"""The reasoner on board: a slow part of the DPS that decides by rollouts in a mental copy of its own testbed."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, State
+
+from vtbdrake.reasoning.reasoner import Budget, Reasoner
+from vtbdrake.rollout.executor import checked_workers
+from vtbdrake.state import NO_DICT, VariableError, parameter
+from vtbdrake.testbed import Scenario, SlowPart, slow_parts
+from vtbdrake.testbed.dps_state import DpsState
+from vtbdrake.testbed.switch import COMMAND
+
+if TYPE_CHECKING:
+    from vtbdrake.reasoning.space import Element
+    from vtbdrake.rollout import Quality
+
+_log = logging.getLogger(__name__)
+
+# The share of the latency that a decision beside a loop may take; the rest is for the way there and back.
+_SHARE = 0.8
+
+_DECISION, _CANDIDATE, _CANDIDATE_AT = "decision", "candidate", "candidate_at"
+_QUALITY, _IMPROVEMENT, _ROLLOUTS = "quality", "improvement", "rollouts"
+
+
+class OnboardReasoner(SlowPart):
+    """A part of the DPS that decides by rollouts of the DPS's own testbed, while the fast loop runs.
+
+    .. pydrake_system::
+
+        name: OnboardReasoner
+        input_ports:
+        - <believed>
+        - request (only with ``on_request``)
+        - dps (filled by `AddressedDiagram.attach`)
+        output_ports:
+        - decision
+        - quality (of the decision, in the unit of the quality; at first NaN)
+        - improvement (over the plan in use, likewise; NaN if that is not eligible)
+        - rollouts (that the decision took)
+        - sampled_at (s; when the state was sampled from which the decision was made, at first -inf)
+        - valid (1 if the decision that was due last was there, else 0)
+        - missed (how many were not)
+        - taken (only with ``on_request``: the request that was taken last, at first 0)
+
+    At t_k it samples the state of the DPS. From t_k + latency on, ``decision`` is the best candidate that a `Reasoner`
+    has found. If none is eligible, or nothing can be believed, or the answer does not come in time, the plan in use
+    stays and ``valid`` is 0: what the DPS does then is its own business.
+
+    In a mental copy (``mental=True``) the same part, with the same ports, does not reason. At t_k + latency it shows
+    the candidate of that rollout, its parameter ``candidate``. So each candidate enters the DPS at the port and at the
+    instant at which the decision will enter it. Afterwards the plan stays, and no request is taken. The outputs
+    ``quality``, ``improvement``, ``rollouts`` and ``missed`` do not change in a mental copy: a DPS whose behaviour
+    depends on them is not predicted rightly.
+
+    In a simulation the thinking time is the latency, and the budget is one of rollouts, so that a decision can be
+    repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop it thinks in
+    processes of its own, and the budget ends after 0.8 of the latency at the latest; the best candidate by then is the
+    decision.
+
+    Args:
+        size: Entries of the decision.
+        scenario: That of the DPS. Its `Scenario.mental` has this part in the same place, with ``mental=True``.
+        decision: What is decided, see `Reasoner`: elements of the parameter ``candidate`` of this part
+            (``dps.<path>.candidate``, or one entry ``dps.<path>.candidate[0]``).
+        quality: See `Reasoner`.
+        horizon: Of a rollout in seconds from t_k on; longer than the latency.
+        budget: Of a decision; it counts rollouts.
+        period, latency, offset, patience: See `SlowPart`.
+        initial: The decision until the first one is made, a scalar or shape (size,).
+        on_request: Whether it decides once for each new request. Otherwise it decides at every t_k, at a receding
+            horizon, and the latency is at most the period.
+        believed: Names of further input ports, with their sizes. In a mental copy, the parameter of that name of this
+            part is the value of the port at t_k, for the rules that lead from estimates to the simulated world
+            (`VirtualTestbedBuilder.believe`).
+        mental: Whether this is the part of a mental copy.
+        niceness: Of the processes beside a loop, from 0 to 19, so that they leave the processors to others.
+        options: Further arguments of `Reasoner`. Its executor and workers are used beside a loop.
+
+    Raises:
+        ValueError: The budget does not count rollouts, something else than a candidate is decided, the horizon ends
+            before a decision is shown, or see `SlowPart`.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self,
+        size: int,
+        *,
+        scenario: Scenario,
+        decision: Sequence[Element],
+        quality: Quality,
+        horizon: float,
+        budget: Budget,
+        period: float,
+        latency: float,
+        offset: float = 0.0,
+        patience: float = 20.0,
+        initial: ArrayLike = 0.0,
+        on_request: bool = False,
+        believed: Mapping[str, int] | None = None,
+        mental: bool = False,
+        niceness: int = 5,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        _check(decision, budget, horizon, latency, niceness)
+        arguments = {
+            "scenario": scenario,
+            "decision": tuple(decision),
+            "quality": quality,
+            "horizon": horizon,
+            "budget": budget,
+            **(options or {}),
+        }
+        believed = dict(believed or {})
+        super().__init__(
+            _Thinker(arguments, seconds=_SHARE * latency, niceness=niceness),
+            inputs=believed,
+            outputs={_DECISION: size, **dict.fromkeys((_QUALITY, _IMPROVEMENT, _ROLLOUTS), 1)},
+            period=period,
+            latency=latency,
+            offset=offset,
+            patience=patience,
+            initial={
+                _DECISION: np.array(np.broadcast_to(np.asarray(initial, dtype=float), (size,))),
+                _QUALITY: np.array([np.nan]),
+                _IMPROVEMENT: np.array([np.nan]),
+            },
+            on_request=on_request,
+            samples_dps=True,
+        )
+        self.mental = mental
+        sizes = {_CANDIDATE: size, **believed}
+        groups = {name: self.DeclareNumericParameter(BasicVector(np.zeros(n))) for name, n in sizes.items()}
+        self._candidate = groups[_CANDIDATE]
+        self._candidate_at = self.DeclareNumericParameter(BasicVector([-inf]))
+        self.variables = (
+            *self.variables,
+            *(parameter(name, groups[name], shape=() if n == 1 else (n,)) for name, n in sizes.items()),
+            parameter(_CANDIDATE_AT, self._candidate_at, unit="s"),
+        )
+
+    def _sample(self, context: Context, state: State) -> None:
+        if not self.mental:
+            super()._sample(context, state)
+        elif self._request is not None and self._is_for_candidate(self._tick(context, 0.0), context):
+            self._take_request(context, state)
+
+    def _show(self, context: Context, state: State) -> None:
+        if not self.mental:
+            super()._show(context, state)
+            return
+        tick = self._tick(context, self.latency)
+        if self._is_for_candidate(tick, context):
+            self._show_vectors(state, tick, {_DECISION: context.get_numeric_parameter(self._candidate).value()})
+
+    def _is_for_candidate(self, tick: int, context: Context) -> bool:
+        """Return whether the candidate of the rollout is the result of sample number ``tick``."""
+        (at,) = context.get_numeric_parameter(self._candidate_at).value()
+        return bool(abs(at - self.offset - tick * self.period) < 0.5 * self.period)
+
+
+class _Thinker:
+    """The function of an `OnboardReasoner`. It makes its reasoner when it is first needed, and keeps it.
+
+    A decision depends on nothing but the arguments of the call. Several contexts of one Diagram take turns.
+
+    Args:
+        arguments: Those of the reasoner.
+        seconds: The longest wall time of a decision beside a loop.
+        niceness: Of the process beside a loop, and of its workers.
+    """
+
+    def __init__(self, arguments: Mapping[str, Any], *, seconds: float, niceness: int) -> None:
+        self._arguments = dict(arguments)
+        self._seconds, self._niceness = seconds, niceness
+        self.__setstate__(self.__dict__)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("_arguments", "_seconds", "_niceness")}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._reasoner: Reasoner | None = None
+        self._taking_turns = threading.Lock()
+
+    def prepare(self) -> None:
+        """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""
+        os.nice(self._niceness)
+        budget = self._arguments["budget"]
+        seconds = min(budget.seconds or inf, self._seconds)
+        reasoner = self._make(**{**self._arguments, "budget": replace(budget, seconds=seconds)})
+        brief = replace(reasoner.task, horizon=reasoner.task.sample_period, threshold=None)
+        # One rollout of one sample per worker.
+        list(reasoner.executor.run(brief, [{}] * checked_workers(self._arguments.get("workers"))))
+
+    def __call__(
+        self, *, dps: DpsState, request: np.ndarray | None = None, **believed: np.ndarray
+    ) -> dict[str, np.ndarray] | None:
+        """Return the outputs of the part, or None if there is no decision.
+
+        Args:
+            dps: The state of the DPS.
+            request: What it was asked; all requests ask for the same.
+            **believed: The values of the further ports.
+        """
+        with self._taking_turns:
+            if self._reasoner is None:
+                budget = replace(self._arguments["budget"], seconds=None)
+                self._make(**{**self._arguments, "budget": budget, "executor": "serial", "workers": None})
+            try:
+                return self._decide(dps, believed)
+            except VariableError as error:
+                _log.warning("nothing was decided at t = %g s: %s", dps.time, error)
+                return None
+
+    def _make(self, **arguments: Any) -> Reasoner:
+        self._reasoner = reasoner = Reasoner(**arguments)
+        testbed = reasoner.problem.testbed
+        parts = {path: part for path, part in slow_parts(testbed.diagram).items() if isinstance(part, OnboardReasoner)}
+        if [part.mental for part in parts.values()] != [True]:
+            raise ValueError(
+                f"the mental scenario {type(testbed.scenario).__name__} reasons itself: give its OnboardReasoner "
+                "mental=True, by a field that Scenario.mental() sets"
+            )
+        (self._path,) = parts
+        for element in self._arguments["decision"]:
+            if element.address.partition("[")[0] != f"{self._path}.{_CANDIDATE}":
+                raise ValueError(f"a reasoner on board decides {self._path}.{_CANDIDATE}, not {element.address}")
+        self._testbed, self._context = testbed, testbed.default_context()
+        return reasoner
+
+    def _decide(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+        assert self._reasoner is not None
+        self._begin(dps, believed)
+        decision = self._reasoner.decide(self._testbed, self._context)
+        if not decision:
+            _log.warning("nothing was decided at t = %g s: %s", dps.time, decision.message)
+            return None
+        decision.apply(self._testbed, self._context)
+        return {
+            _DECISION: np.atleast_1d(self._testbed.read(self._context, f"{self._path}.{_CANDIDATE}")),
+            _QUALITY: np.array([decision.quality]),
+            _IMPROVEMENT: np.array([decision.health.improvement]),
+            _ROLLOUTS: np.array([float(decision.health.rollouts)]),
+        }
+
+    def _begin(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> None:
+        """Set the mental testbed to the state of the DPS, with the plan in use as the candidate."""
+        testbed, context, part = self._testbed, self._context, self._path
+        testbed.dps_layout.put(context, dps.contents)
+        context.SetTime(dps.time)
+        values = {f"{part}.{name}": value for name, value in believed.items()}
+        values |= {f"{COMMAND}{name}": value for name, value in dps.commands.items()}
+        values[f"{part}.{_CANDIDATE}"] = testbed.read(context, f"{part}.{_DECISION}")
+        values[f"{part}.{_CANDIDATE_AT}"] = np.array(dps.time)
+        variables = testbed.variables()
+        testbed.write(context, {a: np.reshape(value, variables[a].shape) for a, value in values.items()})
+        if testbed.believes:
+            testbed.start_from_belief(context)
+
+
+def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency: float, niceness: int) -> None:
+    if budget.rollouts is None:
+        raise ValueError(f"a reasoner on board has a budget of rollouts, Budget(rollouts=70), say, not {budget}")
+    for element in decision:
+        if not element.address.partition("[")[0].endswith(f".{_CANDIDATE}"):
+            raise ValueError(
+                f"a reasoner on board decides its own parameter, dps.<path>.{_CANDIDATE}, not {element.address}: "
+                "connect its port decision to what the decision is for"
+            )
+    if not horizon > latency:
+        raise ValueError(
+            f"a horizon of {horizon:g} s ends before a decision is shown, {latency:g} s after its sample: choose a "
+            "longer one"
+        )
+    if not 0 <= niceness <= 19:
+        raise ValueError(f"the niceness of a process is from 0 to 19, not {niceness}")
