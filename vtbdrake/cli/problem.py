@@ -144,10 +144,6 @@ def _quality(text: str, of: Sequence[str]) -> Quality:
 def make_constraint(text: str, *, limit: str) -> Constraint:
     """Return the constraint ``ADDRESS=NUMBER`` or ``module:function(ADDRESS,...)=NUMBER``.
 
-    Args:
-        text: The constraint.
-        limit: ``at_most`` or ``at_least``.
-
     Raises:
         click.BadParameter: The text has another form.
         click.UsageError: The function does not exist.

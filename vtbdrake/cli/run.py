@@ -131,11 +131,7 @@ def run(
 
 
 def _report_faults(guards: Guards, begin: float) -> None:
-    """Print the faults of the loop.
-
-    Raises:
-        FailedError: The fallbacks were commanding at the end.
-    """
+    """Print the faults of the loop."""
     faults = [fault for fault in guards.log if fault.kind != "told"]
     for fault in faults[:MOST_FAULTS]:
         click.echo(f"fault after {number(fault.time - begin)} s: {fault.reason}")
@@ -147,11 +143,7 @@ def _report_faults(guards: Guards, begin: float) -> None:
 
 
 def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
-    """Take over, and run until the time is up or Ctrl-C.
-
-    Raises:
-        FailedError: The machine was not ready in time.
-    """
+    """Take over, and run until the time is up or Ctrl-C."""
     try:
         runtime.take_over(timeout=wait)
         _log.info("the DPS commands; its time is %s s", number(runtime.time))

@@ -73,13 +73,10 @@ class BackgroundProcess:
         arguments: Picklable values.
         name: The name of the worker in errors and logs.
         backlog: The number of bytes that may wait to be sent; frames beyond that are dropped.
-
-    Attributes:
-        dropped: The number of frames that were dropped.
     """
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
-        self.dropped = 0
+        self.dropped = 0  # the number of frames that were dropped
         self._backlog = backlog
         self._unsent: deque[memoryview] = deque()
         self._unsent_bytes = 0

@@ -46,13 +46,6 @@ class SlowParts:
     because the function raised an exception or the worker was lost. A worker has one request at a time; samples that
     it cannot begin in time become missing, so that no queue grows.
 
-    Args:
-        parts: The slow parts by path.
-        context: The context of the Diagram that contains them.
-        period: The period of the loop, in seconds.
-        clock: The clock of the loop.
-        changed: Called with the kind and the values of every `Change`.
-
     Raises:
         ValueError: A latency is so short that no result could arrive in time, or a function cannot be sent to another
             process.

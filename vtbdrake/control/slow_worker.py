@@ -69,12 +69,7 @@ def _forward(loop: FrameConnection, worker: BackgroundProcess, patience: float) 
 
 
 def compute(supervisor: FrameConnection, function: bytes) -> None:
-    """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error).
-
-    Args:
-        supervisor: The connection to the supervisor.
-        function: A `SlowFunction`, pickled by cloudpickle.
-    """
+    """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error)."""
     evaluate = pickle.loads(function)
     evaluate.prepare()
     supervisor.send(*pack((READY, None)))

@@ -76,10 +76,6 @@ def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:
     """Return Python's wrappers of all numeric parameters below ``diagram``, to be kept alive while it is stepped.
 
     Otherwise pydrake makes and discards a wrapper (1 us) whenever a system in Python reads its parameters.
-
-    Args:
-        diagram: The root of ``context``, or a part of it.
-        context: The root context.
     """
     contexts = [system.GetMyContextFromRoot(context) for _, system in leaves(diagram)]
     return [own.get_numeric_parameter(i) for own in contexts for i in range(own.num_numeric_parameter_groups())]

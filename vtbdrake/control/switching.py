@@ -48,12 +48,6 @@ def prepare(
     sensor signals on real, and the one that its command departs from. The command of an actuator signal that becomes
     real must continue what is measured. The machine must be ready and connected, and have no other commander.
 
-    Args:
-        runtime: The loop.
-        mode: As in `VirtualTestbed.switch`.
-        sense: As in `VirtualTestbed.switch`.
-        act: As in `VirtualTestbed.switch`.
-
     Raises:
         ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
     """
@@ -177,12 +171,6 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
     """Throw switches of a running testbed.
 
     If a signal goes back to sim, the simulated world continues from the DPS's belief of the machine, if it can.
-
-    Args:
-        target: The testbed.
-        context: Its context.
-        senses: New positions by sensor signal.
-        acts: New positions by actuator signal.
     """
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)

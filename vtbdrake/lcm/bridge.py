@@ -216,29 +216,18 @@ class LcmBridge(Bridge):
 
 
 class ChannelReader:
-    """Checks the messages of one channel and updates its signals; `LcmBridge` tells the rules.
-
-    Attributes:
-        channel: Name of the channel.
-        clock_jumps: How often the sender's time jumped, back or ahead, and was accepted.
-    """
+    """Checks the messages of one channel and updates its signals; `LcmBridge` tells the rules."""
 
     def __init__(
         self, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal], reorder_window: float
     ) -> None:
         """Prepare the decoder.
 
-        Args:
-            map: The map of the channel.
-            signals: The signals of the map, in its order.
-            received: What to update, by signal.
-            reorder_window: Window in seconds, see `LcmBridge`.
-
         Raises:
             ValueError: The map cannot carry the signals.
         """
-        self.channel = map.channel
-        self.clock_jumps = 0
+        self.channel = map.channel  # name of the channel
+        self.clock_jumps = 0  # how often the sender's time jumped, back or ahead, and was accepted
         self._decode = map.decoder(signals)
         self._signals = [(signal.name, received[signal.name], Bounds(signal)) for signal in signals]
         for _, received_signal, bounds in self._signals:
@@ -310,11 +299,6 @@ class ChannelWriter:
 
     def __init__(self, map: LcmMap, signals: Sequence[Signal], sent: Mapping[str, SentSignal]) -> None:
         """Prepare the encoder.
-
-        Args:
-            map: The map of the channel.
-            signals: The signals of the map, in its order.
-            sent: Counts what is withheld, by signal.
 
         Raises:
             ValueError: The map cannot carry the signals.

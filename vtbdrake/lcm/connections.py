@@ -282,13 +282,7 @@ class _Search:
 
 
 class LcmLink:
-    """Receives and publishes while there is a bus, and searches for it while there is none.
-
-    Attributes:
-        url: The LCM URL of the bus.
-        losses: How often the bus was lost.
-        reconnections: How often it was found again.
-    """
+    """Receives and publishes while there is a bus, and searches for it while there is none."""
 
     def __init__(
         self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float, stamped: bool = False
@@ -301,9 +295,9 @@ class LcmLink:
             connect_timeout: Seconds to wait for a hub.
             stamped: Whether the kernel shall stamp what arrives; see `TcpqConnection`.
         """
-        self.url = url
-        self.losses = 0
-        self.reconnections = 0
+        self.url = url  # the LCM URL of the bus
+        self.losses = 0  # how often the bus was lost
+        self.reconnections = 0  # how often it was found again
         self._connect: Callable[[], Connection] = partial(LibraryConnection, url, handlers)
         if url.startswith("tcpq://"):
             self._connect = partial(TcpqConnection, url, handlers, connect_timeout, stamped=stamped)

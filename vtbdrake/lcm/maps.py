@@ -37,10 +37,6 @@ _CODES = _NUMBERS | {"byte": "b", "string": "s"}
 def decode(message_type: Any, data: bytes) -> Any:
     """Decode one message strictly: all of it, and nothing else.
 
-    Args:
-        message_type: A class made by lcm-gen.
-        data: The bytes of the message.
-
     Raises:
         MalformedError: ``fingerprint``: the message is of another type; ``truncated``: its end is missing;
             ``trailing``: bytes follow it; ``size``: an array has an impossible length.
@@ -243,11 +239,7 @@ class VectorMap(LcmMap):
         return self.type._get_packed_fingerprint(), self.fields, signals, self.stamp
 
     def _example(self, sizes: Mapping[str, int]) -> bytes:
-        """Return a message with signals of these sizes, in which all numbers but the lengths of arrays are zero.
-
-        Raises:
-            LookupError: The message cannot leave out a signal that is missing.
-        """
+        """Return a message with signals of these sizes, in which all numbers but the lengths of arrays are zero."""
         lengths = {self.parts[name][0].length: size for name, size in sizes.items()}
         for name in self.parts.keys() - sizes.keys():
             length = self.parts[name][0].length

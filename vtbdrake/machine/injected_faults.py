@@ -226,13 +226,10 @@ class DelayLine:
         delay: The latency of every packet without faults, in cycles.
         period: The period of a cycle, in seconds.
         random: The source of random numbers of the faults.
-
-    Attributes:
-        faults: The faults that have begun, by name.
     """
 
     def __init__(self, *, delay: int, period: float, random: np.random.Generator) -> None:
-        self.faults: dict[str, InjectedFault] = {}
+        self.faults: dict[str, InjectedFault] = {}  # the faults that have begun, by name
         self._effects: dict[str, Effect] = {}
         self._delay = delay
         self._period = period

@@ -316,13 +316,7 @@ class HoldingBrake:
             self._joints = [plant.get_joint_actuator(index).joint() for index in plant.GetJointActuatorIndices()]
 
     def actuation(self, name: str, command: Any, stale: bool) -> Any:
-        """Return what acts on an actuator.
-
-        Args:
-            name: The actuator signal.
-            command: Its last command; None if there was none.
-            stale: True if the command is too old to be obeyed.
-        """
+        """Return what acts on an actuator."""
         idle = self._kind != HOLD if self.engaged else stale
         return self.idle[name] if idle or command is None else command
 

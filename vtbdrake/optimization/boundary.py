@@ -324,11 +324,6 @@ def find_boundary(
 ) -> list[dict[int, bool]]:
     """Examine candidates, in as few rounds as possible, until the refinement asks for no more.
 
-    Args:
-        refinement: Which values to examine.
-        conditions: The number of conditions.
-        examine: Returns for each candidate whether it was unsafe.
-
     Returns:
         index -> unsafe, for each condition.
     """

@@ -33,9 +33,6 @@ class ProblemFunction(casadi.Callback):
     A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers suppress the
     exceptions of a function: call `check` after them, which raises the last one.
 
-    Attributes:
-        error: The last exception during an evaluation, or None.
-
     Args:
         problem: A problem with continuous parameters and one quality.
         name: Name of the CasADi function.
@@ -77,7 +74,7 @@ class ProblemFunction(casadi.Callback):
         self._known: dict[RolloutKey, Outcome] = {}
         self._evaluator = Evaluator(problem, self._known, self._roll_out)
         self._jacobian: _Jacobian | None = None
-        self.error: BaseException | None = None
+        self.error: BaseException | None = None  # the last exception during an evaluation, or None
         self.construct(name, {})
 
     @property

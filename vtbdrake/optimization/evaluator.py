@@ -40,9 +40,6 @@ class Evaluator:
         budget: How many rollouts the points may take together; only as many points run side by side as it allows to
             finish.
 
-    Attributes:
-        best: The best evaluation so far; None if there are several qualities.
-
     Raises:
         ValueError: Racing, but several qualities.
     """
@@ -65,7 +62,7 @@ class Evaluator:
         self._budget = budget
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
-        self.best: Evaluation | None = None
+        self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
         # Not the known ones, of which a resumed study has more.
         self._needed: set[RolloutKey] = set()
         # The number of rollouts that each point has needed since it was last told.

@@ -313,10 +313,6 @@ class StateDigest:
 
     An array beyond 16 KiB, such as an image, enters by name and shape only, so that the loop need not wait for it. The
     digest of the DPS alone and that of the DPS in its testbed are equal if their states are.
-
-    Args:
-        target: The testbed, or the DPS alone.
-        context: Root context of the target.
     """
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:

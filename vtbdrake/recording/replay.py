@@ -374,11 +374,7 @@ def _largest_differences(log: ControlLog, actuation: Mapping[str, np.ndarray]) -
 
 
 def _restore(log: ControlLog, target: Target, context: Context) -> None:
-    """Bring a context of ``target`` into the state before the first recorded cycle.
-
-    Raises:
-        LogError: The log is of another scenario, or was fed by a simulated world that the DPS alone does not have.
-    """
+    """Bring a context of ``target`` into the state before the first recorded cycle."""
     log.header.check(target.scenario)
     if isinstance(target, DpsAlone) and log.header.target == TESTBED:
         _check_fed_by_machine(log)
@@ -414,12 +410,7 @@ def _check_fed_by_machine(log: ControlLog) -> None:
 
 
 def _abstract_decoders(log: ControlLog, target: AddressedDiagram) -> dict[str, Callable[[int], Any]]:
-    """Return by abstract sensor signal a function from the number of a message's event to the signal's value.
-
-    Raises:
-        LogError: There is no scenario that says how to decode the messages.
-        ProtocolError: The scenario has no protocol.
-    """
+    """Return by abstract sensor signal a function from the number of a message's event to the signal's value."""
     signals = {signal.name: signal for signal in target.interface.sense}
     abstract = [name for name, signal in signals.items() if not signal.is_vector]
     if not abstract:
@@ -479,10 +470,6 @@ class _BatchReplay(_Replay):
 
     A sensor value exists at the time of its cycle's beginning only: a DPS that reads its inputs at another time raises.
     Actuator commands are logged where a cycle ends, before what is updated at that time.
-
-    Args:
-        log: The log.
-        target: The DPS alone, which becomes part of another Diagram.
 
     Raises:
         _BatchError: A signal is abstract, the DPS has continuous state, or its actuator commands have direct

@@ -115,11 +115,7 @@ def read_archive(
 
 
 def _check_entries(archive: zipfile.ZipFile) -> None:
-    """Reject entries that `write_archive` has not written, and those that would take too much memory.
-
-    Raises:
-        ValueError: There is an entry that `write_archive` has not written, or all would take too much memory.
-    """
+    """Reject entries that `write_archive` has not written, and those that would take too much memory."""
     entries = archive.infolist()
     for entry in entries:
         if entry.compress_type not in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
@@ -135,11 +131,7 @@ def _check_entries(archive: zipfile.ZipFile) -> None:
 
 
 def _array(data: bytes) -> np.ndarray:
-    """Return the array of an entry, after a check of its data against its header.
-
-    Raises:
-        ValueError: The data are not the array that their header declares.
-    """
+    """Return the array of an entry, after a check of its data against its header."""
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

@@ -173,11 +173,6 @@ class AbstractState:
 
     The codecs are those of the system's attribute ``codecs``, or else `codec_of` the present value of the state.
 
-    Args:
-        path: Path of the system, for messages.
-        system: The leaf system.
-        context: Any context of this system.
-
     Raises:
         SnapshotError: The system keeps an abstract value that no codec can carry.
     """

@@ -48,12 +48,6 @@ class _CenicSimulator(Simulator):
 class AddressedDiagram:
     """A Diagram with addresses for the contents of its Context, and with the settings of its simulation.
 
-    Attributes:
-        diagram: The input and output ports of it carry the DPS's signals.
-        interface: The DPS's signals.
-        simulator_config: How it is to be integrated.
-        scenario: What built it, or None.
-
     It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
     """
 
@@ -70,10 +64,10 @@ class AddressedDiagram:
         """Collect the variables of ``diagram``; ``plant_roles`` maps model instances to ``sys`` or ``env``."""
         roles = plant_roles or {}
         clock = Variable("time", X, (), "s", lambda context: context.get_time())
-        self.diagram = diagram
-        self.interface = interface
-        self.simulator_config = simulator_config
-        self.scenario = scenario
+        self.diagram = diagram  # the input and output ports of it carry the DPS's signals
+        self.interface = interface  # the DPS's signals
+        self.simulator_config = simulator_config  # how it is to be integrated
+        self.scenario = scenario  # what built it, or None
         self._variables = collect(
             diagram,
             plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,

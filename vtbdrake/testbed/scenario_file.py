@@ -186,13 +186,7 @@ def _check_nodes(document: yaml.Node, path: Path) -> None:
 
 
 def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
-    """Refuse keys that are no field of the class that is expected there.
-
-    Args:
-        node: The value given for a field.
-        hint: The type of that field.
-        name: Its dotted name.
-    """
+    """Refuse keys that are no field of the class that is expected there."""
     alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
     inside = Union[inside] if inside else Any  # noqa: UP007

@@ -65,14 +65,11 @@ class ProtectedChannel:
     Args:
         name: Name of the channel.
         lease: Time after the owner's last publication during which no other client can take over, in seconds.
-
-    Attributes:
-        owner: The client that may publish; None if there is none.
     """
 
     def __init__(self, name: str, *, lease: float) -> None:
         self.name = name
-        self.owner: ClientConnection | None = None
+        self.owner: ClientConnection | None = None  # the client that may publish; None if there is none
         self._lease = lease
         self._renewed = -inf
         # The owner's name remains there when it has disconnected.
@@ -150,10 +147,6 @@ class _Route(NamedTuple):
 
 class Router:
     """Decides for every record where it goes; it neither reads nor writes sockets.
-
-    Args:
-        protect: Names of the protected channels.
-        lease: Lease of their owners, in seconds.
 
     Attributes:
         outgoing: Messages to send, by client: those that arrive together leave together, so that the client wakes up
@@ -289,11 +282,7 @@ class Router:
 
 
 def _decode(channel: bytes) -> str:
-    """Return a channel or pattern as text; liblcm's clients in Python and Java cannot read other bytes.
-
-    Raises:
-        TcpqError: It is not UTF-8, or contains a null character.
-    """
+    """Return a channel or pattern as text; liblcm's clients in Python and Java cannot read other bytes."""
     try:
         name = channel.decode()
     except UnicodeDecodeError:

@@ -312,11 +312,7 @@ class HubServer:
             self._epoll.register(client.fileno, select.EPOLLIN)
 
     def _admit(self, sock: socket.socket) -> int | None:
-        """Return the user of a new client; if the hub is full, an idle client is disconnected to make room.
-
-        Raises:
-            TcpqError: The client may not connect.
-        """
+        """Return the user of a new client; if the hub is full, an idle client is disconnected to make room."""
         config, clients = self.config, self._clients.values()
         if sock.family == socket.AF_UNIX or self._on_loopback:
             user = tcpq.peer_user(sock)

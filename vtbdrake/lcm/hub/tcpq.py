@@ -61,15 +61,11 @@ _DIAG_ANSWER = struct.Struct("=IHHII BBBB48s III II")  # header; state, addresse
 
 
 class TcpqError(Exception):
-    """A client violated the protocol or its limits.
-
-    Attributes:
-        reason: Kind of the violation, as counted in `HubStatistics.disconnected`.
-    """
+    """A client violated the protocol or its limits."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
-        self.reason = reason
+        self.reason = reason  # kind of the violation, as counted in `HubStatistics.disconnected`
 
 
 def rejection(reason: str) -> bytes:
@@ -143,9 +139,6 @@ def peer_user(sock: socket.socket) -> int | None:
     """Return the user id at the other end of a connected socket; None if the kernel does not know it.
 
     The kernel knows the users of open sockets on this machine.
-
-    Args:
-        sock: Unix socket, or TCP socket over IPv4.
     """
     if sock.family == socket.AF_UNIX:
         _, user, _ = struct.unpack("iII", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))

@@ -379,11 +379,7 @@ def _json_object(data: bytes) -> dict[str, Any]:
 
 
 def _arrays(message: Mapping[str, Any], addresses: Sequence[str], channel: str) -> Values:
-    """Return the values of a message, lists as arrays.
-
-    Raises:
-        LiveError: An address is missing, or a value is not a number or a rectangular list of numbers.
-    """
+    """Return the values of a message, lists as arrays."""
     values = message.get("values")
     if not isinstance(values, dict) or not set(addresses) <= values.keys():
         raise _invalid(channel, f"the values of {', '.join(addresses)}", message)

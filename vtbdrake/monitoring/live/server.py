@@ -85,15 +85,12 @@ class LiveServer:
         url: LCM URL of the bus.
         addresses: Addresses of the output ports, and of the variables, of the loop's target.
 
-    Attributes:
-        rejected: Number of rejected requests.
-
     Raises:
         EOFError: The loop has closed its connection before there was a bus.
     """
 
     def __init__(self, loop: FrameConnection, url: str, addresses: Sequence[str]) -> None:
-        self.rejected = 0
+        self.rejected = 0  # number of rejected requests
         self._loop = loop
         self._addresses = addresses
         self._link = LcmLink(
@@ -145,11 +142,7 @@ class LiveServer:
             self._publish(channel + ANSWER, {"id": request_id(data), "error": str(error)})
 
     def _accept(self, channel: str, request: Request) -> None:
-        """Send a request to the loop, unless it repeats an earlier one.
-
-        Raises:
-            RequestError: There are too many requests or watches.
-        """
+        """Send a request to the loop, unless it repeats an earlier one."""
         now = time.monotonic()
         if channel != WATCH:
             if request.id in self._known_ids:

@@ -185,27 +185,18 @@ class LiveService:
 
 
 class _Reading:
-    """Values that are read together, once or in rounds.
-
-    Attributes:
-        every: Cycles from round to round; 0 for one round only.
-        since: Time of the DPS in the cycle in which the present round began.
-        entries: Entries of all values, concatenated.
-        shapes: Shapes of the values.
-        described: Whether the shapes were sent.
-        error: Why the values cannot be read.
-    """
+    """Values that are read together, once or in rounds."""
 
     def __init__(
         self, number: int, addresses: Sequence[str], readers: Sequence[Callable[[Context], Any]], every: int
     ) -> None:
         self.number = number
-        self.every = every
-        self.since = 0.0
-        self.entries: list[float] = []
-        self.shapes: list[tuple[int, ...]] = []
-        self.described = False
-        self.error = ""
+        self.every = every  # cycles from round to round; 0 for one round only
+        self.since = 0.0  # time of the DPS in the cycle in which the present round began
+        self.entries: list[float] = []  # entries of all values, concatenated
+        self.shapes: list[tuple[int, ...]] = []  # shapes of the values
+        self.described = False  # whether the shapes were sent
+        self.error = ""  # why the values cannot be read
         self._addresses = addresses
         self._readers = readers
         self._next_cycle = 0

@@ -111,10 +111,6 @@ def run_length(threshold: float, allowance: float) -> float:
 
     For one side, it is (exp(2 k b) - 2 k b - 1) / (2 k^2) with b = h + 1.166 (Siegmund, "Sequential Analysis", 1985,
     eq. 2.57); two sides alarm twice as often.
-
-    Args:
-        threshold: h, in standard deviations.
-        allowance: k, in standard deviations.
     """
     exponent = 2.0 * allowance * (threshold + _EXCESS)
     return (expm1(exponent) - exponent) / (2.0 * allowance**2) / 2.0

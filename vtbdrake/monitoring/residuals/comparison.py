@@ -159,12 +159,6 @@ class Comparison:
     The DPS's actuator command in the row of y_i is for j = i + delay; the one that is reported beside y_i acted in
     j = i - 1. A twin is driven by the DPS's actuator commands, a shadow by the reported ones: they are what acts.
 
-    Args:
-        predictor: The model.
-        rows: Layout of the rows.
-        config: Configuration.
-        mode: ``shadow`` or ``twin``.
-
     Attributes:
         skipped: Number of windows without a result, because rows, a belief or actuator commands were missing.
         failed: Number of windows whose prediction failed; ``error`` describes the last failure.

@@ -321,10 +321,6 @@ class Sampler:
     def fill(self, rows: Array, cycle: Cycle) -> int:
         """Fill empty rows with the new values of a cycle.
 
-        Args:
-            rows: Rows of NaN, at least one for each sensor signal.
-            cycle: The cycle.
-
         Returns:
             The number of rows: 0 without a new sample, several if some of its samples are older than others.
         """
