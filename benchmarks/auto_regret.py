@@ -1,4 +1,4 @@
-"""How near the default solver comes to the optimum with few rollouts, against solvers that are known to be good.
+"""Regret of the default solver after few rollouts, against solvers that are known to be good.
 
 The gap of a run is how much worse its best point is than the optimum, in units of the median gap of random points. It
 counts as `SOLVED` if it is smaller: no simulation is that exact. Of every function and budget, what is compared are
@@ -232,7 +232,7 @@ class _SpentError(Exception):
 
 
 class _Record:
-    """What a solver has found: the true costs of its points, each once, and the best after each rollout."""
+    """The result of a solver: the true costs of its points, each once, and the best after each rollout."""
 
     def __init__(self, case: Case, budget: int) -> None:
         self._case = case

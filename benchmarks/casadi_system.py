@@ -1,4 +1,4 @@
-"""What an estimator and a controller cost, written in CasADi instead of numpy."""
+"""Costs of an estimator and a controller in CasADi, against numpy."""
 
 from __future__ import annotations
 

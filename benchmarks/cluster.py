@@ -1,4 +1,4 @@
-"""What a Dask cluster of any size would bring, from what a local one of two workers costs."""
+"""Gain of a Dask cluster of any size, extrapolated from the costs of a local one of two workers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What it takes to put the DPS alone on the robot, against the whole testbed in the same place."""
+"""Costs of the DPS alone on the robot, against the whole testbed in the same place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long it takes to find a good gait: a study against differential evolution that rebuilds the diagram each time."""
+"""Time to find a good gait: a study, against differential evolution that rebuilds the diagram each time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LIMIT = 600
 
 
 def stable_distance(x: float, roll: float, pitch: float) -> float:
-    """How far the robot has come, in m; 0 if it tips: a torso that leans by 15 deg does not come back."""
+    """Return how far the robot has come, in m; 0 if it tips: a torso that leans by 15 deg does not come back."""
     return max(x, 0.0) if max(abs(roll), abs(pitch)) < TILT else 0.0
 
 
@@ -53,7 +53,7 @@ def gait_problem() -> vtb.Problem:
 
 @dataclass(frozen=True)
 class Search:
-    """How long a search took until it reached the target, in s, infinite if it did not, and its rollouts."""
+    """The time until a search reached the target, in s, infinite if it did not, and its rollouts."""
 
     seconds: float
     rollouts: int

@@ -1,4 +1,4 @@
-"""What a message costs on its way through the hub."""
+"""Time of a message through the hub."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``import vtbdrake`` costs."""
+"""Time of ``import vtbdrake``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How quick and how punctual the full loop is: machine process, hub, controller, hub, machine process."""
+"""Speed and punctuality of the full loop: machine process, hub, controller, hub, machine process."""
 
 from __future__ import annotations
 

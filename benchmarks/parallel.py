@@ -1,4 +1,4 @@
-"""What two cores bring: rollouts of the SpaceClimber on every executor, against one after another."""
+"""Gain of two cores: rollouts of the SpaceClimber on every executor, against one after another."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ P0 = np.diag([0.1, 0.1, 0.01, 0.1, 0.01])
 
 
 def measurements(steps: int) -> np.ndarray:
-    """Of a vehicle on a circle, (5, steps), without noise."""
+    """Return measurements of a vehicle on a circle, (5, steps), without noise."""
     t = PERIOD * np.arange(steps)
     speed, rate = 0.5, 0.3
     position = speed / rate * np.array([np.sin(rate * t), 1.0 - np.cos(rate * t)])

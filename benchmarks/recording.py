@@ -1,4 +1,4 @@
-"""What it costs the loop to be recorded and watched, and how quickly its log is replayed."""
+"""Costs of recording and watching a loop, and the speed of the replay of its log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How soon a wrong payload of the arm is found, and how often a right one is found wrong.
+"""Delay until a wrong payload of the arm is found, and the rate at which a right one is found wrong.
 
 ``python -m benchmarks.residuals 3600`` simulates an hour of nominal operation.
 """
@@ -82,7 +82,7 @@ def payload_alarm(nominal: float = 10.0) -> list[Benchmark]:
 
 
 def learn(runtime: Runtime) -> Calibration:
-    """What residuals are like while the arm does what it does."""
+    """Return the residuals while the arm moves."""
     with ResidualMonitor(runtime, "twin", learn=True) as monitor:
         runtime.run(cycles=round(LEARNING / PERIOD))
     return monitor.calibrate()

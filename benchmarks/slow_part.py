@@ -1,4 +1,4 @@
-"""What a slow part beside it does to the punctuality of the loop."""
+"""Punctuality of the loop with a slow part beside it."""
 
 from __future__ import annotations
 

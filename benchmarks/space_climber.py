@@ -1,4 +1,4 @@
-"""What the framework costs, and what it saves, on the SpaceClimber."""
+"""Costs and savings of the framework on the SpaceClimber."""
 
 from __future__ import annotations
 

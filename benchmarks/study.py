@@ -1,4 +1,4 @@
-"""What a study costs beside its rollouts, against a bare loop and against bare Optuna, and what racing saves."""
+"""Costs of a study beside its rollouts, against a bare loop and bare Optuna, and savings by racing."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ CORES = 2
 
 
 def study_overhead_threads(rollouts: int = 512, repeats: int = 9) -> Benchmark:
-    """What a study adds to a rollout that runs in a thread; see `_overhead`."""
+    """Measure what a study adds to a rollout that runs in a thread; see `_overhead`."""
     return _overhead("study_overhead_threads", ThreadExecutor(1), rollouts=rollouts, repeats=repeats)
 
 
 def study_overhead_processes(rollouts: int = 512, repeats: int = 9) -> Benchmark:
-    """What a study adds to a rollout that runs in another process; see `_overhead`."""
+    """Measure what a study adds to a rollout that runs in another process; see `_overhead`."""
     return _overhead("study_overhead_processes", ProcessExecutor(1), rollouts=rollouts, repeats=repeats)
 
 

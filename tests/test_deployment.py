@@ -1,4 +1,4 @@
-"""How a scenario describes its deployment, what is refused, and the call that starts it."""
+"""Tests of the deployment that a scenario describes, of its refusals, and of the call that starts it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What others ask a DPS that runs, from the command line."""
+"""Tests of requests to a running DPS from the command line."""
 
 from __future__ import annotations
 

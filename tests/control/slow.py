@@ -99,5 +99,5 @@ class SlowScenario(Scenario):
 
 
 def moving(t: float) -> Mapping[str, Any]:
-    """What the machine's sensor shows."""
+    """Return what the machine's sensor shows."""
     return {"position": [np.sin(30.0 * t), 0.5 * np.cos(17.0 * t)]}

@@ -1,4 +1,4 @@
-"""What fallbacks command, and which of them fit which signal."""
+"""Tests of the commands of fallbacks, and of which of them fit which signal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a loop asks of the operating system is granted or explained, and given back.
+"""Tests that requests of a loop to the operating system are granted or explained, and given back.
 
 The settings belong to a process, so each test has one of its own.
 """
@@ -54,7 +54,7 @@ def drop_rights():
 
 
 def told(code: str) -> dict[str, Any]:
-    """What ``code`` tells in a process of its own."""
+    """Run ``code`` in a process of its own, and return what it tells."""
     command = [sys.executable, "-c", STATE + code]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=60)

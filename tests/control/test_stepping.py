@@ -1,4 +1,4 @@
-"""What a loop steps: the times of its steps, and the parameters that are kept alive meanwhile."""
+"""Tests of the stepped target: the times of its steps, and the parameters that are kept alive meanwhile."""
 
 from __future__ import annotations
 

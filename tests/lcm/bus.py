@@ -1,4 +1,4 @@
-"""What tests on a real bus need: an independent client, and functions that wait."""
+"""An independent client of a real bus, and functions that wait for it."""
 
 from __future__ import annotations
 

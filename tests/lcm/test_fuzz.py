@@ -1,4 +1,4 @@
-"""Of a hundred thousand broken messages, none raises, all are counted, and only valid ones are accepted."""
+"""Fuzz tests: no broken message of a hundred thousand raises, all are counted, and only valid ones are accepted."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def machine(**options: Any) -> Machine:
 
 
 def run(robot: Machine, cycles: int, *, command: float | None = None) -> list[bytes]:
-    """What it tells after each of some cycles."""
+    """Return the messages of the machine after each of some cycles."""
     told = []
     for _ in range(cycles):
         if command is not None:

@@ -1,4 +1,4 @@
-"""What must hold for every notebook: it runs, shows each figure once, and is stored with its text and plots."""
+"""Checks of a notebook: it runs, shows each figure once, and is stored with its text and plots."""
 
 import re
 from pathlib import Path

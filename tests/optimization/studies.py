@@ -23,7 +23,7 @@ DAMPING = "sim.sys.Pendulum.theta.damping"
 
 
 def gap(theta: float) -> float:
-    """How far the pendulum is from where it is wanted, in rad."""
+    """Return how far the pendulum is from where it is wanted, in rad."""
     return abs(theta - 0.3)
 
 
@@ -95,7 +95,7 @@ class StatedExecutor(Executor):
 
 
 def run_for_ever(path: str, executor: str) -> None:
-    """What a process does that is going to be killed."""
+    """Run a study that never ends, in a process that is going to be killed."""
     print("ready", flush=True)
     pendulum_problem().study(path, solver="cmaes", seed=3).run(rollouts=100_000, executor=executor, progress=False)
 

@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def table(study):
-    """What a study is: its points and what is known of them, without the times that they took."""
+    """Return the points of a study and what is known of them, without the times that they took."""
     rollouts = {row: (o.h, o.value, o.measures, o.t_star, o.end, o.message) for row, o in study.rollouts.items()}
     return [(t.parameters, t.values, t.exact, t.origin, t.batch) for t in study.trials], rollouts
 

@@ -1,4 +1,4 @@
-"""What a notebook or a script defines travels to workers: functions, scenarios, and systems derived from Drake's."""
+"""Tests that what a notebook or a script defines travels to workers: functions, scenarios, systems of their own."""
 
 import subprocess
 import sys

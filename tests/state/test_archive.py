@@ -26,7 +26,7 @@ SNAPSHOT = Snapshot(
 
 
 def load(data: bytes) -> Snapshot | None:
-    """What is read; None if it is refused, as it should be."""
+    """Return what is read; None if it is refused, as it should be."""
     try:
         return Snapshot.load(data)
     except ArchiveError as error:

@@ -13,7 +13,7 @@ from vtbdrake.state.codecs import codec_of
 
 @dataclass(frozen=True)
 class Track:
-    """What a perception may find."""
+    """A result of perception, as a dataclass."""
 
     points: np.ndarray
     count: int

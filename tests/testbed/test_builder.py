@@ -1,4 +1,4 @@
-"""What does not fit is refused when the testbed is built, by name."""
+"""Tests that parts which do not fit are refused by name when the testbed is built."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What Meshcat writes is read back: keyframes, their times, their poses and their paths."""
+"""Tests that read back what Meshcat writes: keyframes, their times, their poses and their paths."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace

@@ -140,14 +140,7 @@ class LcmMap:
         return decode_message
 
     def encoder(self, signals: Sequence[Signal]) -> Encoder:
-        """Return the encoder of this channel's messages.
-
-        Args:
-            signals: The signals of this map, in its order.
-
-        Raises:
-            ValueError: The message type cannot carry them.
-        """
+        """Return the encoder of this channel's messages; see `decoder`."""
         to_message = self.encode
         if to_message is None:
             raise ValueError(f"the map of channel {self.channel} has no encode=: it cannot send")

@@ -27,6 +27,7 @@ class Packet(NamedTuple):
     due: int  # the cycle of the machine in which it arrives
 
 
+Ranges = Mapping[str, tuple[float, float]]
 Effect = Callable[[Packet], Iterable[Packet]]
 """A function from a packet to the packets that arrive instead, in this order."""
 
@@ -37,7 +38,7 @@ class InjectedFault:
 
     name: ClassVar[str]
     sides: ClassVar[Sequence[str]] = (SENSE, ACT)
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # of fields; those of whole numbers are integers
+    ranges: ClassVar[Ranges] = {}  # of fields; those of whole numbers are integers
 
     side: str = SENSE  # ``sense`` for messages that the machine sends, ``act`` for those that it receives
     channels: Sequence[str] = ()  # the channels that are affected; all of that side if empty
@@ -81,7 +82,7 @@ class ClockJump(InjectedFault):
 
     name = "clock_jump"
     sides = (SENSE,)
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"seconds": (-1e9, 1e9)}
+    ranges: ClassVar[Ranges] = {"seconds": (-1e9, 1e9)}
     seconds: float
 
 
@@ -109,7 +110,7 @@ class Corrupt(InjectedFault):
     """Messages arrive corrupted."""
 
     name = "corrupt"
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"fraction": (0.0, 1.0)}
+    ranges: ClassVar[Ranges] = {"fraction": (0.0, 1.0)}
     kind: str = "bits"  # a key of `CORRUPTIONS`
     fraction: float = 1.0  # the probability for each message
 
@@ -134,7 +135,7 @@ class Duplicate(InjectedFault):
     """Every message arrives again, ``copies`` times."""
 
     name = "duplicate"
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"copies": (1, 1000)}
+    ranges: ClassVar[Ranges] = {"copies": (1, 1000)}
     copies: int = 1
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
@@ -146,7 +147,7 @@ class Drop(InjectedFault):
     """Messages are lost, each with the probability ``fraction``."""
 
     name = "drop"
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"fraction": (0.0, 1.0)}
+    ranges: ClassVar[Ranges] = {"fraction": (0.0, 1.0)}
     fraction: float = 1.0
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
@@ -158,7 +159,7 @@ class Delay(InjectedFault):
     """Messages arrive ``seconds`` later, in whole cycles of the machine, rounded up."""
 
     name = "delay"
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"seconds": (0.0, 1e6)}
+    ranges: ClassVar[Ranges] = {"seconds": (0.0, 1e6)}
     seconds: float
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:

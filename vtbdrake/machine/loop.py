@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import asdict
 from math import inf
 from typing import Any
 
@@ -232,7 +233,7 @@ class MachineLoop:
     def _send_status(self) -> None:
         config = self.machine.config
         self._next_status = self.machine.cycle + max(1, round(config.status_period / config.period))
-        self._link.publish((config.status_channel, json.dumps(self.machine.status().to_dict()).encode()))
+        self._link.publish((config.status_channel, json.dumps(asdict(self.machine.status())).encode()))
 
     # -- requests
 
@@ -271,7 +272,7 @@ class MachineLoop:
         except (ValueError, RecursionError) as error:
             _log.warning("request rejected: %s", error)
             return {"error": str(error)}
-        return {**self.machine.status().to_dict(), **more}
+        return {**asdict(self.machine.status()), **more}
 
     def _do(self, request: dict[str, Any]) -> dict[str, Any]:
         if "fault" in request:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
@@ -91,10 +91,6 @@ class MachineStatus:
     # for the reason ``late``
     rejected: dict[str, dict[str, int]]
     faults: list[dict[str, Any]]  # the injected faults that have begun, as `InjectedFault.to_dict` gives them
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the status as plain data for JSON."""
-        return asdict(self)
 
 
 class Machine:

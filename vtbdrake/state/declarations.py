@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,42 +29,32 @@ class Element:
     bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for every entry
 
 
-def parameter(
-    name: str,
-    index: int,
-    *,
-    shape: tuple[int, ...] = (),
-    start: int = 0,
-    unit: str = "1",
-    bounds: tuple[float, float] = (-inf, inf),
-) -> Element:
-    """Name a piece of the numeric parameter group ``index``: part of a in s = [x, a]; see `Element`."""
-    return Element(name, PARAMETER, int(index), shape, start, unit, bounds)
+class _Options(TypedDict, total=False):
+    shape: tuple[int, ...]
+    start: int
+    unit: str
+    bounds: tuple[ArrayLike, ArrayLike]
 
 
-def discrete_state(
-    name: str,
-    index: int,
-    *,
-    shape: tuple[int, ...] = (),
-    start: int = 0,
-    unit: str = "1",
-    bounds: tuple[float, float] = (-inf, inf),
-) -> Element:
-    """Name a piece of the discrete state group ``index``: part of x in s = [x, a]; see `Element`."""
-    return Element(name, DISCRETE, int(index), shape, start, unit, bounds)
+def parameter(name: str, index: int, **options: Unpack[_Options]) -> Element:
+    """Name a piece of the numeric parameter group ``index``: part of a in s = [x, a].
+
+    Args:
+        name: Last part of the address.
+        index: Number of the group.
+        options: ``shape``, ``start``, ``unit`` and ``bounds``, see `Element`.
+    """
+    return Element(name, PARAMETER, int(index), **options)
 
 
-def continuous_state(
-    name: str,
-    *,
-    shape: tuple[int, ...] = (),
-    start: int = 0,
-    unit: str = "1",
-    bounds: tuple[float, float] = (-inf, inf),
-) -> Element:
-    """Name a piece of the continuous state: part of x in s = [x, a]; see `Element`."""
-    return Element(name, CONTINUOUS, 0, shape, start, unit, bounds)
+def discrete_state(name: str, index: int, **options: Unpack[_Options]) -> Element:
+    """Name a piece of the discrete state group ``index``: part of x in s = [x, a]; see `parameter`."""
+    return Element(name, DISCRETE, int(index), **options)
+
+
+def continuous_state(name: str, **options: Unpack[_Options]) -> Element:
+    """Name a piece of the continuous state: part of x in s = [x, a]; see `parameter`."""
+    return Element(name, CONTINUOUS, 0, **options)
 
 
 @dataclass(frozen=True)

@@ -208,15 +208,13 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
 
 
 def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:
-    return _variable(
-        plant,
-        f"{address}.pose",
-        X,
-        (6,),
-        POSE_UNIT,
-        lambda context: pose_to_array(plant.GetFreeBodyPose(context, body)),
-        lambda context, value: plant.SetFreeBodyPose(context, body, pose_from_array(value)),
-    )
+    def read(context: Context) -> np.ndarray:
+        return pose_to_array(plant.GetFreeBodyPose(context, body))
+
+    def write(context: Context, value: np.ndarray) -> None:
+        plant.SetFreeBodyPose(context, body, pose_from_array(value))
+
+    return _variable(plant, f"{address}.pose", X, (6,), POSE_UNIT, read, write)
 
 
 def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str) -> Variable:
@@ -231,15 +229,13 @@ def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str
 
 
 def _frame_pose(plant: MultibodyPlant, frame: FixedOffsetFrame, address: str) -> Variable:
-    return _variable(
-        plant,
-        f"{address}.pose",
-        A,
-        (6,),
-        POSE_UNIT,
-        lambda context: pose_to_array(frame.GetPoseInParentFrame(context)),
-        lambda context, value: frame.SetPoseInParentFrame(context, pose_from_array(value)),
-    )
+    def read(context: Context) -> np.ndarray:
+        return pose_to_array(frame.GetPoseInParentFrame(context))
+
+    def write(context: Context, value: np.ndarray) -> None:
+        frame.SetPoseInParentFrame(context, pose_from_array(value))
+
+    return _variable(plant, f"{address}.pose", A, (6,), POSE_UNIT, read, write)
 
 
 def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Variable:

@@ -35,7 +35,7 @@ def two_joints() -> tuple[DiagramBuilder, MultibodyPlant]:
 def torques(
     steps: int, *, u: Callable[[int], list[float]] = lambda k: [8.0, -4.0], v: tuple[float, float] = (0.0, 0.0), **drive
 ) -> np.ndarray:
-    """What comes out for k = 0, 1, ... while the joints turn at v."""
+    """Return the output for k = 0, 1, ... while the joints turn at v."""
     _, plant = two_joints()
     drives = JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], period=PERIOD, **drive)
     simulator = Simulator(drives)

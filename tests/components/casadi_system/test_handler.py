@@ -1,4 +1,4 @@
-"""What is compiled of a `CasadiSystem`, part by part."""
+"""Tests of the compiled parts of a `CasadiSystem`, one by one."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Bench:
 
 
 def wrench_at_sensor(plant: MultibodyPlant, q: np.ndarray, F_T: np.ndarray) -> np.ndarray:
-    """What the sensor shows while the environment exerts F_T = [torque; force] on the tip of the arm at rest."""
+    """Return what the sensor shows while the environment exerts F_T = [torque; force] on the tip of the arm at rest."""
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
     X_WS = plant.GetBodyByName("tool").EvalPoseInWorld(context)

@@ -31,7 +31,7 @@ GENERATOR = _generator()
 
 
 def play(commands: list[float], *, at: np.ndarray = HOME_POSE, state: dict | None = None) -> dict[str, np.ndarray]:
-    """What the reference is in each period; the arm stays ``at``."""
+    """Return the reference in each period; the arm stays ``at``."""
     x = {"motion": 1.0, "clock": 0.0, "start": HOME_POSE, "reference": HOME_POSE} | (state or {})
     shown: dict[str, list[np.ndarray]] = {}
     for wanted in commands:

@@ -1,4 +1,4 @@
-"""What carries the arm after a fault, alone and through the guards, against the simulated arm."""
+"""Tests of the fallback that carries the arm after a fault, alone and through the guards, against the simulated arm."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def gravity(q: np.ndarray) -> np.ndarray:
 def torque(
     floating: FloatInPlace, q: np.ndarray, v: np.ndarray = REST, *, age: float = 0.0, fresh: bool = True
 ) -> np.ndarray | NoCommand:
-    """What it commands for a sample of this age."""
+    """Return the command for a sample of this age."""
     values = {"joint_position": q, "joint_velocity": v}
     known = {name: Sample(value, age) for name, value in values.items()}
     return floating.command(np.zeros(7), values if fresh else {}, known, T)

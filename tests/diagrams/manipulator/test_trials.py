@@ -1,4 +1,4 @@
-"""What is taken down of a trial, against the plant's own poses and the definition of the motions."""
+"""Tests of the record of a trial, against the plant's own poses and the definition of the motions."""
 
 from __future__ import annotations
 

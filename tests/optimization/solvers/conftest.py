@@ -1,4 +1,4 @@
-"""What tests of several solvers share."""
+"""Fixtures that tests of several solvers share."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What every solver of the catalogue keeps: repetition, replay, budgets, failed simulations, an end without remains."""
+"""Tests of every solver of the catalogue: repetition, replay, budgets, failed simulations, an end without remains."""
 
 import importlib.util
 import itertools
