@@ -61,44 +61,31 @@ class Boundary:
     """The interval in which the parameter's boundary lies: safe up to its lower end, unsafe at its upper end.
 
     A rollout is unsafe if it exceeds the threshold, violates a constraint, or fails.
-
-    Attributes:
-        address: The address of the parameter.
-        unit: The unit of the parameter.
-        lower: The largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
-        upper: The smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
-            none). There is one rollout per value and condition, and repeats close to the boundary.
-        by_condition: The same interval for each condition alone, shape (conditions, 2).
-        examined: The smallest and the largest value examined.
-        gap: Width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have
-            been missed.
-        step: The smallest distance of two values examined.
-        chances: One for each value and condition that was repeated, by value and condition.
-        safe_beyond: Values above a condition's first unsafe one that were safe nevertheless: the outcome is not
-            monotonic, and a bisection could have ended there.
-        ended_at: Values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
-            safe up to there.
-        failed_at: Values at which a simulation failed.
-        failure: The reason of the first failure.
-        sweep: The rollouts without jitter.
-        repeated: The rollouts with jitter; None if there are none.
     """
 
-    address: str
-    unit: str
-    lower: float
+    address: str  # the address of the parameter
+    unit: str  # the unit of the parameter
+    lower: float  # the largest value examined up to which no rollout was unsafe (-inf if one at the least value was)
+    # the smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is none). There
+    # is one rollout per value and condition, and repeats close to the boundary.
     upper: float
-    by_condition: np.ndarray = field(compare=False)
-    examined: tuple[float, float] = (-inf, inf)
+    by_condition: np.ndarray = field(compare=False)  # the same interval for each condition alone, shape (conditions, 2)
+    examined: tuple[float, float] = (-inf, inf)  # the smallest and the largest value examined
+    # width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have been
+    # missed
     gap: float = 0.0
-    step: float = inf
-    chances: tuple[Chance, ...] = ()
+    step: float = inf  # the smallest distance of two values examined
+    chances: tuple[Chance, ...] = ()  # one for each value and condition that was repeated, by value and condition
+    # values above a condition's first unsafe one that were safe nevertheless: the outcome is not monotonic, and a
+    # bisection could have ended there
     safe_beyond: tuple[float, ...] = ()
+    # values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was safe up to
+    # there
     ended_at: tuple[float, ...] = ()
-    failed_at: tuple[float, ...] = ()
-    failure: str = ""
-    sweep: Sweep | None = field(default=None, compare=False)
-    repeated: Sweep | None = field(default=None, compare=False)
+    failed_at: tuple[float, ...] = ()  # values at which a simulation failed
+    failure: str = ""  # the reason of the first failure
+    sweep: Sweep | None = field(default=None, compare=False)  # the rollouts without jitter
+    repeated: Sweep | None = field(default=None, compare=False)  # the rollouts with jitter; None if there are none
 
     @property
     def worst_chances(self) -> tuple[Chance, ...]:

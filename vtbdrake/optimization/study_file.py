@@ -73,30 +73,21 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Trial(PointValues):
-    """A point s^0 of a study, and how good it is.
+    """A point s^0 of a study, and how good it is."""
 
-    Attributes:
-        number: Number in the order of the study; counted by the study file.
-        parameters: The point, address -> value.
-        values: One per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
-            simulation failed.
-        violations: One per constraint, the worst over the conditions: at most 0 where it holds.
-        exact: False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is
-            known but that the point violates a constraint.
-        origin: ``solver`` or ``user``, whichever asked for the point.
-        method: The solver's method at that time.
-        batch: The number of the batch of points that were evaluated together.
-        attributes: The user's notes on the point, see `Study.set_attribute`.
-    """
-
-    parameters: Mapping[str, Any]
+    parameters: Mapping[str, Any]  # the point, address -> value
+    # one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a simulation
+    # failed.
     values: tuple[float, ...]
-    violations: tuple[float, ...]
+    violations: tuple[float, ...]  # one per constraint, the worst over the conditions: at most 0 where it holds
+    # False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is known but
+    # that the point violates a constraint
     exact: bool
-    origin: str
-    method: str
-    batch: int
-    number: int = 0
+    origin: str  # ``solver`` or ``user``, whichever asked for the point
+    method: str  # the solver's method at that time
+    batch: int  # the number of the batch of points that were evaluated together
+    number: int = 0  # number in the order of the study; counted by the study file
+    # the user's notes on the point, see `Study.set_attribute`
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @property

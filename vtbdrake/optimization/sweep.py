@@ -37,33 +37,20 @@ _RISKS: dict[str, type[Risk]] = {kind.__name__: kind for kind in (Mean, Worst, Q
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """The rollouts of a problem at several points, one row per point and condition.
+    """The rollouts of a problem at several points, one row per point and condition."""
 
-    Attributes:
-        parameters: What was varied; p of them.
-        units: The units of the parameters.
-        conditions: Address -> value of each condition.
-        points: Shape (n, p).
-        condition: Number of the condition in each row, shape (n,).
-        rollouts: The n results, in the order in which the points were given.
-        scenario: The scenario's name and fields.
-        complete: False if it was interrupted; it then holds the finished rollouts.
-        minimize: Whether a quality is a cost, for each quality of the problem.
-        constraints: The name of each of the problem's constraints.
-        risk: How a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's
-            class, which a file cannot hold.
-    """
-
-    parameters: tuple[Parameter, ...]
-    units: tuple[str, ...]
-    conditions: tuple[Mapping[str, Any], ...]
-    points: np.ndarray
-    condition: np.ndarray
-    rollouts: tuple[RolloutResult, ...]
-    scenario: Mapping[str, Any] = field(default_factory=dict)
-    complete: bool = True
-    minimize: tuple[bool, ...] = (False,)
-    constraints: tuple[str, ...] = ()
+    parameters: tuple[Parameter, ...]  # what was varied; p of them
+    units: tuple[str, ...]  # the units of the parameters
+    conditions: tuple[Mapping[str, Any], ...]  # address -> value of each condition
+    points: np.ndarray  # shape (n, p)
+    condition: np.ndarray  # number of the condition in each row, shape (n,)
+    rollouts: tuple[RolloutResult, ...]  # the n results, in the order in which the points were given
+    scenario: Mapping[str, Any] = field(default_factory=dict)  # the scenario's name and fields
+    complete: bool = True  # False if it was interrupted; it then holds the finished rollouts
+    minimize: tuple[bool, ...] = (False,)  # whether a quality is a cost, for each quality of the problem
+    constraints: tuple[str, ...] = ()  # the name of each of the problem's constraints
+    # how a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's class,
+    # which a file cannot hold
     risk: Risk | None = field(default_factory=Worst)
 
     def __len__(self) -> int:

@@ -128,54 +128,36 @@ class LogEvents:
 
 @dataclass(frozen=True, eq=False)
 class ControlLog:
-    """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read.
+    """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read."""
 
-    Attributes:
-        path: Path of the file.
-        header: What was recorded.
-        start: State before the first recorded cycle.
-        numbers: Numbers of the cycles, shape (n,).
-        times: Times of the DPS at the ends of the cycles, in seconds, (n,).
-        now: Times on the loop's clock, in seconds, (n,).
-        utimes: Times of day in microseconds since 1970, (n,).
-        ok: Whether the DPS's actuator commands were sent, not those of the fallbacks, (n,).
-        fed: Newest values by vector sensor signal, (n, size); NaN before the first.
-        sources: By sensor signal, where a cycle had a new value, (n,): 0 for none, -1 for a vector, and for an abstract
-            signal the number of the event with its message.
-        actuation: Actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
-        commanded: Whether the DPS commanded, by actuator signal, (n,).
-        sent: Actuator commands that were sent, after the guards, by vector signal, (n, size).
-        changes: Changes of the target, each with the index of the cycle before whose step it happened.
-        faults: Present faults, each with the index of the cycle from which on they hold; empty when all are over.
-        digests: Digests of the DPS's state, each with the index of the cycle after which it was taken.
-        damages: Damaged places of the file. Reading resumes at the next whole cycle.
-        gaps: Cycles that are missing, lost by the recorder or damaged.
-        clock_jumps: Indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards.
-        closed: Whether the recorder was closed. If not, later cycles may be missing.
-        events: All events of the file.
-    """
-
-    path: Path
-    header: LogHeader
-    start: Snapshot
-    numbers: np.ndarray
-    times: np.ndarray
-    now: np.ndarray
-    utimes: np.ndarray
-    ok: np.ndarray
-    fed: Mapping[str, np.ndarray]
+    path: Path  # path of the file
+    header: LogHeader  # what was recorded
+    start: Snapshot  # state before the first recorded cycle
+    numbers: np.ndarray  # numbers of the cycles, shape (n,)
+    times: np.ndarray  # times of the DPS at the ends of the cycles, in seconds, (n,)
+    now: np.ndarray  # times on the loop's clock, in seconds, (n,)
+    utimes: np.ndarray  # times of day in microseconds since 1970, (n,)
+    ok: np.ndarray  # whether the DPS's actuator commands were sent, not those of the fallbacks, (n,)
+    fed: Mapping[str, np.ndarray]  # newest values by vector sensor signal, (n, size); NaN before the first
+    # by sensor signal, where a cycle had a new value, (n,): 0 for none, -1 for a vector, and for an abstract signal the
+    # number of the event with its message
     sources: Mapping[str, np.ndarray]
+    # actuator commands of the DPS by vector signal, (n, size); NaN where there is none
     actuation: Mapping[str, np.ndarray]
-    commanded: Mapping[str, np.ndarray]
-    sent: Mapping[str, np.ndarray]
+    commanded: Mapping[str, np.ndarray]  # whether the DPS commanded, by actuator signal, (n,)
+    sent: Mapping[str, np.ndarray]  # actuator commands that were sent, after the guards, by vector signal, (n, size)
+    # changes of the target, each with the index of the cycle before whose step it happened
     changes: Sequence[tuple[int, Change]]
+    # present faults, each with the index of the cycle from which on they hold; empty when all are over
     faults: Sequence[tuple[int, tuple[str, ...]]]
+    # digests of the DPS's state, each with the index of the cycle after which it was taken
     digests: Sequence[tuple[int, bytes]]
-    damages: Sequence[Damage]
-    gaps: Sequence[Gap]
+    damages: Sequence[Damage]  # damaged places of the file. Reading resumes at the next whole cycle.
+    gaps: Sequence[Gap]  # cycles that are missing, lost by the recorder or damaged
+    # indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards
     clock_jumps: Sequence[int]
-    closed: bool
-    events: LogEvents
+    closed: bool  # whether the recorder was closed. If not, later cycles may be missing.
+    events: LogEvents  # all events of the file
 
     def __len__(self) -> int:
         return len(self.numbers)

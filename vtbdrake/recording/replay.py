@@ -68,34 +68,25 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReplayReport:
-    """The outcome of a replay; n is the number of cycles that were replayed.
+    """The outcome of a replay; n is the number of cycles that were replayed."""
 
-    Attributes:
-        outcome: ``identical`` (every actuator command, the time after every cycle and every digest, to the last bit),
-            ``different``, or ``not compared`` (the replay had other values).
-        cycles: Number of replayed cycles.
-        ended: Why not all cycles of the log were replayed; empty if they were.
-        first_difference: The first difference; None if there is none.
-        max_difference: Largest absolute difference by vector actuator signal; inf where an actuator command is missing
-            on one side or not finite.
-        digests: Number of digests of the DPS's state that were compared.
-        versions: The software whose version differs from the recorded one; results may differ for that reason.
-        times: Times of the DPS at the ends of the cycles, in seconds, (n,).
-        actuation: Actuator commands of the DPS by vector signal, (n, size); NaN where there is none.
-        errors: Exceptions of the DPS, by the number of the cycle.
-        record: Recorded values at the ends of the cycles by address, (n, ...); a list, if they are not arrays.
-    """
-
+    # ``identical`` (every actuator command, the time after every cycle and every digest, to the last bit),
+    # ``different``, or ``not compared`` (the replay had other values)
     outcome: str
-    cycles: int
-    ended: str
-    first_difference: Difference | None
+    cycles: int  # number of replayed cycles
+    ended: str  # why not all cycles of the log were replayed; empty if they were
+    first_difference: Difference | None  # the first difference; None if there is none
+    # largest absolute difference by vector actuator signal; inf where an actuator command is missing on one side or not
+    # finite
     max_difference: Mapping[str, float]
-    digests: int
+    digests: int  # number of digests of the DPS's state that were compared
+    # the software whose version differs from the recorded one; results may differ for that reason
     versions: tuple[str, ...]
-    times: np.ndarray
+    times: np.ndarray  # times of the DPS at the ends of the cycles, in seconds, (n,)
+    # actuator commands of the DPS by vector signal, (n, size); NaN where there is none
     actuation: Mapping[str, np.ndarray]
-    errors: Mapping[int, str]
+    errors: Mapping[int, str]  # exceptions of the DPS, by the number of the cycle
+    # recorded values at the ends of the cycles by address, (n, ...); a list, if they are not arrays
     record: Mapping[str, Any]
 
     @property

@@ -16,17 +16,11 @@ from vtbdrake.state.layout import FlatState, StateLayout
 
 @dataclass(frozen=True, eq=False)
 class DpsState:
-    """The state of a DPS at one instant, before the updates of that instant.
+    """The state of a DPS at one instant, before the updates of that instant."""
 
-    Attributes:
-        time: In seconds.
-        contents: State and parameters of the DPS's systems.
-        commands: The commands u that are set from outside, by name.
-    """
-
-    time: float
-    contents: FlatState
-    commands: Mapping[str, np.ndarray]
+    time: float  # in seconds
+    contents: FlatState  # state and parameters of the DPS's systems
+    commands: Mapping[str, np.ndarray]  # the commands u that are set from outside, by name
 
 
 def _encode(state: DpsState) -> dict[str, np.ndarray]:
