@@ -2,10 +2,14 @@
 
 from libc.math cimport exp
 
+cimport numpy as cnp
 
-def calibrate(
-    const double[::1] parameters, const double[::1] raw, double[::1] measurements, *, Py_ssize_t filtered, double period
-):
+from vtbdrake.state.arrays cimport numbers, writable
+
+cnp.import_array()
+
+
+def calibrate(parameters, raw, measurements, *, Py_ssize_t filtered, double period):
     """Compute the next measurements of a `Calibration` in place.
 
     Args:
@@ -15,16 +19,19 @@ def calibrate(
         filtered: The number of values, from the first on, that pass the low-pass.
         period: The sample period in s.
     """
-    cdef Py_ssize_t size = raw.shape[0], k
-    cdef double tau = parameters[size], decay = exp(-period / tau) if tau > 0.0 else 0.0, value
+    cdef Py_ssize_t size = raw.size, k
+    cdef const double* p = numbers(parameters, size + 1)
+    cdef const double* u = numbers(raw, size)
+    cdef double* y = writable(measurements, size)
+    cdef double tau = p[size], decay = exp(-period / tau) if tau > 0.0 else 0.0, value
     for k in range(size):
-        value = raw[k] - parameters[k]
+        value = u[k] - p[k]
         if k < filtered and decay > 0.0:
-            value += decay * (measurements[k] - value)
-        measurements[k] = value
+            value += decay * (y[k] - value)
+        y[k] = value
 
 
-def limit(const double[::1] parameters, const double[::1] target, double[::1] command, *, double period):
+def limit(parameters, target, command, *, double period):
     """Compute the next command of a `CommandLimiter` in place.
 
     Args:
@@ -33,12 +40,15 @@ def limit(const double[::1] parameters, const double[::1] target, double[::1] co
         command: The command.
         period: The sample period in s.
     """
-    cdef Py_ssize_t size = target.shape[0], k
-    cdef double reach = parameters[2 * size] * period, step, value, lower, upper
+    cdef Py_ssize_t size = target.size, k
+    cdef const double* p = numbers(parameters, 2 * size + 1)
+    cdef const double* u = numbers(target, size)
+    cdef double* q = writable(command, size)
+    cdef double reach = p[2 * size] * period, step, value, lower, upper
     for k in range(size):
-        lower, upper = parameters[k], parameters[size + k]
-        step = target[k] - command[k]
+        lower, upper = p[k], p[size + k]
+        step = u[k] - q[k]
         step = reach if step > reach else (-reach if step < -reach else step)
-        value = command[k] + step
+        value = q[k] + step
         value = lower if value < lower else value
-        command[k] = upper if value > upper else value
+        q[k] = upper if value > upper else value

@@ -9,10 +9,10 @@ cdef class Gait:
     cpdef double leg_phase(self, Py_ssize_t leg, double phase) noexcept
     cpdef double swing(self, double leg_phase) noexcept
     cpdef double height(self, Py_ssize_t leg, double phase) noexcept
-    cpdef void advance(
+    cdef void move(
         self,
-        double[::1] feet,
-        const double[::1] nominal,
+        double* feet,
+        const double* nominal,
         double phase,
         double next_phase,
         double forward,

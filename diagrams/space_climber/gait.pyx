@@ -13,6 +13,12 @@ Feet are points (x, y, z) in the body's frame B.
 
 from libc.math cimport floor
 
+cimport numpy as cnp
+
+from vtbdrake.state.arrays cimport numbers, writable
+
+cnp.import_array()
+
 
 cdef class Gait:
     """A gait: its duty factor beta, and the delays of the legs in cycles, in the order of LEGS."""
@@ -42,16 +48,7 @@ cdef class Gait:
         """Return the height of a leg's foot over the ground at the phase of the gait, per unit of clearance."""
         return lift(self.swing(self.leg_phase(leg, phase)))
 
-    cpdef void advance(
-        self,
-        double[::1] feet,
-        const double[::1] nominal,
-        double phase,
-        double next_phase,
-        double forward,
-        double turn,
-        double stance_steps,
-    ) noexcept:
+    def advance(self, feet, *, nominal, double phase, double next_phase, double forward, double turn, stance_steps):
         """Move the feet by one step of the body.
 
         Standing feet move the opposite way. Swinging feet cover the share of their remaining way that takes them along
@@ -59,12 +56,28 @@ cdef class Gait:
         their nominal place; that target may change meanwhile, and does when the speed does.
 
         Args:
-            feet: The positions [x0, y0, x1, ...] before the step, shape (12,), which those after it overwrite.
-            nominal: The nominal places of the feet, shape (12,).
-            phase, next_phase: The phase of the gait before and after the step, in cycles.
-            forward, turn: The body's motion along its x axis (m) and about its z axis (rad).
+            feet: The positions before the step, shape (6, 2), which those after it overwrite.
+            nominal: The nominal places of the feet, shape (6, 2).
+            phase: The phase of the gait before the step, in cycles.
+            next_phase: The phase after it.
+            forward: The body's motion along its x axis in m.
+            turn: The body's motion about its z axis in rad.
             stance_steps: Length of a stance in steps.
         """
+        cdef double* x = writable(feet, 2 * LEG_COUNT)
+        self.move(x, numbers(nominal, 2 * LEG_COUNT), phase, next_phase, forward, turn, stance_steps)
+
+    cdef void move(
+        self,
+        double* feet,
+        const double* nominal,
+        double phase,
+        double next_phase,
+        double forward,
+        double turn,
+        double stance_steps,
+    ) noexcept:
+        """Compute `advance`."""
         cdef double half = 0.5 * stance_steps
         cdef double x, y, nx, ny, after, covered, share
         cdef Py_ssize_t k

@@ -2,7 +2,12 @@
 
 from libc.math cimport asin, atan2, copysign, cos, exp, fabs, fmod, hypot, pi, sin
 
+cimport numpy as cnp
+
+from vtbdrake.state.arrays cimport numbers, writable
 from vtbdrake_diagrams.space_climber.kinematics cimport LEG_COUNT, LegKinematics
+
+cnp.import_array()
 
 
 cdef class PoseFilter:
@@ -20,7 +25,7 @@ cdef class PoseFilter:
     def __init__(self, LegKinematics legs, *, double foot_radius, double period):
         self._legs, self._foot_radius, self._period = legs, foot_radius, period
 
-    def step(self, double time_constant, const double[::1] measurements, double[::1] pose, double[::1] memory):
+    def step(self, double time_constant, measurements, pose, memory):
         """Compute the next pose and memory in place.
 
         Args:
@@ -29,33 +34,39 @@ cdef class PoseFilter:
             pose: [roll, pitch, yaw, x, y, height].
             memory: [attitude_known, standing (6), x0, y0, x1, ...], the feet of the last sample in the world.
         """
+        cdef const double* imu = numbers(measurements, 6 + 3 * LEG_COUNT + LEG_COUNT)
+        cdef const double* angles = imu + 6
+        cdef const double* standing = angles + 3 * LEG_COUNT
+        cdef double* x = writable(pose, 6)
+        cdef double* known = writable(memory, 1 + 3 * LEG_COUNT)
+        cdef double* stood = known + 1
+        cdef double* last = stood + LEG_COUNT
         cdef double tau = time_constant, trust = 1.0
         cdef double feet[3 * LEG_COUNT]
         cdef double dx = 0.0, dy = 0.0, drop = 0.0
         cdef Py_ssize_t still = 0, down = 0, k
-        cdef const double* standing = &measurements[24]
-        if measurements[3] or measurements[4] or measurements[5]:
-            if memory[0] and tau > 0.0:
+        if imu[3] or imu[4] or imu[5]:
+            if known[0] and tau > 0.0:
                 trust = 1.0 - exp(-self._period / tau)
-            follow(&pose[0], &measurements[0], self._period, trust)
-            memory[0] = 1.0
-        self._legs.feet(&measurements[6], feet)
-        turn_to_world(&pose[0], feet)
+            follow(x, imu, self._period, trust)
+            known[0] = 1.0
+        self._legs.feet(angles, feet)
+        turn_to_world(x, feet)
         for k in range(LEG_COUNT):
             if standing[k]:
                 down += 1
                 drop += feet[3 * k + 2]
-                if memory[1 + k]:
+                if stood[k]:
                     still += 1
-                    dx += memory[7 + 2 * k] - feet[3 * k]
-                    dy += memory[8 + 2 * k] - feet[3 * k + 1]
-            memory[1 + k] = standing[k]
-            memory[7 + 2 * k], memory[8 + 2 * k] = feet[3 * k], feet[3 * k + 1]
+                    dx += last[2 * k] - feet[3 * k]
+                    dy += last[2 * k + 1] - feet[3 * k + 1]
+            stood[k] = standing[k]
+            last[2 * k], last[2 * k + 1] = feet[3 * k], feet[3 * k + 1]
         if still:
-            pose[3] += dx / still
-            pose[4] += dy / still
+            x[3] += dx / still
+            x[4] += dy / still
         if down:
-            pose[5] = self._foot_radius - drop / down
+            x[5] = self._foot_radius - drop / down
 
 
 def complementary_filter(attitude, imu, *, double period, double trust):

@@ -8,7 +8,7 @@ import pytest
 from vtbdrake_diagrams.space_climber.gait import GAITS, Gait, glide, lift
 from vtbdrake_diagrams.space_climber.morphology import Morphology
 
-NOMINAL = Morphology().stance[:, :2]
+NOMINAL = Morphology().stance[:, :2].copy()
 STEPS = 60  # a cycle; every duty factor is a whole number of steps
 
 
@@ -18,12 +18,20 @@ def leg_phases(gait: Gait, phase: float) -> list[float]:
 
 def walk(gait: Gait, *, forward: float, turn: float = 0.0, cycles: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Phases (n,) and feet (n, 6, 2) of the last of ``cycles`` cycles of constant steps (forward m, turn rad)."""
-    feet = NOMINAL.flatten()
+    feet = NOMINAL.copy()
     phases, path = [], []
     for k in range(cycles * STEPS):
-        gait.advance(feet, NOMINAL.ravel(), k / STEPS, (k + 1) / STEPS, forward, turn, gait.duty * STEPS)
+        gait.advance(
+            feet,
+            nominal=NOMINAL,
+            phase=k / STEPS,
+            next_phase=(k + 1) / STEPS,
+            forward=forward,
+            turn=turn,
+            stance_steps=gait.duty * STEPS,
+        )
         phases.append((k + 1) / STEPS)
-        path.append(feet.reshape(6, 2).copy())
+        path.append(feet.copy())
     return np.array(phases[-STEPS:]), np.array(path[-STEPS:])
 
 

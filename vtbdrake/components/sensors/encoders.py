@@ -42,7 +42,7 @@ class _JointSensor(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         x: NDArray[np.float64] = self._state_port.Eval(context)
-        return x[self._entries]
+        return x.take(self._entries)
 
 
 class JointEncoders(_JointSensor):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import inf, isfinite, sqrt
 
 import numpy as np
@@ -96,12 +95,6 @@ class _Settings:
     quantization: NDArray[np.float64] | None = None
     latency: int = 0
     dropout: float = 0.0
-
-    @cached_property
-    def exact(self) -> bool:
-        """Return whether there are no errors at all."""
-        found = (self.noise, self.bias, self.drift, self.quantization)
-        return not self.latency and not self.dropout and all(values is None for values in found)
 
     def __deepcopy__(self, memo: object) -> _Settings:
         # Clones of a Context share it.
@@ -202,9 +195,11 @@ class ErrorStage:
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
-        settings: _Settings = self._settings(context)
-        if settings.exact and not (self._more and self._remembers(context)):
+        values = context.get_numeric_parameter(self._parameters).value()
+        # All but the seed.
+        if not (np.count_nonzero(values[1:]) or (self._more and self._remembers(context))):
             return y
+        settings: _Settings = self._settings(context)
         key = {"seed": settings.seed, "stream": self._stream, "tick": round(context.get_time() / self._period)}
         if settings.noise is not None:
             y = y + settings.noise * normal_noise(y.size, **key)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from vtbdrake.components.sensors.contact_kernel import contact_forces
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import parameter
@@ -57,9 +57,9 @@ class ContactSensor(SampledSensor):
             "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", stream=stream, errors=errors
         )
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        # Where in the list of forces a body or geometry adds to; the last place is for all that are not asked for.
-        self._size = len(bodies) + 1
-        self._slots = [-1] * plant.num_bodies()
+        # Which sum of forces a body or geometry adds to.
+        self._count = len(bodies)
+        self._slots = [self._count] * plant.num_bodies()
         for k, body in enumerate(bodies):
             self._slots[int(body.index())] = k
         self._geometry_slots = {
@@ -73,18 +73,5 @@ class ContactSensor(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         results = self._results_port.Eval(context)
-        force = [0.0] * self._size
-        for k in range(results.num_point_pair_contacts()):
-            info = results.point_pair_contact_info(k)
-            fx, fy, fz = info.contact_force().tolist()
-            magnitude = sqrt(fx * fx + fy * fy + fz * fz)
-            for slot in (self._slots[int(info.bodyA_index())], self._slots[int(info.bodyB_index())]):
-                force[slot] += magnitude
-        for k in range(results.num_hydroelastic_contacts()):
-            info = results.hydroelastic_contact_info(k)
-            magnitude = float(np.linalg.norm(info.F_Ac_W().translational()))
-            surface = info.contact_surface()
-            for geometry in (surface.id_M(), surface.id_N()):
-                force[self._geometry_slots.get(geometry.get_value(), -1)] += magnitude
-        threshold = context.get_numeric_parameter(self._threshold)[0]
-        return np.array([1.0 if f > threshold else 0.0 for f in force[:-1]])
+        forces = contact_forces(results, self._slots, self._geometry_slots, self._count)
+        return (forces > context.get_numeric_parameter(self._threshold)[0]).astype(float)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import atan2, cos, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +12,7 @@ from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.components.sensors.imu_kernel import sample, specific_force_at_rest
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
@@ -20,9 +20,6 @@ from vtbdrake.state.declarations import NO_DICT
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import Frame
-
-Vector3 = tuple[float, float, float]
-Wxyz = tuple[float, float, float, float]
 
 
 class Imu(SampledSensor):
@@ -64,14 +61,14 @@ class Imu(SampledSensor):
     ) -> None:
         body = frame.body()
         default_context = plant.CreateDefaultContext()
-        self._g_W: Vector3 = tuple(plant.gravity_field().gravity_vector().tolist())
+        self._g_W = np.array(plant.gravity_field().gravity_vector())
         self._body = int(body.index())
         X_BF = frame.GetFixedPoseInBodyFrame()
         mount = [*X_BF.translation().tolist(), *RollPitchYaw(X_BF.rotation()).vector().tolist()]
-        q_WF = tuple(frame.CalcPoseInWorld(default_context).rotation().ToQuaternion().wxyz().tolist())
+        q_WF = frame.CalcPoseInWorld(default_context).rotation().ToQuaternion().wxyz()
         super().__init__(
             "imu",
-            default=(0.0, 0.0, 0.0, *_rotate_back(q_WF, _negative(self._g_W))),
+            default=(0.0, 0.0, 0.0, *specific_force_at_rest(q_WF, self._g_W)),
             period=period,
             unit="rad/s, m/s^2",
             noise={"gyro_noise": (3, "rad/s"), "accelerometer_noise": (3, "m/s^2")},
@@ -90,96 +87,31 @@ class Imu(SampledSensor):
         self._floating = body.is_floating_base_body() and body.has_quaternion_dofs()
         if self._floating:
             # [q; v] holds (wxyz, p_WB) and (w_WB, v_WB). Much cheaper than the poses of all bodies.
-            start = body.floating_positions_start()
-            self._q_slice = slice(start, start + 4)
-            start = plant.num_positions() + body.floating_velocities_start_in_v()
-            self._v_slice = slice(start, start + 6)
+            self._orientation = body.floating_positions_start()
+            self._velocity = plant.num_positions() + body.floating_velocities_start_in_v()
             self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         else:
+            self._orientation, self._velocity = 0, 4
             self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
             self._velocities_port = self.DeclareAbstractInputPort(
                 "body_spatial_velocities", Value[list[SpatialVelocity]]()
             )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        q_WF, v_WF = self._motion(context)
-        sampled, *memory = context.get_discrete_state(self._memory).value().tolist()
-        state.set_value(self._memory, np.array((1.0, *v_WF, *q_WF)))
-        gx, gy, gz = self._g_W
-        if not sampled:
-            return np.array((0.0, 0.0, 0.0, *_rotate_back(q_WF, (-gx, -gy, -gz))))
-        rate = 1.0 / self._period
-        f_W = (
-            (v_WF[0] - memory[0]) * rate - gx,
-            (v_WF[1] - memory[1]) * rate - gy,
-            (v_WF[2] - memory[2]) * rate - gz,
+        return sample(
+            self._motion(context),
+            orientation=self._orientation,
+            velocity=self._velocity,
+            mount=context.get_numeric_parameter(self._mount).value(),
+            g_W=self._g_W,
+            memory=state.get_mutable_value(self._memory),
+            period=self._period,
         )
-        w0, x0, y0, z0 = memory[3:]
-        if w0 * q_WF[0] + x0 * q_WF[1] + y0 * q_WF[2] + z0 * q_WF[3] < 0:  # q and -q are the same orientation
-            w0, x0, y0, z0 = -w0, -x0, -y0, -z0
-        w, x, y, z = _product((w0, -x0, -y0, -z0), q_WF)
-        sine = sqrt(x * x + y * y + z * z)
-        scale = (2.0 * atan2(sine, w) / sine if sine > 1e-12 else 2.0) * rate
-        q_mid = _unit(w0 + q_WF[0], x0 + q_WF[1], y0 + q_WF[2], z0 + q_WF[3])
-        return np.array((scale * x, scale * y, scale * z, *_rotate_back(q_mid, f_W)))
 
-    def _motion(self, context: Context) -> tuple[Wxyz, Vector3]:
-        """Return q_WF and v_WF."""
+    def _motion(self, context: Context) -> NDArray[np.float64]:
+        """Return numbers that hold q_WB and V_WB."""
         if self._floating:
-            x = self._state_port.Eval(context)
-            q_WB = _unit(*x[self._q_slice].tolist())
-            wx, wy, wz, vx, vy, vz = x[self._v_slice].tolist()
-        else:
-            q_WB = tuple(self._poses_port.Eval(context)[self._body].rotation().ToQuaternion().wxyz().tolist())
-            V_WB = self._velocities_port.Eval(context)[self._body]
-            wx, wy, wz = V_WB.rotational().tolist()
-            vx, vy, vz = V_WB.translational().tolist()
-        x, y, z, *rpy = context.get_numeric_parameter(self._mount).value().tolist()
-        if x or y or z:
-            px, py, pz = _rotate(q_WB, (x, y, z))
-            vx, vy, vz = vx + wy * pz - wz * py, vy + wz * px - wx * pz, vz + wx * py - wy * px
-        return (_product(q_WB, _quaternion(*rpy)) if any(rpy) else q_WB), (vx, vy, vz)
-
-
-# Plain floats: for three and four numbers several times faster than numpy.
-
-
-def _negative(v: Vector3) -> Vector3:
-    return (-v[0], -v[1], -v[2])
-
-
-def _unit(w: float, x: float, y: float, z: float) -> Wxyz:
-    scale = 1.0 / sqrt(w * w + x * x + y * y + z * z)
-    return (w * scale, x * scale, y * scale, z * scale)
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> Wxyz:
-    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll)."""
-    qx = (cos(roll / 2), sin(roll / 2), 0.0, 0.0)
-    qy = (cos(pitch / 2), 0.0, sin(pitch / 2), 0.0)
-    qz = (cos(yaw / 2), 0.0, 0.0, sin(yaw / 2))
-    return _product(qz, _product(qy, qx))
-
-
-def _product(a: Wxyz, b: Wxyz) -> Wxyz:
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-def _rotate(q: Wxyz, v: Vector3) -> Vector3:
-    """Return R v for the unit quaternion q of R."""
-    w, x, y, z = q
-    vx, vy, vz = v
-    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
-    return (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx)
-
-
-def _rotate_back(q: Wxyz, v: Vector3) -> Vector3:
-    """Return R' v for the unit quaternion q of R."""
-    return _rotate((q[0], -q[1], -q[2], -q[3]), v)
+            x: NDArray[np.float64] = self._state_port.Eval(context)
+            return x
+        q_WB = self._poses_port.Eval(context)[self._body].rotation().ToQuaternion().wxyz()
+        return np.concatenate([q_WB, self._velocities_port.Eval(context)[self._body].get_coeffs()])
