@@ -77,7 +77,8 @@ class OnboardReasoner(SlowPart):
         quality: See `Reasoner`.
         horizon: Of a rollout in seconds from t_k on; longer than the latency.
         budget: Of a decision; it counts rollouts.
-        period, latency, offset, patience: See `SlowPart`.
+        period, latency, offset, patience: See `SlowPart`; as a decision takes no longer than its latency, the patience is
+            short.
         initial: The decision until the first one is made, a scalar or shape (size,).
         on_request: Whether it decides once for each new request. Otherwise it decides at every t_k, at a receding
             horizon, and the latency is at most the period.
@@ -107,7 +108,7 @@ class OnboardReasoner(SlowPart):
         period: float,
         latency: float,
         offset: float = 0.0,
-        patience: float = 20.0,
+        patience: float = 3.0,
         initial: ArrayLike = 0.0,
         on_request: bool = False,
         believed: Mapping[str, int] | None = None,

@@ -1,0 +1,157 @@
+"""A DPS that reasons on the machine: beside its loop, in processes of its own, recorded and replayed."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+
+from tests.cli.program import run
+from tests.cli.test_run import PATIENCE, start
+from tests.control.scripted import ScriptedBridge
+from tests.reasoning.pusher import PLANNER, PusherScenario
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.recording import read_log
+from vtbdrake.recording.replay import replay
+from vtbdrake.testbed import DpsAlone
+
+PERIOD = 0.01
+PUSHER = "tests.reasoning.pusher:PusherScenario"
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that this one has started."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:  # It has ended.
+                continue
+            if parent == pid:
+                found.append(int(entry.name))
+    return found
+
+
+class Loop:
+    """The DPS alone in its loop on a simulated clock, with a mass that stands still."""
+
+    def __init__(self, scenario):
+        self.target = DpsAlone(scenario)
+        clock = SimulatedClock()
+        bridge = ScriptedBridge(scenario.interface(), clock, lambda t: {"state": [0.1, -0.3]})
+        self.before = set(children(os.getpid()))
+        self.runtime = Runtime(self.target, bridge, period=PERIOD, clock=clock)
+        self.runtime.cycle()
+        self.runtime.switch("real")
+        self.runtime.write({"u.goal": 0.4})
+
+    def __enter__(self):
+        assert self.wait()
+        return self
+
+    def __exit__(self, *_):
+        self.runtime.close()
+
+    @property
+    def counts(self):
+        return self.runtime.slow_parts.statistics[PLANNER]
+
+    @property
+    def worker(self):
+        """The process that reasons."""
+        (supervisor,) = set(children(os.getpid())) - self.before
+        (worker,) = children(supervisor)
+        return worker
+
+    def wait(self):
+        return self.runtime.slow_parts.wait(60.0)
+
+    def ask(self, request):
+        self.runtime.write({"u.request": request})
+        self.runtime.run(cycles=1)
+
+    def run_patiently(self, cycles):
+        self.runtime.run(cycles=cycles, until=lambda: not self.wait())
+
+    def read(self, name):
+        return self.target.read(self.runtime.context, f"{PLANNER}.{name}")
+
+
+def test_it_decides_beside_the_loop_as_in_a_simulation():
+    # So long that the time of a decision is not what ends it.
+    scenario = PusherScenario(rollouts=6, latency=5.0, horizon=5.5)
+    with Loop(scenario) as real:
+        assert os.getpriority(os.PRIO_PROCESS, real.worker) >= 5
+        real.ask(1.0)
+        real.run_patiently(520)
+        assert (real.counts.results, real.counts.missed) == (1, 0)
+        shown = [real.read(name) for name in ("decision", "quality", "rollouts", "valid")]
+    target = DpsAlone(scenario)
+    context = target.default_context()
+    target.diagram.GetInputPort("real.sense.state").FixValue(context, [0.1, -0.3])
+    simulator = target.simulator(context)
+    target.write(context, {"u.goal": 0.4})
+    target.write(context, {"u.request": 1.0})
+    simulator.AdvanceTo(5.1)
+    assert shown == [target.read(context, f"{PLANNER}.{name}") for name in ("decision", "quality", "rollouts", "valid")]
+
+
+def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
+    with Loop(PusherScenario(rollouts=10, latency=0.5)) as real:
+        worker = real.worker
+        real.ask(1.0)
+        os.kill(worker, signal.SIGKILL)
+        while not real.counts.restarts:
+            real.runtime.run(cycles=1)
+        # The loop goes on, and the plan stays.
+        real.runtime.run(cycles=60)
+        assert (real.counts.missed, real.read("missed"), real.read("valid")) == (1, 1.0, 0.0)
+        assert real.read("decision") == 0.0 and not real.runtime.guards.latched
+        request = 1.0
+        while not real.counts.results:
+            request += 1.0
+            assert real.wait()
+            real.ask(request)
+            real.run_patiently(60)
+        assert (real.read("valid"), real.read("taken")) == (1.0, request)
+        assert real.worker != worker
+
+
+def test_dps_that_reasons_decides_acts_and_is_replayed(tmp_path: Path) -> None:
+    log_file, options = tmp_path / "pusher.lcm", ("--field", "latency=0.5", "--set", "u.goal=0.4")
+    with (
+        Hub(port=0) as hub,
+        MachineProcess(PusherScenario(), hub.url),
+        start(PUSHER, "--url", hub.url, "--record", log_file, *options) as program,
+    ):
+        patience = ("--url", hub.url, "--timeout", PATIENCE)
+        assert program.stderr is not None
+        assert any("the DPS commands" in line for line in program.stderr)
+
+        def read(name: str) -> float:
+            return float(run("get", f"{PLANNER}.{name}", *patience).stdout.split("=")[1])
+
+        # Decisions are missing while the reasoner starts, and may be on a computer that is busy.
+        request, missed = 0, -1.0
+        while not read("valid"):
+            if read("missed") != missed:
+                request, missed = request + 1, read("missed")
+                run("set", f"u.request={request}", *patience)
+        run("watch", "dps.law.force", "--every", 100, "--count", 12, *patience)
+        program.send_signal(signal.SIGTERM)
+        _, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    log = read_log(log_file)
+    decided = [i for i, change in log.changes if change.kind == "result" and "decision" in change.values[PLANNER]]
+    force = log.actuation["force"][:, 0]
+    (first,) = decided[:1]
+    # The mass is at rest at the origin until the decision acts.
+    assert np.nanmax(np.abs(force[:first])) < 1e-9 < 0.1 < np.abs(force[first:]).max()
+    report = replay(log)
+    assert report.identical and report.digests > 0, report
