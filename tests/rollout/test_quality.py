@@ -318,3 +318,8 @@ def test_what_makes_no_sense_is_refused(make, message):
 def test_a_negative_cost_is_refused():
     with pytest.raises(QualityError, match="a cost is finite and not negative: state it so that 0 is the best"):
         rollout(Quality(lambda theta: theta - 1.0, THETA, minimize=True))
+
+
+def test_a_quality_without_a_name_is_f():
+    assert Quality(lambda z: z, of="time").name == "f"
+    assert Quality(abs, of="time").name == "abs"

@@ -87,8 +87,9 @@ class Measure:
 
     @property
     def name(self) -> str:
-        """Return the name of the function."""
-        return str(getattr(self.f, "__name__", type(self.f).__name__))
+        """Return the name of the function; ``f`` if it has none, as in equation (12)."""
+        name = str(getattr(self.f, "__name__", type(self.f).__name__))
+        return "f" if name == "<lambda>" else name
 
     def __call__(self, values: Sequence[Any], *, time: float) -> float:
         """Return f of the quality variables.
