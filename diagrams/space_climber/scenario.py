@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
+from operator import itemgetter
 
 import numpy as np
 from pydrake.geometry import Box, DefaultProximityProperties, SceneGraphConfig
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
@@ -156,14 +158,47 @@ class SpaceClimberScenario(Scenario):
         return X_WG
 
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare that the estimated pose and the sensed joint angles set the state of the simulated robot."""
+        """Declare how the estimates set the state of the simulated robot."""
         builder.believe(
             "sim.sys.climber.base.pose",
             of=["dps.env.position", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
             by=lambda position, roll, pitch, yaw: [*position, roll, pitch, yaw],
         )
+        self._believe_motion(builder)
         self._believe_joints(builder)
 
+    def _believe_motion(self, builder: VirtualTestbedBuilder) -> None:
+        """Declare that the base turns as the gyro says, and advances as the gait does."""
+        gait = GAITS[self.gait]
+
+        def velocity(
+            roll: float, pitch: float, yaw: float, imu: np.ndarray, level: float, stroke: float, period: float
+        ) -> np.ndarray:
+            R_WB = RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix()
+            v_WB = R_WB @ [level * gait.speed(stroke=stroke, period=period), 0.0, 0.0]
+            return np.concatenate([R_WB @ imu[:3], v_WB])
+
+        of = ["dps.env.roll", "dps.env.pitch", "dps.env.yaw", "dps.sense.calibration.imu"]
+        of += [f"dps.impl.gait.{name}" for name in ("level", "stroke", "period")]
+        builder.believe("sim.sys.climber.base.velocity", of=of, by=velocity)
+
     def _believe_joints(self, builder: VirtualTestbedBuilder) -> None:
+        """Declare that the joints are where they were measured, and move as they are commanded."""
+        encoders, next_command, command = (
+            "dps.sense.calibration.joint_encoders",
+            "dps.impl.gait.joint_position",
+            "dps.act.joint_position",
+        )
         for i, name in enumerate(JOINT_NAMES):
-            builder.believe(f"sim.sys.climber.{name}.position", of=[f"dps.sense.calibration.joint_encoders[{i}]"])
+            builder.believe(f"sim.sys.climber.{name}.position", of=[encoders], by=itemgetter(i))
+            builder.believe(
+                f"sim.sys.climber.{name}.velocity",
+                of=[next_command, command, "dps.act.rate"],
+                by=partial(_joint_velocity, joint=i, period=self.period),
+            )
+
+
+def _joint_velocity(next_command: np.ndarray, command: np.ndarray, rate: float, *, joint: int, period: float) -> float:
+    """Return the velocity (rad/s) of a joint from its next command and the present one (rad), limited to a rate."""
+    velocity = (next_command.item(joint) - command.item(joint)) / period
+    return min(max(velocity, -rate), rate)

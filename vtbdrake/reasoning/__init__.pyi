@@ -1,5 +1,8 @@
 """The public names for reasoning."""
 
+from vtbdrake.reasoning.belief import Belief as Belief
+from vtbdrake.reasoning.belief import BeliefError as BeliefError
+from vtbdrake.reasoning.belief import Starter as Starter
 from vtbdrake.reasoning.decision import Candidate as Candidate
 from vtbdrake.reasoning.decision import Decision as Decision
 from vtbdrake.reasoning.decision import Health as Health

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from vtbdrake.state.codecs import AbstractState, abstract_state
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
 from vtbdrake.state.systems import group_size, is_camera, is_scene_graph, leaves, write_group
+from vtbdrake.state.variables import Variable
 
 
 class LayoutError(ValueError):
@@ -75,6 +76,16 @@ class StateLayout:
                 self._abstract.append((path, system, codecs))
         self.names = (*names, *(f"{path}/abstract" for path, _, _ in self._abstract))
         self.size = start
+
+    def slice_of(self, variable: Variable) -> slice | None:
+        """Return where in the numbers the value of a variable lies, in C order; None if it does not lie there."""
+        place = variable.place
+        for system, groups in self._groups if place is not None else ():
+            for group, index, whole in groups:
+                if place is not None and system is place.system and (group, index) == (place.group, place.index):
+                    start = whole.start + place.start
+                    return slice(start, start + int(np.prod(variable.shape, dtype=int)))
+        return None
 
     def take(self, context: Context) -> FlatState:
         """Return the contents in a root context.

@@ -26,8 +26,9 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
+from vtbdrake.state.declarations import CONTINUOUS, DISCRETE
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
-from vtbdrake.state.variables import A, Variable, VariableError, X
+from vtbdrake.state.variables import A, Place, Variable, VariableError, X
 
 # Name of a model instance -> the dotted prefix of the addresses of its variables.
 Prefix = Callable[[str], str]
@@ -119,14 +120,15 @@ def _joint_variables(plant: MultibodyPlant, joint: Joint, address: str) -> Itera
     def set_damping(context: Context, value: np.ndarray) -> None:
         joint.SetDampingVector(context, np.atleast_1d(value))
 
+    group = CONTINUOUS if plant.time_step() == 0.0 else DISCRETE
     bounds = (-inf, inf)
     if nq == 1:
         bounds = (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
     variable = partial(_variable, plant)
     yield variable(f"{address}.position", X, shapes[0], units[0], lambda context: plant.GetPositions(context)[q],
-                   set_positions, bounds=bounds)  # fmt: skip
+                   set_positions, bounds=bounds, place=Place(plant, group, 0, q.start))  # fmt: skip
     yield variable(f"{address}.velocity", X, shapes[1], units[1], lambda context: plant.GetVelocities(context)[v],
-                   set_velocities)  # fmt: skip
+                   set_velocities, place=Place(plant, group, 0, plant.num_positions() + v.start))  # fmt: skip
     yield variable(f"{address}.damping", A, shapes[1], units[2], joint.GetDampingVector, set_damping,
                    bounds=(0.0, inf))  # fmt: skip
     if plant.time_step() > 0.0:  # Every supported Drake version locks the joints of discrete plants.

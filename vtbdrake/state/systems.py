@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from pydrake.systems.primitives import ConstantVectorSource
 
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER, Element
-from vtbdrake.state.variables import A, Variable, Variables, X
+from vtbdrake.state.variables import A, Place, Variable, Variables, X
 
 if TYPE_CHECKING:
     from pydrake.geometry import SceneGraph
@@ -151,7 +151,8 @@ def _numeric(address: str, system: System, element: Element) -> Variable:
         write_group(context, element.group, element.index, group)
 
     kind = A if element.group == PARAMETER else X
-    return Variable(address, kind, element.shape, element.unit, read, write, bounds=element.bounds)
+    place = Place(system, element.group, element.index, element.start)
+    return Variable(address, kind, element.shape, element.unit, read, write, bounds=element.bounds, place=place)
 
 
 def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:

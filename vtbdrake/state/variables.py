@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, System
 
 X = "x"
 A = "a"
@@ -23,6 +23,16 @@ Writer = Callable[[Context, np.ndarray], None]
 
 class VariableError(ValueError):
     """A value that a variable cannot take, or a write to a derived one."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a value lies, entry by entry, in a numeric group of a leaf system's context."""
+
+    system: System
+    group: str  # ``continuous``, ``discrete`` or ``parameter``
+    index: int  # number of the group
+    start: int  # first entry in the group
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,6 +52,7 @@ class Variable:
     # or a finer one.
     carried_by: str = ""
     order: int = 0  # variables of a lower order are written first, as writing them changes others
+    place: Place | None = None  # where the value lies as it is; None if it is computed from what lies somewhere
 
     def __repr__(self) -> str:
         return f"Variable({self.address!r}, kind={self.kind!r}, shape={self.shape}, unit={self.unit!r})"
@@ -285,4 +296,5 @@ def _entry(variable: Variable, index: int) -> Variable:
         write=None if variable.derived else write,
         bounds=(bound(0), bound(1)),
         carried_by=variable.carried_by,
+        place=variable.place and replace(variable.place, start=variable.place.start + index),
     )

@@ -76,9 +76,7 @@ class AddressedDiagram:
         )
         self._sampling = _sampling_part(diagram)
         if self._sampling is not None:
-            commands = [variable for address, variable in self._variables.items() if address.startswith(COMMAND)]
-            readers = {variable.address.removeprefix(COMMAND): variable.get for variable in commands}
-            self._sampling.sample_dps_by(DpsReader(self.dps_layout, readers))
+            self._sampling.sample_dps_by(self.dps_state)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"
@@ -182,6 +180,14 @@ class AddressedDiagram:
         self._give_integrator(simulator)
         simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return snapshot
+
+    @cached_property
+    def dps_state(self) -> DpsReader:
+        """Return the reader of the DPS's state: a function of a root context."""
+        dps = self.diagram.GetSubsystemByName("dps")
+        commands = {a.removeprefix(COMMAND): v.get for a, v in self._variables.items() if a.startswith(COMMAND)}
+        sensors = {s.name: (dps, dps.GetInputPort(s.name)) for s in self.interface.sense if s.is_vector}
+        return DpsReader(self.dps_layout, commands, sensors)
 
     def event_timings(self) -> tuple[tuple[float, float], ...]:
         """Return (period, offset) in seconds of the periodic updates of all systems, each pair once.

@@ -14,7 +14,7 @@ from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
-from vtbdrake.testbed.testbed import MODES, Belief, VirtualTestbed, check_mode
+from vtbdrake.testbed.testbed import MODES, BeliefRule, VirtualTestbed, check_mode
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat, SceneGraph, SceneGraphConfig
@@ -48,7 +48,7 @@ class VirtualTestbedBuilder:
         diagram_builder: The DiagramBuilder of the testbed, for functions of Drake that take one.
         plant, scene_graph: Those of the simulated world; None until `add_plant` adds them.
         sensors, actuators: The ports of the simulated world, by signal.
-        beliefs: What `believe` declares.
+        belief_rules: What `believe` declares.
         extra_variables: Those that `add_variable` lists.
     """
 
@@ -67,7 +67,7 @@ class VirtualTestbedBuilder:
         self.actuators: dict[str, InputPort] = {}
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
-        self.beliefs: list[Belief] = []
+        self.belief_rules: list[BeliefRule] = []
         self.extra_variables: list[Variable] = []
 
     def add(self, role: str, name: str, system: S) -> S:
@@ -212,7 +212,7 @@ class VirtualTestbedBuilder:
             age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
                 sensor, which shows its state, is one period late. Predictions from the belief need the age.
         """
-        self.beliefs.append(Belief(target, tuple(of), by, age))
+        self.belief_rules.append(BeliefRule(target, tuple(of), by, age))
 
     def add_variable(self, variable: Variable) -> None:
         """List a further variable, for example one that is derived from others."""

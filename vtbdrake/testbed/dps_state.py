@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context, InputPort, LeafSystem, System
 
 from vtbdrake.state import Codec
 from vtbdrake.state.layout import FlatState, StateLayout
@@ -21,19 +21,22 @@ class DpsState:
     time: float  # in seconds
     contents: FlatState  # state and parameters of the DPS's systems
     commands: Mapping[str, np.ndarray]  # the commands u that are set from outside, by name
+    # the sensor values that are vectors, as the DPS sees them at this instant, by name; without those never fed
+    received: Mapping[str, np.ndarray]
 
 
 def _encode(state: DpsState) -> dict[str, np.ndarray]:
     names = np.frombuffer("\n".join(state.contents.names).encode(), dtype=np.uint8)
     numbers = {"time": np.array(state.time), "names": names, "numbers": state.contents.numbers}
     commands = {f"u.{name}": value for name, value in state.commands.items()}
-    return numbers | commands | {f"abstract.{key}": array for key, array in state.contents.abstract.items()}
+    received = {f"received.{name}": value for name, value in state.received.items()}
+    return numbers | commands | received | {f"abstract.{key}": array for key, array in state.contents.abstract.items()}
 
 
 def _decode(arrays: Mapping[str, np.ndarray]) -> DpsState:
     names = tuple(arrays["names"].tobytes().decode().split("\n"))
     contents = FlatState(names, arrays["numbers"], _below("abstract.", arrays))
-    return DpsState(arrays["time"].item(), contents, _below("u.", arrays))
+    return DpsState(arrays["time"].item(), contents, _below("u.", arrays), _below("received.", arrays))
 
 
 def _below(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -49,15 +52,27 @@ class DpsReader:
     Args:
         layout: That of the DPS's systems.
         commands: Reads the commands u that are set from outside, by name.
+        sensors: The DPS's input ports of sensor signals that are vectors, by name.
     """
 
-    def __init__(self, layout: StateLayout, commands: Mapping[str, Callable[[Context], Any]]) -> None:
+    def __init__(
+        self,
+        layout: StateLayout,
+        commands: Mapping[str, Callable[[Context], Any]],
+        sensors: Mapping[str, tuple[System, InputPort]],
+    ) -> None:
         self._layout = layout
         self._commands = dict(commands)
+        self._sensors = dict(sensors)
 
     def __call__(self, root: Context) -> DpsState:
         commands = {name: np.array(read(root), dtype=float) for name, read in self._commands.items()}
-        return DpsState(root.get_time(), self._layout.take(root), commands)
+        received = {}
+        for name, (dps, port) in self._sensors.items():
+            own = dps.GetMyContextFromRoot(root)
+            if port.HasValue(own):
+                received[name] = np.array(port.Eval(own))
+        return DpsState(root.get_time(), self._layout.take(root), commands, received)
 
 
 class RootReference:

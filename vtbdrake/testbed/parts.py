@@ -118,7 +118,7 @@ class WorldAlone(AddressedDiagram):
         diagram: Input ports ``act.<signal>``, which lead to the simulated actuators, and output ports
             ``sense.<signal>``, which come from the simulated sensors.
         plant: Plant of the simulated world, if it has one.
-        beliefs: Which estimates of the DPS set which of its variables.
+        belief_rules: How estimates of the DPS set its variables.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -147,7 +147,7 @@ class WorldAlone(AddressedDiagram):
             plant_roles=parts.plant_roles(),
         )
         self.plant = parts.plant
-        self.beliefs = tuple(parts.beliefs)
+        self.belief_rules = tuple(parts.belief_rules)
         self._actuators = {s.name: (s, diagram.GetInputPort(f"act.{s.name}")) for s in parts.interface.act}
 
     def default_context(self) -> Context:

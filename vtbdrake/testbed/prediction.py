@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams
 
 from vtbdrake.testbed.parts import WorldAlone
-from vtbdrake.testbed.testbed import Belief
+from vtbdrake.testbed.testbed import BeliefRule
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
@@ -47,7 +47,7 @@ class Predictor:
         self.interface = world.interface
         self._period = period
         self._values = dict(values)
-        if not world.beliefs:
+        if not world.belief_rules:
             raise ValueError(
                 f"{type(scenario).__name__} does not declare which estimates of its DPS set its simulated world, from "
                 "which a prediction starts: declare them with VirtualTestbedBuilder.believe"
@@ -55,8 +55,8 @@ class Predictor:
         for signal in [*world.interface.sense, *world.interface.act]:
             if not signal.is_vector:
                 raise ValueError(f"only vector signals are predicted, but {signal.name} is abstract")
-        self._beliefs: dict[int, list[Belief]] = {}
-        for belief in world.beliefs:
+        self._beliefs: dict[int, list[BeliefRule]] = {}
+        for belief in world.belief_rules:
             world.variables()[belief.target]
             self._beliefs.setdefault(_age_in_periods(belief, period), []).append(belief)
         self.estimates = {
@@ -119,7 +119,7 @@ class Predictor:
         return np.concatenate([port.Eval(self._context) for port in self._sensors])
 
 
-def _age_in_periods(belief: Belief, period: float) -> int:
+def _age_in_periods(belief: BeliefRule, period: float) -> int:
     age = round(belief.age / period)
     if not isclose(age * period, belief.age, rel_tol=1e-6, abs_tol=1e-9):
         raise ValueError(

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Belief:
-    """``target`` (an address in sim) is ``by`` of the estimates at the addresses ``of`` (in dps).
+class BeliefRule:
+    """How estimates of the DPS set a variable of the world.
+
+    ``target`` (an address in sim) is ``by`` of the estimates at the addresses ``of`` (in dps).
 
     ``age`` is the time in seconds from the instant of the world that the estimates are about to that of the sensor
     values from which they are made: that of sampling, say. What lies between machine and DPS does not count.
@@ -91,6 +93,9 @@ class VirtualTestbed(AddressedDiagram):
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
         dps: The data processing system, a direct subsystem of the diagram.
         plant, scene_graph: Those of the simulated world, if it has them.
+        simulated_sensors, simulated_actuators: The systems that offer sensor signals or take actuator signals, by
+            signal.
+        belief_rules: How estimates of the DPS set variables of the simulated world.
         visualized: True if a Meshcat draws it.
     """
 
@@ -120,9 +125,11 @@ class VirtualTestbed(AddressedDiagram):
         self.scene_graph = parts.scene_graph
         self.visualized = visualized
         self._signals = {signal.name: signal for signal in parts.interface.sense}
-        self._beliefs = tuple(parts.beliefs)
-        for belief in self._beliefs:
-            belief.check(self._variables)
+        self.simulated_sensors = {name: port.get_system() for name, port in parts.sensors.items()}
+        self.simulated_actuators = {name: port.get_system() for name, port in parts.actuators.items()}
+        self.belief_rules = tuple(parts.belief_rules)
+        for rule in self.belief_rules:
+            rule.check(self._variables)
 
     def _repr_html_(self) -> str:
         """Show Figure 4 in a notebook, with the switches as they were built."""
@@ -218,7 +225,7 @@ class VirtualTestbed(AddressedDiagram):
     @property
     def believes(self) -> bool:
         """Return whether the testbed declares which estimates of its DPS set its simulated world."""
-        return bool(self._beliefs)
+        return bool(self.belief_rules)
 
     def start_from_belief(self, context: Context) -> None:
         """Set the simulated world to what the DPS in ``context`` believes: s_sim(t0) from s_dps(t).
@@ -229,12 +236,12 @@ class VirtualTestbed(AddressedDiagram):
             ValueError: The testbed declares no belief, or a variable refuses what is believed of it.
         """
         self.check_context(context)
-        if not self._beliefs:
+        if not self.belief_rules:
             raise ValueError("this testbed does not declare what of its DPS sets its simulated world (see `believe`)")
         self.write(
             context,
             {
-                belief.target: np.clip(belief.value(self._variables, context), *self._variables[belief.target].bounds)
-                for belief in self._beliefs
+                rule.target: np.clip(rule.value(self._variables, context), *self._variables[rule.target].bounds)
+                for rule in self.belief_rules
             },
         )

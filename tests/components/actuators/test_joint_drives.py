@@ -170,3 +170,18 @@ def test_joint_without_its_one_velocity_is_refused() -> None:
     plant.Finalize()
     with pytest.raises(ValueError, match="6 velocities"):
         JointDrives(plant, [plant.GetJointByName("free")], period=PERIOD)
+
+
+def test_drives_that_resume_stand_where_a_command_of_some_time_has_led_them() -> None:
+    drive = {"time_constant": 0.01, "delay": 3, "max_delay": 4, "rate": 500.0, "limit": 20.0}
+    expected = torques(200, **drive)[-1]
+    _, plant = two_joints()
+    drives = JointDrives(plant, [plant.GetJointByName("a"), plant.GetJointByName("b")], period=PERIOD, **drive)
+    simulator = Simulator(drives)
+    context = simulator.get_mutable_context()
+    drives.GetInputPort("state").FixValue(context, np.zeros(4))
+    drives.GetInputPort("command").FixValue(context, [8.0, -4.0])
+    drives.resume(context, [8.0, -4.0])
+    for end in (0.0, 0.0005, 0.0105):
+        simulator.AdvanceTo(end)
+        np.testing.assert_allclose(drives.get_output_port().Eval(context), expected, rtol=1e-6)

@@ -70,6 +70,31 @@ def test_imu_off_centre_feels_the_centripetal_force() -> None:
     np.testing.assert_allclose(y[3:], expected, atol=2e-3 * np.linalg.norm(expected) + 1e-3)
 
 
+def test_imu_that_resumes_goes_on_as_the_one_before() -> None:
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
+    diagram = add(builder, plant, imu)
+    running, resumed = Simulator(diagram), Simulator(diagram)
+    plant.SetFreeBodySpatialVelocity(
+        plant.GetMyContextFromRoot(running.get_mutable_context()),
+        plant.GetBodyByName("body"),
+        SpatialVelocity([0.5, -1.0, 2.0], [1.0, 2.0, 3.0]),
+    )
+    for now, end in ((0.204, 0.215), (0.23, 0.235)):  # Between two samples, and when the next one is due.
+        running.AdvanceTo(now)
+        context = resumed.get_mutable_context()
+        context.SetTime(now)
+        own, there = plant.GetMyMutableContextFromRoot(context), plant.GetMyContextFromRoot(running.get_context())
+        plant.SetPositionsAndVelocities(own, plant.GetPositionsAndVelocities(there))
+        imu.resume(imu.GetMyMutableContextFromRoot(context), reading(imu, running))
+        resumed.Initialize()
+        np.testing.assert_array_equal(reading(imu, resumed), reading(imu, running))
+        for simulator in (running, resumed):
+            simulator.AdvanceTo(end)
+        np.testing.assert_allclose(reading(imu, resumed), reading(imu, running), atol=2e-3)
+
+
 def arm(*, angle: float, rate: float = 0.0, discrete: bool = False) -> tuple[DiagramBuilder, MultibodyPlant]:
     """A link that turns about the world's y axis without gravity's torque: its mass is on the axis."""
     builder = DiagramBuilder()

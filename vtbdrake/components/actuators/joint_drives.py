@@ -125,6 +125,12 @@ class JointDrives(LeafSystem):
         self._kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
+    def resume(self, context: Context, command: ArrayLike) -> None:
+        """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""
+        torque = np.asarray(command, dtype=float)
+        context.SetDiscreteState(self._torque, torque)
+        context.SetDiscreteState(self._memory, np.tile(torque, 2 + self._max_delay))
+
     def _elements(self) -> Iterator[Element]:
         n, index = self._n, self._parameters
         yield discrete_state("torque", self._torque, shape=(n,), unit="N m")

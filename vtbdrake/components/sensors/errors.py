@@ -193,6 +193,13 @@ class ErrorStage:
             )
         settings.set_value(found)
 
+    def resume(self, context: Context, y: NDArray[np.float64]) -> None:
+        """Let ``y`` be in transit, throughout."""
+        if self._more and self._longest:
+            memory = np.array(context.get_discrete_state(self._memory).value())
+            memory[self._n :] = np.tile(y, self._longest)
+            context.SetDiscreteState(self._memory, memory)
+
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
         values = context.get_numeric_parameter(self._parameters).value()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.common.value import Value
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
@@ -98,15 +100,36 @@ class Imu(SampledSensor):
             )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        return self._sample_into(state.get_mutable_value(self._memory), context)
+
+    def _sample_into(self, memory: NDArray[np.float64], context: Context) -> NDArray[np.float64]:
+        """Return the measurement; ``memory`` is that of the last sample, and becomes that of this one."""
         return sample(
             self._motion(context),
             orientation=self._orientation,
             velocity=self._velocity,
             mount=context.get_numeric_parameter(self._mount).value(),
             g_W=self._g_W,
-            memory=state.get_mutable_value(self._memory),
+            memory=memory,
             period=self._period,
         )
+
+    def resume(self, context: Context, y: NDArray[np.float64]) -> None:
+        """Go on as `SampledSensor.resume` does; the motion up to now is one that was measured as ``y``."""
+        super().resume(context, y)
+        now = context.get_time()
+        # The time since the last sample; what is due now has not been sampled yet.
+        elapsed = now - (ceil(now / self._period - 1e-6) - 1.0) * self._period
+        memory = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        self._sample_into(memory, context)
+        v_WF, R_WF = memory[1:4], RotationMatrix(Quaternion(memory[4:]))
+        turn = elapsed * y[:3]
+        angle = float(np.linalg.norm(turn))
+        if angle > 0.0:
+            memory[4:] = (R_WF @ RotationMatrix(AngleAxis(-angle, turn / angle))).ToQuaternion().wxyz()
+            R_WF = R_WF @ RotationMatrix(AngleAxis(-angle / 2.0, turn / angle))
+        memory[1:4] = v_WF - elapsed * (R_WF @ y[3:] + self._g_W)
+        context.SetDiscreteState(self._memory, memory)
 
     def _motion(self, context: Context) -> NDArray[np.float64]:
         """Return numbers that hold q_WB and V_WB."""

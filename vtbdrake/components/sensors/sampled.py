@@ -91,6 +91,19 @@ class SampledSensor(LeafSystem):
         """Return the time between two samples (s)."""
         return self._period
 
+    def resume(self, context: Context, y: NDArray[np.float64]) -> None:
+        """Go on where a sensor stands that has shown ``y`` last, with all that is in transit alike.
+
+        So the DPS of a mental copy gets what the DPS itself would have got, until the copy's sensors sample.
+
+        Args:
+            context: of this sensor, in the state of the world in which it is to go on.
+            y: shape (n,).
+        """
+        context.SetDiscreteState(self._output, y)
+        if self._stage is not None:
+            self._stage.resume(context, y)
+
     @abstractmethod
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         """Return the measurement without noise. Write memory for the next measurement to ``state``."""

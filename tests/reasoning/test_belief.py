@@ -1,0 +1,320 @@
+"""Beliefs: mental rollouts begin where the DPS believes itself and its world to be."""
+
+import pickle
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.framework import BasicVector, LeafSystem
+
+from tests.reasoning.scenarios import MassScenario
+from tests.testbeds import PENDULUM, AcrobotScenario
+from vtbdrake.components.sensors import JointEncoders
+from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.reasoning import Belief, BeliefError, Starter
+from vtbdrake.rollout import ProcessExecutor, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
+from vtbdrake.state import discrete_state
+from vtbdrake.testbed import DpsAlone, Interface, Signal
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+
+THETA, OMEGA = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
+ARM_MASS = "sim.sys.Pendulum.arm.mass"
+T = 0.02
+
+
+class Tracker(LeafSystem):
+    """Estimates angle and rate from the last two angles, and commands no torque.
+
+    .. pydrake_system::
+
+        name: Tracker
+        input_ports:
+        - angle
+        output_ports:
+        - torque
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        estimate, torque = self.DeclareDiscreteState(2), self.DeclareDiscreteState(1)
+        self._angle = self.DeclareVectorInputPort("angle", BasicVector(1))
+        self.DeclareStateOutputPort("torque", torque)
+        self.DeclarePeriodicDiscreteUpdateEvent(T, 0.0, self._update)
+        self.variables = (
+            discrete_state("angle", estimate, unit="rad"),
+            discrete_state("rate", estimate, start=1, unit="rad/s"),
+        )
+
+    def _update(self, context, discrete):
+        (angle,) = self._angle.Eval(context)
+        discrete.set_value(0, [angle, (angle - context.get_discrete_state(0)[0]) / T])
+
+
+@dataclass
+class TrackedScenario(MassScenario):
+    """A swinging pendulum whose encoder is late, and a DPS that tracks it."""
+
+    latency: int = 3
+    time_step: float = 0.001
+    gain_of_rate: float = 1.0
+
+    def interface(self):
+        return Interface(sense=[Signal("angle", size=1)], act=[Signal("torque", size=1, idle=0.0)])
+
+    def make_dps(self):
+        return Tracker()
+
+    def add_world(self, builder):
+        plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
+        Parser(plant).AddModelsFromUrl(PENDULUM)
+        joint = plant.GetJointByName("theta")
+        joint.set_position_limits([-2.0], [2.0])
+        plant.Finalize()
+        builder.add_sensor("angle", JointEncoders(plant, [joint], period=T, errors=ErrorModel(latency=self.latency)))
+        builder.sim_actuator("torque", plant.get_actuation_input_port())
+        builder.believe(THETA, of=["dps.angle"])
+        builder.believe(OMEGA, of=["dps.rate"], by=lambda rate: self.gain_of_rate * rate)
+
+
+def _swinging(scenario, seconds=0.63):
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {THETA: 1.0})
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(seconds)
+    return testbed, simulator.get_context()
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    """A testbed, its context after a while, and a mental testbed."""
+    return *_swinging(TrackedScenario()), TrackedScenario().build()
+
+
+def _future(task, testbed, simulator, address):
+    context = simulator.get_mutable_context()
+    found = [testbed.read(context, address)]
+    for instant in task.instants(context.get_time(), testbed.event_timings())[1:]:
+        simulator.AdvanceTo(instant)
+        found.append(testbed.read(context, address))
+    return np.array(found)
+
+
+# -- perfect beliefs
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+def test_with_a_perfect_belief_the_mental_rollout_is_the_true_future(executor):
+    scenario, elbow = AcrobotScenario(time_step=0.01), "sim.sys.Acrobot.elbow.position"
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    testbed.write(simulator.get_mutable_context(), {elbow: 0.8, "sim.sys.Acrobot.upper_link.mass": 1.2})
+    simulator.AdvanceTo(0.51)
+    belief = pickle.loads(pickle.dumps(Belief.perfect(testbed, simulator.get_context())))
+    task = RolloutTask(scenario.mental(), 0.5, record=[elbow])
+    future = _future(task, testbed, simulator, elbow)
+    with executor() as workers:
+        results = dict(workers.run(task, [{}, {}], start=belief.start(scenario.mental().build())))
+    for result in results.values():
+        np.testing.assert_array_equal(result.record[elbow], future)
+
+
+def test_a_perfect_belief_reaches_a_world_with_another_integrator():
+    testbed, context = _swinging(TrackedScenario())
+    testbed.write(context, {ARM_MASS: 0.7})
+    mental = TrackedScenario(time_step=0.0)
+    task = RolloutTask(mental, 0.1, record=[THETA, OMEGA, ARM_MASS, "dps.rate"])
+    record = RolloutRunner(task).run({}, start=Belief.perfect(testbed, context).start(mental.build())).record
+    for address in task.record:
+        assert record[address][0] == testbed.read(context, address)
+
+
+# -- what a DPS believes
+
+
+def test_the_mental_world_is_what_the_dps_believes(tracked):
+    testbed, context, mental = tracked
+    start = Belief.of(testbed, context).start(mental)
+    task = RolloutTask(TrackedScenario(), 0.1, record=[THETA, OMEGA, "dps.angle", "time"])
+    record = RolloutRunner(task).run({}, start=start).record
+    assert (record[THETA][0], record[OMEGA][0]) == (
+        testbed.read(context, "dps.angle"),
+        testbed.read(context, "dps.rate"),
+    )
+    assert abs(record[THETA][0] - testbed.read(context, THETA)) > 0.01, "the estimate is late"
+    assert (record["dps.angle"][0], record["time"][0]) == (testbed.read(context, "dps.angle"), 0.63)
+
+
+def test_the_mental_dps_gets_the_values_that_the_dps_received_last(tracked):
+    testbed, context, mental = tracked
+    shown = testbed.read(context, "sim.sense.angle.joint_encoders").item()
+    task = RolloutTask(TrackedScenario(), 6 * T, record=["dps.angle"], sample_period=T / 2)
+    record = RolloutRunner(task).run({}, start=Belief.of(testbed, context).start(mental)).record["dps.angle"]
+    # At 0.64 s the value shown, up to 0.70 s those in transit, and then what the sensor itself has measured.
+    np.testing.assert_array_equal(record[2:9], shown)
+    assert abs(record[-1] - shown) > 0.01
+
+
+def test_a_belief_of_the_dps_alone_gives_the_same_start(tracked):
+    testbed, context, mental = tracked
+    alone = DpsAlone(TrackedScenario())
+    own = alone.continue_from(testbed, context)
+    with pytest.raises(BeliefError, match="has not received angle"):
+        Belief.of(alone, own).start(mental)
+    value = testbed.read(context, "sim.sense.angle.joint_encoders")
+    alone.diagram.GetInputPort("real.sense.angle").FixValue(own, value)
+    expected, found = Belief.of(testbed, context).start(mental), Belief.of(alone, own).start(mental)
+    np.testing.assert_array_equal(found.contents.numbers, expected.contents.numbers)
+    assert (found.time, found.contents.names) == (expected.time, expected.contents.names)
+
+
+def test_the_climber_walks_on_from_the_belief_of_its_dps_alone():
+    scenario, pose = SpaceClimberScenario(), "sim.sys.climber.base.pose"
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    simulator.AdvanceTo(3.01)
+    context = simulator.get_context()
+    alone = DpsAlone(scenario)
+    own = alone.continue_from(testbed, context)
+    for signal in scenario.interface().sense:
+        alone.diagram.GetInputPort(f"real.sense.{signal.name}").FixValue(
+            own, testbed.read(context, f"T_sense.{signal.name}.value")
+        )
+    mental = scenario.mental().build()
+    start = Belief.of(alone, own).start(mental)
+    task = RolloutTask(scenario.mental(), 1.2, record=[pose, "sim.sys.climber.base.velocity"], sample_period=0.1)
+    runner = RolloutRunner(task, mental)
+    found = runner.run({}, start=start).record
+    future = _future(task, testbed, simulator, pose)
+    estimate = np.linalg.norm((found[pose] - future)[0, :3])
+    errors = np.linalg.norm((found[pose] - future)[:, :3], axis=1)
+    assert 0.0 < estimate < 0.03
+    assert errors.max() < 1.5 * estimate
+    assert future[-1, 0] - future[0, 0] > 0.2, "it walks"
+    # It walks from the first moment: 0.2 m/s, where a robot at rest stumbles.
+    np.testing.assert_allclose(found["sim.sys.climber.base.velocity"][:, 3], 0.2, atol=0.05)
+
+
+# -- uncertain beliefs
+
+
+def test_samples_have_the_covariance_that_is_given(tracked):
+    testbed, context, mental = tracked
+    belief = Belief.of(testbed, context)
+    starter = Starter(mental, uncertainty={THETA: 0.1, OMEGA: lambda w, rng: w + 0.5 * rng.uniform(-1.0, 1.0)}, seed=3)
+    starts = starter.starts(belief, samples=400)
+    q, v = (mental.start_layout.slice_of(mental.variables()[a]) for a in (THETA, OMEGA))
+    drawn = np.array([[s.contents.numbers[q][0], s.contents.numbers[v][0]] for s in starts])
+    believed = [testbed.read(context, "dps.angle"), testbed.read(context, "dps.rate")]
+    np.testing.assert_allclose(drawn.mean(axis=0), believed, atol=0.05)
+    np.testing.assert_allclose(drawn.std(axis=0), [0.1, 0.5 / np.sqrt(3.0)], rtol=0.1)
+    again = starter.starts(belief, samples=2)
+    np.testing.assert_array_equal(again[1].contents.numbers, starts[1].contents.numbers)
+
+
+def test_a_covariance_matrix_correlates_the_entries_of_a_variable():
+    scenario = SpaceClimberScenario()
+    mental, pose = scenario.build(), "sim.sys.climber.base.velocity"
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    simulator.AdvanceTo(0.1)
+    C = 1e-2 * (np.eye(6) + 0.8 * (np.eye(6, k=1) + np.eye(6, k=-1)) / 2)
+    starts = Starter(mental, uncertainty={pose: C}).starts(Belief.of(testbed, simulator.get_context()), samples=500)
+    place = mental.start_layout.slice_of(mental.variables()[pose])
+    np.testing.assert_allclose(np.cov([s.contents.numbers[place] for s in starts], rowvar=False), C, atol=3e-3)
+
+
+def test_an_uncertain_parameter_of_the_world_varies_around_its_value_there(tracked):
+    testbed, context, mental = tracked
+    starts = Starter(mental, uncertainty={ARM_MASS: 5.0}).starts(Belief.of(testbed, context), samples=30)
+    masses = [float(start.values[ARM_MASS]) for start in starts]
+    assert min(masses) == 0.0 and max(masses) > 5.0 and len(set(masses)) > 10
+    runner = RolloutRunner(RolloutTask(TrackedScenario(), 0.1, record=[ARM_MASS]), mental)
+    heavy = int(np.argmax(masses))
+    assert runner.run({}, start=starts[heavy]).record[ARM_MASS][0] == masses[heavy]
+
+
+def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
+    testbed, context, mental = tracked
+    first, second = Starter(mental).starts(Belief.of(testbed, context), samples=2)
+    assert first is second
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "why"),
+    [
+        ({"dps.rate": 0.1}, "unlike dps.rate"),
+        ({THETA: -1.0}, "is a standard deviation"),
+        ({THETA: [0.1, 0.2]}, "of shape"),
+        ({THETA: np.nan}, "is a standard deviation"),
+        ({"sim.sys.Pendulum.theta.positon": 0.1}, "did you mean"),
+    ],
+)
+def test_an_uncertainty_that_does_not_fit_is_refused(tracked, uncertainty, why):
+    with pytest.raises(ValueError, match=why):
+        Starter(tracked[2], uncertainty=uncertainty)
+
+
+# -- beliefs from which nothing can begin
+
+
+def test_a_belief_that_is_missing_or_out_of_bounds_is_refused_with_its_reason(tracked):
+    testbed, context, _ = tracked
+    belief = Belief.of(testbed, context)
+    unknown = TrackedScenario(gain_of_rate=np.nan)
+    unknown.validate = lambda: None  # A scenario's fields are finite.
+    with pytest.raises(BeliefError, match=r"theta.velocity is missing: nan, of \{'dps.rate': "):
+        belief.start(unknown.build())
+
+
+def test_an_estimate_a_little_past_a_stop_is_clipped_and_one_far_beyond_is_refused(tracked):
+    testbed, _, mental = tracked
+    context, starter = testbed.default_context(), Starter(mental)
+    for angle in (2.19, -2.19):
+        testbed.write(context, {"dps.angle": angle})
+        start = starter.start(Belief.of(testbed, context))
+        assert start.contents.numbers[mental.start_layout.slice_of(mental.variables()[THETA])] == np.sign(angle) * 2.0
+    testbed.write(context, {"dps.angle": 2.21})
+    with pytest.raises(BeliefError, match=rf"{THETA} is 2.21 rad, .* must lie in \[-2, 2\]"):
+        starter.start(Belief.of(testbed, context))
+
+
+def test_an_old_belief_is_refused(tracked):
+    testbed, context, mental = tracked
+    belief, starter = Belief.of(testbed, context), Starter(mental, max_age=0.1)
+    starter.start(belief, now=0.7)
+    with pytest.raises(BeliefError, match=r"of t = 0.63 s and 0.12 s old, but at most 0.1 s"):
+        starter.start(belief, now=0.75)
+
+
+def test_a_world_without_rules_is_refused():
+    testbed = MassScenario().build()
+    with pytest.raises(BeliefError, match="declare them with VirtualTestbedBuilder.believe"):
+        Belief.of(testbed, testbed.default_context()).start(testbed)
+
+
+def test_another_dps_is_refused_by_the_name_of_what_differs(tracked):
+    testbed = AcrobotScenario().build()
+    with pytest.raises(BeliefError, match=r"it lacks dps/discrete/0 \(2\); it has dps/discrete/0 \(1\)"):
+        Belief.of(testbed, testbed.default_context()).start(tracked[2])
+
+
+def test_the_mental_world_may_differ_where_the_dps_is_the_same(tracked):
+    testbed, context, _ = tracked
+    other = TrackedScenario(latency=0, time_step=0.0)
+    start = Belief.of(testbed, context).start(other.build())
+    record = RolloutRunner(RolloutTask(other, 0.1, record=[THETA])).run({}, start=start).record
+    assert record[THETA][0] == testbed.read(context, "dps.angle")
+
+
+def test_what_is_no_belief_is_refused(tracked):
+    testbed, context, mental = tracked
+    with pytest.raises(BeliefError, match="not Snapshot"):
+        Starter(mental).start(testbed.snapshot(context))
+    with pytest.raises(ValueError, match="positive time"):
+        Starter(mental, max_age=0.0)
+    belief = Belief.of(testbed, context)
+    with pytest.raises(BeliefError, match="has not received angle"):
+        Starter(mental).start(replace(belief, dps=replace(belief.dps, received={})))

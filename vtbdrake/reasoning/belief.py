@@ -1,0 +1,370 @@
+"""Belief: what a DPS knows when it reasons, and the starts of mental rollouts that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context, System
+from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
+
+from vtbdrake.rollout.start import Start
+from vtbdrake.state import VariableError
+from vtbdrake.state.layout import FlatState, LayoutError
+from vtbdrake.state.variables import A
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.dps_state import DpsState
+from vtbdrake.testbed.switch import COMMAND
+from vtbdrake.testbed.testbed import BeliefRule
+
+# An estimate may lie beyond the bounds of its variable by this share of their distance: a joint a little past its stop.
+_BEYOND = 0.05
+
+
+class BeliefError(ValueError):
+    """A belief from which no rollout can begin."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A true simulated world, for a perfect belief.
+
+    Attributes:
+        contents: of the whole testbed.
+        values: by address, all that can be set in the simulated world.
+    """
+
+    contents: FlatState
+    values: Mapping[str, ArrayLike]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Belief:
+    """What a DPS believes at one instant: itself, as it stands, and the world, as its estimates have it.
+
+    The rules that lead from estimates to variables of the world are those of the mental scenario
+    (`VirtualTestbedBuilder.believe`), and so is all that no rule sets. A belief is plain data, which can be pickled.
+
+    Attributes:
+        dps: the DPS: its state, parameters and commands, and the sensor values that it has received last.
+        world: the true world, of a perfect belief; None for every other one.
+    """
+
+    dps: DpsState
+    world: World | None = None
+
+    def __repr__(self) -> str:
+        kind = "perfect belief" if self.world is not None else "belief"
+        return f"<{kind} at t = {self.dps.time:g} s>"
+
+    @classmethod
+    def of(cls, target: AddressedDiagram, context: Context) -> Belief:
+        """Return the belief of the DPS in ``context``.
+
+        Args:
+            target: a testbed, or a DPS alone: the target of a Runtime, say.
+            context: of the target; it stays as it is.
+
+        Raises:
+            ValueError: the context belongs to another target.
+        """
+        target.check_context(context)
+        return cls(target.dps_state(context))
+
+    @classmethod
+    def perfect(cls, testbed: VirtualTestbed, context: Context) -> Belief:
+        """Return a belief that knows the simulated world as it is: for tests, and for bounds of what can be reached.
+
+        With the same scenario, a mental rollout is then the true future, see `AddressedDiagram.fork`. With another
+        mental scenario, all variables of the world that both have are the true ones.
+
+        Raises:
+            ValueError: the context belongs to another testbed.
+        """
+        testbed.check_context(context)
+        settable = [v for a, v in testbed.variables().items() if a.startswith("sim.") and not v.derived]
+        values = {variable.address: variable.get(context) for variable in settable}
+        return cls(testbed.dps_state(context), World(testbed.whole_layout.take(context), values))
+
+    def start(self, mental: VirtualTestbed) -> Start:
+        """Return where a rollout of ``mental`` begins that is as it is believed to be; see `Starter.start`."""
+        return Starter(mental).start(self)
+
+
+# How an estimate is uncertain: a standard deviation (scalar or of the variable's shape), a covariance matrix, or a
+# function that draws: (believed value, random generator) -> value.
+Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
+
+
+class Starter:
+    """Turns beliefs into starts for the rollouts of one mental testbed.
+
+    1. The DPS continues as it stands, at its own time; u is as it was.
+    2. The world is that of the mental scenario, with the variables that the scenario's rules set
+       (`VirtualTestbedBuilder.believe`) as the DPS's estimates have them. An estimate that lies beyond the bounds of
+       its variable by at most 5 % of their distance is clipped. Velocities without a rule are zero.
+    3. Sensors show the values that the DPS has received last, also those in transit, until they sample in the mental
+       world. (What they would measure in the believed state differs from that by the errors of the estimates: the
+       DPS's filters would see a jump that does not happen.) Actuators stand as if they had been given the DPS's
+       present command for some time. Sensors and actuators without a method ``resume``, such as cameras, begin as in
+       the mental scenario.
+
+    A rule says how old its estimates are (``age``). They are not extrapolated: the mental world is late by that much.
+
+    Args:
+        mental: the testbed of the rollouts.
+        uncertainty: by address of a variable of the simulated world, how uncertain the belief about it is: a standard
+            deviation, a covariance matrix, or a function (believed value, random generator) -> value. A variable
+            without a rule is uncertain about its value in the mental scenario.
+        seed: with the number of a sample, determines its random numbers, in the same way for every belief.
+        max_age: the largest age of a belief in seconds.
+
+    Raises:
+        BeliefError: an uncertainty is of no variable of the simulated world, or does not fit its shape.
+    """
+
+    def __init__(
+        self,
+        mental: VirtualTestbed,
+        *,
+        uncertainty: Mapping[str, Uncertainty] | None = None,
+        seed: int = 0,
+        max_age: float = inf,
+    ) -> None:
+        if not max_age > 0.0:
+            raise ValueError(f"the largest age of a belief is a positive time, not {max_age} s")
+        self._mental = mental
+        self._max_age = max_age
+        self._seed = seed
+        self._variables = mental.variables()
+        self._context = mental.default_context()
+        vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
+        self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and _resumes(s)}
+        self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and _resumes(s)}
+        self._targets = [_Target(mental, rule) for rule in mental.belief_rules]
+        self._estimates = {
+            address: (variable, mental.dps_layout.slice_of(variable))
+            for target in self._targets
+            for address in target.rule.of
+            for variable in [self._variables[address]]
+        }
+        self._draws = {address: self._draw(address, how) for address, how in (uncertainty or {}).items()}
+        # What is believed without a rule.
+        self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in self._draws}
+        set_by = [*self._prior, *(target.rule.target for target in self._targets)]
+        self._kinds = {a: (v.kind, mental.start_layout.slice_of(v)) for a in set_by for v in [self._variables[a]]}
+
+    def _draw(self, address: str, how: Uncertainty) -> Callable[[np.ndarray, np.random.Generator], ArrayLike]:
+        variable = self._variables[address]
+        if not address.startswith("sim.") or variable.derived:
+            raise BeliefError(f"uncertain is a variable of the simulated world that can be set, unlike {address}")
+        if callable(how):
+            return how
+        spread, size = np.asarray(how, dtype=float), int(np.prod(variable.shape, dtype=int))
+        if spread.shape == (size, size) and size > 1 and np.isfinite(spread).all():
+            values, axes = np.linalg.eigh(spread)
+            if not (
+                np.isfinite(spread).all() and np.allclose(spread, spread.T) and values[0] >= -1e-9 * abs(values[-1])
+            ):
+                raise BeliefError(
+                    f"the covariance of {address} must be symmetric and positive semidefinite, not {how!r}"
+                )
+            root = axes * np.sqrt(np.maximum(values, 0.0))
+            return lambda mean, rng: mean + (root @ rng.standard_normal(size)).reshape(variable.shape)
+        if spread.shape not in ((), variable.shape) or not (np.isfinite(spread) & (spread >= 0.0)).all():
+            raise BeliefError(
+                f"the uncertainty of {address}, of shape {variable.shape}, is a standard deviation, one per entry, a "
+                f"covariance matrix or a function, not {how!r}"
+            )
+        return lambda mean, rng: mean + spread * rng.standard_normal(variable.shape)
+
+    def start(self, belief: Belief, *, now: float = -inf) -> Start:
+        """Return where a rollout begins in the world as it is believed to be.
+
+        Args:
+            belief: of the DPS.
+            now: the present time of the DPS in seconds, from which the age of the belief follows.
+
+        Raises:
+            BeliefError: the belief is too old; its DPS does not fit that of the mental testbed; an estimate is
+                missing (not finite) or lies outside the bounds of its variable; or the mental scenario has no rules.
+        """
+        self._check(belief, now)
+        if belief.world is not None:
+            return self._perfect(belief.dps, belief.world)
+        return self._start(belief.dps, self._believed(belief.dps))
+
+    def starts(self, belief: Belief, *, samples: int, now: float = -inf) -> list[Start]:
+        """Return starts in ``samples`` worlds, drawn from the belief and its uncertainty; see `start`.
+
+        The n-th is drawn with the seed and n, so that the same belief gives the same starts. A value beyond the bounds
+        of its variable is clipped. Without uncertainty, all are the believed one.
+
+        Raises:
+            BeliefError: as in `start`.
+        """
+        if not self._draws or belief.world is not None:
+            return [self.start(belief, now=now)] * samples
+        self._check(belief, now)
+        believed = self._believed(belief.dps)
+        starts = []
+        for n in range(samples):
+            rng = np.random.default_rng([self._seed, n])
+            drawn = {a: self._drawn(a, draw(np.asarray(believed[a]), rng)) for a, draw in self._draws.items()}
+            starts.append(self._start(belief.dps, believed | drawn))
+        return starts
+
+    def _drawn(self, address: str, value: ArrayLike) -> np.ndarray:
+        variable = self._variables[address]
+        drawn = np.asarray(value, dtype=float)
+        if drawn.shape != variable.shape or not np.isfinite(drawn).all():
+            raise BeliefError(
+                f"{address} takes finite numbers of shape {variable.shape}, but {value!r} was drawn for it"
+            )
+        return np.clip(drawn, *variable.bounds)
+
+    def _check(self, belief: Belief, now: float) -> None:
+        if not isinstance(belief, Belief):
+            raise BeliefError(f"a rollout begins from a Belief, from Belief.of(testbed, context), say, not {belief!r}")
+        age = now - belief.dps.time
+        if age > self._max_age:
+            raise BeliefError(
+                f"the belief is of t = {belief.dps.time:g} s and {age:g} s old, but at most {self._max_age:g} s are "
+                "allowed (max_age)"
+            )
+
+    def _believed(self, dps: DpsState) -> dict[str, ArrayLike]:
+        """Let the mental DPS continue from ``dps``, and return what it believes, by address."""
+        if not self._targets:
+            raise BeliefError(
+                f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
+                "declare them with VirtualTestbedBuilder.believe, or take Belief.perfect"
+            )
+        self._continue(self._context, dps)
+        for name in self._sensors:
+            if name not in dps.received:
+                raise BeliefError(f"the DPS has not received {name} yet, so that it does not know its world")
+        numbers, estimates = dps.contents.numbers, {}
+        for address, (variable, place) in self._estimates.items():
+            if place is None:
+                estimates[address] = variable.get(self._context)
+            elif variable.shape:
+                estimates[address] = numbers[place].reshape(variable.shape)
+            else:
+                estimates[address] = numbers.item(place.start)
+        return self._prior | {target.rule.target: target.value(estimates) for target in self._targets}
+
+    def _continue(self, context: Context, dps: DpsState) -> None:
+        context.SetTime(dps.time)
+        try:
+            self._mental.dps_layout.put(context, dps.contents)
+            self._variables.write(context, self._commands(dps))
+        except (LayoutError, VariableError) as error:
+            raise BeliefError(
+                f"the DPS that believes does not fit that of the mental scenario {self._mental.scenario!r}: {error}"
+            ) from error
+
+    def _commands(self, dps: DpsState) -> dict[str, ArrayLike]:
+        # A command may come from a port of the world instead.
+        commands = {f"{COMMAND}{name}": value for name, value in dps.commands.items()}
+        return {address: value for address, value in commands.items() if address in self._variables}
+
+    def _start(self, dps: DpsState, believed: Mapping[str, ArrayLike]) -> Start:
+        """Return the start of a world that is as believed, in which the DPS has been set already."""
+        context, layout = self._context, self._mental.start_layout
+        contents = layout.take(context)
+        numbers, rest, later = np.array(contents.numbers), {}, {}
+        for address, value in believed.items():
+            kind, place = self._kinds[address]
+            if place is not None:
+                numbers[place] = np.ravel(value) if place.stop - place.start > 1 else value
+            elif kind == A:
+                later[address] = value
+            else:
+                rest[address] = value
+        layout.put(context, replace(contents, numbers=numbers))
+        try:
+            self._variables.write(context, rest)
+        except VariableError as error:
+            raise BeliefError(f"the world cannot be as it is believed to be: {error}") from error
+        for name, sensor in self._sensors.items():
+            _resume(sensor, context, dps.received[name])
+        own = self._mental.dps.GetMyContextFromRoot(context)
+        for name, actuator in self._actuators.items():
+            _resume(actuator, context, self._mental.dps.GetOutputPort(name).Eval(own))
+        return Start(dps.time, layout.take(context), {**self._commands(dps), **later})
+
+    def _perfect(self, dps: DpsState, world: World) -> Start:
+        hidden = {a: value for a, value in world.values.items() if a in self._variables and self._variables[a].hidden}
+        values = {**self._commands(dps), **hidden}
+        if world.contents.names == self._mental.whole_layout.names:
+            return Start(dps.time, world.contents, values)
+        context = self._mental.default_context()
+        self._continue(context, dps)
+        shapes = {v.address: v.shape for v in self._variables.values() if not v.derived}
+        alike = {a: value for a, value in world.values.items() if shapes.get(a) == np.shape(value)}
+        try:
+            self._variables.write(context, alike)
+        except VariableError as error:
+            raise BeliefError(f"the mental world cannot be as the true one: {error}") from error
+        return Start(dps.time, self._mental.whole_layout.take(context), values)
+
+
+class _Target:
+    """A variable of the simulated world that a rule sets."""
+
+    def __init__(self, mental: VirtualTestbed, rule: BeliefRule) -> None:
+        self.rule = rule
+        self.variable = mental.variables()[rule.target]
+        lower, upper = (np.asarray(bound, dtype=float) for bound in self.variable.bounds)
+        distance = upper - lower
+        self._tolerance = np.where(np.isfinite(distance), _BEYOND * distance, 0.0)
+        # An infinite value is within no bounds.
+        largest = np.finfo(float).max
+        self._least, self._most = np.maximum(lower, -largest), np.minimum(upper, largest)
+        self._interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
+
+    def value(self, estimates: Mapping[str, Any]) -> ArrayLike:
+        """Return what is believed of the variable, within its bounds.
+
+        Raises:
+            BeliefError: It is missing, or lies beyond the bounds.
+        """
+        of = [estimates[address] for address in self.rule.of]
+        value = self.rule.value_of(of)
+        if isinstance(value, float) and self._interval[0] <= value <= self._interval[1]:
+            return value  # Most are of joints: numpy would take ten times as long.
+        variable, told = self.variable, dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))
+        try:
+            believed = np.asarray(value, dtype=float).reshape(variable.shape)
+        except (TypeError, ValueError) as error:
+            raise BeliefError(
+                f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, of {told}"
+            ) from error
+        if not np.isfinite(believed).all():
+            raise BeliefError(f"the belief about {variable.address} is missing: {believed.tolist()}, of {told}")
+        if ((believed < self._least - self._tolerance) | (believed > self._most + self._tolerance)).any():
+            raise BeliefError(
+                f"the belief about {variable.address} is {believed.tolist()} {variable.unit}, of {told}, but it must "
+                f"lie in {variable.bounds_text()}"
+            )
+        return np.clip(believed, self._least, self._most)
+
+
+def _resume(system: System, root: Context, value: Any) -> None:
+    """Let a sensor or actuator go on where one stands that showed, or was given, ``value`` last."""
+    own = system.GetMyMutableContextFromRoot(root)
+    if isinstance(system, ZeroOrderHold | DiscreteTimeDelay):
+        own.SetDiscreteState(0, np.resize(value, own.get_discrete_state(0).size()))
+    else:
+        system.resume(own, value)
+
+
+def _resumes(system: System) -> bool:
+    """Return whether a sensor or actuator holds values that come from earlier."""
+    return hasattr(system, "resume") or isinstance(system, ZeroOrderHold | DiscreteTimeDelay)
