@@ -4,10 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, Sphere
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Box,
+    ProximityProperties,
+    Sphere,
+)
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder
@@ -215,6 +228,31 @@ def test_contact_sensor_feels_weight_above_its_threshold(time_step: float) -> No
         ApplySimulatorConfig(config, simulator)
     simulator.AdvanceTo(0.3)
     np.testing.assert_array_equal(reading(sensor, simulator), [0.0, 1.0, 0.0])
+
+
+def test_contact_sensor_feels_hydroelastic_contact() -> None:
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=0.001, contact_model="hydroelastic")
+    plant, _ = AddMultibodyPlant(config, builder)
+    soft, hard = ProximityProperties(), ProximityProperties()
+    AddCompliantHydroelasticProperties(0.05, 1e6, soft)
+    AddRigidHydroelasticProperties(0.5, hard)
+    for properties in (soft, hard):
+        AddContactMaterial(dissipation=1.0, friction=CoulombFriction(1, 1), properties=properties)
+    balls = []
+    for name, height in (("low", 0.1), ("high", 1.0)):
+        ball = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+        plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(0.1), name, soft)
+        joint = PrismaticJoint(name, plant.world_frame(), ball.body_frame(), [0, 0, 1])
+        joint.set_default_translation(height)
+        plant.AddJoint(joint)
+        balls.append(ball)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform([0, 0, -0.5]), Box(10, 10, 1), "ground", hard)
+    plant.Finalize()
+    sensor = ContactSensor(plant, balls, threshold=5.0, period=PERIOD)
+    simulator = Simulator(add(builder, plant, sensor))
+    simulator.AdvanceTo(0.2)
+    np.testing.assert_array_equal(reading(sensor, simulator), [1.0, 0.0])
 
 
 def test_period_must_be_positive() -> None:

@@ -89,6 +89,13 @@ def test_feet_and_heights_are_continuous(name: str) -> None:
     assert up.max() == pytest.approx(1.0, abs=1e-4)
 
 
+def test_arrays_of_another_size_or_type_are_refused() -> None:
+    step = dict(phase=0.0, next_phase=0.1, forward=0.0, turn=0.0, stance_steps=10.0)
+    for feet in (np.zeros((5, 2)), np.zeros((6, 2), dtype=np.float32), np.zeros((6, 4))[:, ::2], NOMINAL.tolist()):
+        with pytest.raises(ValueError, match="12 doubles in a contiguous writable array"):
+            GAITS["tripod"].advance(feet, nominal=NOMINAL, **step)
+
+
 @pytest.mark.parametrize("profile", [glide, lift])
 def test_swing_starts_and_ends_at_rest(profile: object) -> None:
     assert callable(profile)
