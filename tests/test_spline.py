@@ -54,7 +54,7 @@ def test_before_and_after_it_holds_its_ends(order: str) -> None:
 
 
 @pytest.mark.parametrize("step", [0.1, 0.7, 1e-3])
-def test_an_instant_at_the_end_of_a_step_belongs_to_the_next_however_it_is_rounded(step: float) -> None:
+def test_instant_at_step_end_belongs_to_next(step: float) -> None:
     spline = Spline("zero", 50, 50 * step)
     for begin in (0.0, 0.3, 17.1):
         times = (begin + np.arange(50) * step) - begin

@@ -39,7 +39,7 @@ def test_scenarios_are_found_from_the_current_directory(tmp_path: Path) -> None:
     assert DAMPING in result.stdout, result.stderr
 
 
-def test_a_module_of_the_current_directory_does_not_take_the_place_of_another(tmp_path: Path) -> None:
+def test_current_directory_is_searched_last(tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text("print('has run')\nfrom tests.testbeds import PendulumScenario as Mine\n")
     for command in (["-m", "vtbdrake.cli"], ["-P", "-c", "from vtbdrake.cli import main; main()"]):
         result = subprocess.run(

@@ -1,6 +1,7 @@
 """``vtbdrake sweep`` and ``boundary`` show what the library computes."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +12,16 @@ from vtbdrake.cli.problem import magnitude
 from vtbdrake.optimization import Sweep
 
 
-def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> None:
-    problem = Problem(
-        scenario=PendulumScenario(),
-        parameters=[Parameter(ANGLE, 0.0, 3.0)],
-        quality=Quality(magnitude, of=RATE),
-        horizon=2.0,
-        threshold=4.0,
+def stated(**more: Any) -> Problem:
+    """Return the problem that the command lines below state."""
+    parameters, quality = [Parameter(ANGLE, 0.0, 3.0)], Quality(magnitude, of=RATE)
+    return Problem(
+        scenario=PendulumScenario(), parameters=parameters, quality=quality, horizon=2.0, threshold=4.0, **more
     )
-    expected = problem.sweep(4, progress=False)
+
+
+def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> None:
+    expected = stated().sweep(4, progress=False)
 
     vary = ("--vary", f"{ANGLE}=0:3:4", "--quality", RATE, "--threshold", 4, "--horizon", 2)
     files = [tmp_path / name for name in ("s.csv", "s.sweep", "s.png")]
@@ -60,14 +62,7 @@ def test_sweep_over_two_parameters_has_a_row_per_pair_and_condition() -> None:
 
 
 def test_boundary_for_all_and_for_each_condition() -> None:
-    problem = Problem(
-        scenario=PendulumScenario(),
-        parameters=[Parameter(ANGLE, 0.0, 3.0)],
-        quality=Quality(magnitude, of=RATE),
-        horizon=2.0,
-        threshold=4.0,
-        conditions=[{DAMPING: 0.1}, {DAMPING: 0.5}],
-    )
+    problem = stated(conditions=[{DAMPING: 0.1}, {DAMPING: 0.5}])
     expected = problem.boundary(resolution=0.1, coarse=0.5, repeats=2, progress=False)
     assert expected.lower < expected.by_condition[1, 0]
 

@@ -82,7 +82,7 @@ def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
     return ear.torques[: 2 * CYCLES]
 
 
-def test_it_commands_what_the_whole_testbed_would_and_carries_nothing_of_a_world(tmp_path: Path) -> None:
+def test_dps_alone_commands_like_the_testbed(tmp_path: Path) -> None:
     snapshot = snapshot_in_motion(tmp_path / "s")
     with Hub(port=0) as hub:
         expected = commands_of_the_whole_testbed(hub, snapshot)
@@ -153,7 +153,7 @@ def intruder(url: str) -> Iterator[None]:
         thread.join()
 
 
-def test_a_second_publisher_is_waited_for_before_the_switch_and_an_alarm_after_it(hub: Hub) -> None:
+def test_second_publisher_delays_switch_and_alarms(hub: Hub) -> None:
     options = ("--url", hub.url, "--no-live", *FAR)
     with MachineProcess(ServoMachineScenario(), hub.url), ExitStack() as stack:
         with intruder(hub.url):
@@ -177,7 +177,7 @@ def may_have_priority() -> bool:
 
 
 @pytest.mark.skipif(not may_have_priority(), reason="needs the right to SCHED_FIFO")
-def test_a_step_that_does_not_end_is_ended_and_the_fallback_goes_out(hub: Hub) -> None:
+def test_endless_step_sends_the_fallback(hub: Hub) -> None:
     with MachineProcess(ServoMachineScenario(rate=0.0), hub.url):
         ear = Ear(hub.url)
         endless = "tests.cli.endless:EndlessScenario"
@@ -190,7 +190,7 @@ def test_a_step_that_does_not_end_is_ended_and_the_fallback_goes_out(hub: Hub) -
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
 
 
-def test_it_ends_when_the_time_is_up_and_writes_what_it_measured_and_recorded(hub: Hub, tmp_path: Path) -> None:
+def test_run_ends_in_time_and_writes_files(hub: Hub, tmp_path: Path) -> None:
     files = ("--statistics", tmp_path / "s.json", "--record", tmp_path / "log.lcm")
     with MachineProcess(ServoMachineScenario(), hub.url):
         ear = Ear(hub.url)
@@ -245,7 +245,7 @@ def test_a_dps_that_stopped_is_let_on_when_the_machine_is_back(hub: Hub) -> None
     assert released.stdout.startswith("over: sensor signal position is stale")
 
 
-def test_a_machine_that_does_not_speak_is_waited_for_and_then_given_up(hub: Hub) -> None:
+def test_silent_machine_is_given_up(hub: Hub) -> None:
     with start(SERVO, "--url", hub.url, "--wait", 1.0, "--no-live", "--pace", "") as program:
         _, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 1

@@ -41,17 +41,7 @@ PATIENCE = 60.0  # s for whatever has to happen
 
 
 class TroubledSwing(Swing):
-    """A `Swing` that raises, or commands NaN, when it is told to.
-
-    .. pydrake_system::
-
-        name: TroubledSwing
-        input_ports:
-        - position
-        - velocity
-        output_ports:
-        - torque
-    """
+    """A `Swing` that raises, or commands NaN, when it is told to; its ports are those of `Swing`."""
 
     def __init__(self, period: float) -> None:
         super().__init__(period)

@@ -130,7 +130,7 @@ def test_a_simulation_that_fails_is_not_safe():
     assert (boundary.lower, boundary.upper, boundary.failed_at) == (0.0, 5.0, (5.0,))
 
 
-def test_a_range_that_is_no_multiple_of_the_resolution_ends_at_its_end():
+def test_uneven_range_ends_at_its_end():
     outcomes, _ = _examine(_refinement(0.3, 0.6, Parameter("m", 0.0, 1.0)), lambda m, _: m > 0.95)
     boundary = _sweep(outcomes).boundary()
     assert (boundary.lower, boundary.upper) == (pytest.approx(0.9), 1.0)
@@ -204,7 +204,7 @@ def test_the_interval_of_a_chance_is_that_of_clopper_and_pearson(unsafe, rollout
     st.lists(st.lists(st.sampled_from([0.0, 0.3, 1.0]), min_size=2, max_size=2), min_size=3, max_size=12),
     st.integers(0, 12),
 )
-def test_values_are_repeated_down_to_a_safe_one_and_up_to_an_unsafe_one(shares, first):
+def test_repeats_end_at_safe_and_unsafe_values(shares, first):
     last = len(shares) - 1
     first = min(first, last + 1)
     repeated = []

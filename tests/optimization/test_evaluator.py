@@ -147,7 +147,7 @@ SLOW = {"auto", "bayesian", "GP"}
         if solver not in SLOW or kind == "maximized"
     ],
 )
-def test_the_best_point_of_a_raced_study_is_that_of_all_its_points(solver, kind):
+def test_racing_keeps_the_best_point(solver, kind):
     rng = np.random.default_rng([len(solver), len(kind)])
     risk = [Mean(), Worst(), Quantile(0.5), CVaR(0.5)][rng.integers(4)]
     centers = rng.uniform(0.2, 0.8, 4)
@@ -270,7 +270,7 @@ def test_equal_points_are_evaluated_once():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_budgets_racing_points_by_hand_and_interruptions_in_any_order_leave_a_study_whole(tmp_path, seed):
+def test_random_operations_leave_a_study_whole(tmp_path, seed):
     chance, rollouts, by_hand = random.Random(seed), 0, []
     kind = chance.choice(list(QUALITIES))
     solver = chance.choice(["sobol", "CMA-ES", "TPE", "LN_COBYLA", "differential-evolution", "latin-hypercube"])

@@ -211,7 +211,7 @@ def test_a_study_with_options_is_resumed_with_the_same_options(tmp_path, solver,
             assert len(study.run(rollouts=6, executor="serial", progress=False)) == 6
 
 
-def test_an_option_that_cannot_be_kept_is_refused_before_there_is_a_file(tmp_path):
+def test_unstorable_option_leaves_no_file(tmp_path):
     with pytest.raises(ValueError, match="a study keeps the options of its solver, which are numbers, words"):
         pendulum_problem().study(tmp_path / "a.db", solver="TPE", options={"sampler_options": {"gamma": len}})
     assert not (tmp_path / "a.db").exists()

@@ -168,7 +168,7 @@ def test_writing_again_adds_only_what_is_new(url):
     assert [t.number for t in exported.trials] == list(range(20))
 
 
-def test_a_point_that_a_batch_holds_twice_is_there_twice_and_stays_so(url):
+def test_repeated_point_in_batch_stays_twice(url):
     study = recorded([X, Y], [point((0.5, 0.5), 1.0)], qualities={"h": "maximize"})
     study.to_optuna(url, "twice")
     trial = Trial(dict(study.trials[0].parameters), (1.0,), (), True, "user", "by hand", batch=0)

@@ -57,7 +57,7 @@ def test_the_best_start_of_a_pendulum_is_that_of_the_closed_form(solver):
     assert study.best.parameters[THETA] == pytest.approx(exact, abs=tolerance)
 
 
-def test_the_best_gains_of_a_double_integrator_are_those_of_the_linear_quadratic_regulator():
+def test_best_gains_are_those_of_lqr():
     # For x'' = u and the cost of x^2 + u^2 over an infinite time, u = -x - sqrt(2) x', from every start.
     problem = Problem(
         scenario=DoubleIntegratorScenario(),
@@ -156,7 +156,7 @@ def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
 
 
 @pytest.mark.parametrize("solver", ["cmaes", "TPE", "LN_COBYLA", "SNOPT", "differential-evolution", "sobol", "random"])
-def test_a_study_with_a_larger_budget_goes_on_as_if_it_had_had_it_from_the_start(tmp_path, solver):
+def test_larger_budget_continues_the_same_study(tmp_path, solver):
     whole = pendulum_problem().study(solver=solver, seed=2).run(rollouts=45, executor="serial", progress=False)
     study = pendulum_problem().study(tmp_path / "parts.db", solver=solver, seed=2)
     for rollouts in (1, 17, 20, 45):
@@ -196,7 +196,7 @@ def test_points_given_between_two_budgets_are_told_where_the_study_goes_on(tmp_p
     assert [t.number for t in study.trials if t.origin == "user"] == [24]
 
 
-def test_a_study_of_a_solver_that_cannot_be_told_again_ends_with_a_spent_budget_too():
+def test_irreproducible_solver_ends_with_spent_budget():
     conditions = [{DAMPING: damping} for damping in np.linspace(0.0, 1.0, 24)]
     study = pendulum_problem(conditions=conditions).study(solver="GN_CRS2_LM")
     for rollouts in (100, 110, 120):
@@ -363,7 +363,7 @@ def test_a_budget_that_makes_no_sense_is_refused(budget, message):
         pendulum_problem().study().run(**budget)
 
 
-def test_points_given_by_hand_have_their_turn_before_a_design_that_takes_the_whole_budget():
+def test_points_by_hand_precede_a_design():
     study = pendulum_problem().study(solver="sobol")
     study.add([0.25, 0.0], [0.5, 1.0])
     study.run(rollouts=10, executor="serial", progress=False)

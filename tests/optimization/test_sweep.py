@@ -197,7 +197,7 @@ def test_values_stay_in_their_order():
     assert [rollout.parameters[OMEGA] for rollout in sweep.rollouts] == sweep.points[:, 0].tolist()
 
 
-def test_costs_too_small_for_one_over_one_plus_c_have_a_best_point():
+def test_tiny_costs_have_a_best_point():
     quality = vtb.Quality(lambda omega: 1e-20 * (omega - 2.0) ** 2, OMEGA, minimize=True, reading="worst")
     sweep = _problem(quality=quality, horizon=0.05).sweep(values=[5.0, 2.0, 4.0], executor="serial", progress=False)
     assert len(set(sweep.h.tolist())) == 1

@@ -64,7 +64,7 @@ def test_a_double_integrator_switches_at_half_the_time_of_bang_bang(method, mass
     assert decision.quality < 0.1
 
 
-def test_a_pendulum_is_swung_up_by_the_switching_time_that_an_ode_solver_finds():
+def test_swing_up_time_agrees_with_ode_solver():
     torque, horizon = 2.5, 1.6
 
     def height(switch):

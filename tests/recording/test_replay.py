@@ -77,18 +77,7 @@ def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
 
 
 class Prepared(ServoSystem):
-    """A DPS that is initialized to count from 100 on.
-
-    .. pydrake_system::
-
-        name: Prepared
-        input_ports:
-        - position
-        - speed
-        - target
-        output_ports:
-        - velocity
-    """
+    """A DPS that is initialized to count from 100 on; its ports are those of `ServoSystem`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -222,18 +211,7 @@ def test_unknown_address_is_rejected(tmp_path: Path) -> None:
 
 
 class Worse(ServoSystem):
-    """A DPS that changes the last bit of its actuator command in one cycle.
-
-    .. pydrake_system::
-
-        name: Worse
-        input_ports:
-        - position
-        - speed
-        - target
-        output_ports:
-        - velocity
-    """
+    """A DPS that changes the last bit of its actuator command in one cycle; its ports are those of `ServoSystem`."""
 
     def _update(self, context: Context, discrete: object) -> None:
         super()._update(context, discrete)

@@ -107,7 +107,7 @@ def test_a_rollout_that_kills_every_worker_fails_alone(tmp_path):
     assert results[1].message.count("died (exit code -9)") == 2
 
 
-def test_a_script_without_a_main_guard_and_with_its_own_functions_uses_processes(tmp_path):
+def test_unguarded_script_uses_processes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         textwrap.dedent("""

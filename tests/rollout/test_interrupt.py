@@ -75,7 +75,7 @@ def test_ctrl_c_in_a_simulation_ends_the_sweep_at_once(make, how, caplog):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ctrl_c_in_a_second_simulation_for_the_state_is_not_a_failure():
+def test_ctrl_c_in_second_simulation_is_no_failure():
     task = RolloutTask(InterruptedScenario(), 1.0, Quality(abs, SHOULDER))
     with pytest.raises(KeyboardInterrupt):
         RolloutRunner(task).state({}, 0.5)

@@ -60,7 +60,7 @@ def test_t_star_and_h(trajectory, threshold, t_star, h, end):
     np.testing.assert_array_equal(result.quality, trajectory[: round(stop / PERIOD) + 1])
 
 
-def test_a_rollout_that_runs_on_knows_all_of_g1_and_the_same_t_star():
+def test_run_on_keeps_t_star():
     result, runner = _roll([0.0, 2.0, 0.5, 3.0, 0.0], threshold=1.0, run_on=True)
     assert result.exceedances == pytest.approx([0.1, 0.3])
     assert (result.end, result.t_star, result.h) == ("threshold", pytest.approx(0.1), 2.0)
@@ -112,7 +112,7 @@ def test_costs_of_any_size_are_compared_themselves(scale):
         (lambda t, pitch: 1.0, "raises TypeError"),
     ],
 )
-def test_what_is_not_a_quality_is_an_error_that_says_when_and_where(f, message):
+def test_invalid_quality_error_names_time_and_place(f, message):
     task = RolloutTask(AcrobotScenario(), 0.2, Quality(f, "time"))
     with pytest.raises(QualityError, match=f"at t = 0 s, time = 0.0, {message}"):
         RolloutRunner(task).run({})

@@ -68,7 +68,7 @@ def test_history_shows_every_point_by_what_is_known_of_it():
     np.testing.assert_array_equal(drawn(axes, "failed")[:, 0], [6])
 
 
-def test_the_best_so_far_rises_for_a_quality_and_falls_for_a_cost():
+def test_best_so_far_is_monotonic():
     rising, falling = plot_history(one_of_each()), plot_history(one_of_each(qualities={"energy": "minimize"}))
     np.testing.assert_array_equal(drawn(rising.axes[0], "best so far"), [[0, 1], [1, 3], [2, 3], [6, 3]])
     np.testing.assert_array_equal(drawn(falling.axes[0], "best so far"), [[0, 1], [1, 1], [2, 1], [6, 1]])
@@ -85,7 +85,7 @@ def test_history_counts_methods_and_what_went_wrong():
     ]
 
 
-def test_axis_of_a_quality_says_whether_it_is_a_cost_and_over_what_it_is_taken():
+def test_axis_label_names_cost_and_risk():
     study = one_of_each(qualities={"energy": "minimize"}, conditions=5, risk="CVaR(level=0.2)")
     assert plot_history(study).axes[0].get_ylabel() == "energy (cost, CVaR(level=0.2) of 5 conditions)"
     assert plot_history(one_of_each(conditions=3)).axes[0].get_ylabel() == "speed (worst of 3 conditions)"
@@ -217,7 +217,7 @@ def test_of_equal_places_one_that_keeps_the_constraints_counts():
     np.testing.assert_array_equal(drawn(axes, "broken"), [[1.0, 9.0]])
 
 
-def test_over_one_parameter_it_is_a_line_in_the_order_of_the_values():
+def test_landscape_of_one_parameter_is_a_line():
     points = [point((x,), v) for x, v in [(3.0, 2.0), (1.0, 1.0), (2.0, 3.0)]]
     axes = plot_landscape(recorded([PERIOD], points, qualities=SPEED, units=["s"])).axes[0]
     np.testing.assert_array_equal(drawn(axes, "h"), [[1, 1], [2, 3], [3, 2]])

@@ -139,7 +139,7 @@ def test_drift_is_the_sum_of_independent_steps() -> None:
     np.testing.assert_allclose(y, np.cumsum(steps, axis=0), atol=1e-13)
 
 
-def test_errors_that_are_set_while_time_runs_hold_from_the_next_sample_on() -> None:
+def test_errors_hold_from_the_next_sample() -> None:
     sensor = Constant(ErrorModel())
     simulator = Simulator(sensor)
     before = advance(sensor, simulator, range(3))

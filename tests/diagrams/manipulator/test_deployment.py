@@ -132,7 +132,7 @@ class FakeArm:
             pass
 
 
-def test_first_command_after_a_restart_of_the_hub_departs_from_the_torque_that_the_arm_reports() -> None:
+def test_first_command_after_hub_restart_continues_reported_torque() -> None:
     scenario = ManipulatorScenario(law="joint_impedance")
     carried, braked = np.array([0.0, -45.2, 0.0, 22.4, 0.0, -2.1, 0.0]), np.zeros(7)
     with Hub(port=0) as first:

@@ -64,7 +64,7 @@ def test_swing_goes_to_its_pose_and_back() -> None:
     np.testing.assert_array_equal(r["dp"], 0.0)
 
 
-def test_swing_halfway_is_at_half_the_distance_with_the_peak_speed_of_minimum_jerk() -> None:
+def test_swing_is_a_minimum_jerk_motion() -> None:
     r = play([SWING] * steps(1.3))
     quarter = steps(1.25)
     np.testing.assert_allclose(r["q_r"][quarter], HOME_POSE + VALUES["swing"] / 2, atol=1e-9)

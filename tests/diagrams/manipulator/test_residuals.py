@@ -81,7 +81,7 @@ def nominal_and_heavy(request: pytest.FixtureRequest) -> Iterator[dict[str, Mapp
 
 
 @pytest.mark.parametrize("mode", ["twin", "shadow"])
-def test_payload_that_is_5_percent_heavier_is_found_in_a_tenth_of_a_second(
+def test_heavier_payload_is_found_quickly(
     nominal_and_heavy: dict[str, Mapping[str, ResidualMonitor]], mode: str
 ) -> None:
     monitor = nominal_and_heavy["heavy"][mode]

@@ -77,7 +77,7 @@ def test_velocity_that_the_positions_do_not_bear_out_counts_to_the_disagreement(
     np.testing.assert_allclose(told, torque(honest, HOME, np.full(7, DISAGREEMENT)), atol=1e-9)
 
 
-def test_weight_of_the_last_known_pose_is_carried_for_a_while_and_then_the_brakes_have_to() -> None:
+def test_weight_is_carried_then_left_to_brakes() -> None:
     floating = FloatInPlace()
     np.testing.assert_allclose(torque(floating, HOME, fresh=False, age=0.9 * CARRY), gravity(HOME), atol=1e-9)
     assert torque(floating, HOME, fresh=False, age=1.1 * CARRY) is NO_COMMAND
@@ -161,7 +161,7 @@ class GuardedArm:
         return self.guards.reset(self.cycles * T, self.received)
 
 
-def test_arm_whose_sensors_fall_silent_is_carried_and_then_left_to_its_brakes() -> None:
+def test_silent_sensors_leave_arm_to_brakes() -> None:
     arm = GuardedArm()
     before = arm.pose
     arm.heard = lambda measured: {}

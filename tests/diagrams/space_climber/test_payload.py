@@ -28,7 +28,7 @@ def test_f_is_that_of_the_paper() -> None:
     [LEGS, ("front_left", "middle_right", "rear_left"), ("front_right", "middle_left", "rear_left", "rear_right")],
 )
 @pytest.mark.parametrize("ahead", [-0.1, 0.0, 0.1])
-def test_at_the_static_limit_the_centre_of_mass_lies_on_the_edge_of_support(legs, ahead) -> None:
+def test_static_limit_lies_on_support_edge(legs, ahead) -> None:
     testbed = SpaceClimberScenario().build()
     context = testbed.default_context()
     limit = static_limit(testbed, legs=legs, ahead=ahead)

@@ -103,7 +103,7 @@ def test_auto_needs_no_extra(space, objectives, monkeypatch):
     assert len(drive(solver, lambda p: (p[-1], -p[-1])[:objectives])) == 6
 
 
-def test_every_algorithm_that_drake_lists_is_offered_or_known_to_be_of_no_use():
+def test_every_algorithm_of_drake_is_known():
     options = SolverOptions()
     options.SetOption(NloptSolver.id(), NloptSolver.AlgorithmName(), "?")
     program = MathematicalProgram()

@@ -126,7 +126,7 @@ def test_a_model_remembers_only_so_many_points():
     np.testing.assert_allclose(best.point, SPHERE.best, atol=1e-2)
 
 
-def test_a_model_of_a_space_of_which_every_point_is_known_ends_with_success():
+def test_exhausted_space_ends_with_success():
     space = (Parameter("i", 1, 3, integer=True), Choice("c", ["a", "b"]))
     solver = make_solver("bayesian", space)
     log = drive(solver, lambda p: p[0])

@@ -103,7 +103,7 @@ def test_a_batch_that_failed_moves_nothing(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_they_come_near_the_minimum_of_a_valley_and_never_lose_by_a_larger_budget(name):
+def test_solvers_descend_a_valley(name):
     costs = [-solve(name, SPHERE, budget=budget, seed=1)[1].values[0] for budget in (20, 60, 180, 400)]
     assert costs == sorted(costs, reverse=True)
     assert costs[-1] < 0.01

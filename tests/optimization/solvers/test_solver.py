@@ -72,7 +72,7 @@ EDGES = {
 
 @pytest.mark.parametrize("edge", EDGES)
 @pytest.mark.parametrize("name", INSTALLED)
-def test_at_the_edge_of_what_is_allowed_it_works_or_refuses_before_the_first_point(name, edge):
+def test_edge_cases_work_or_are_refused(name, edge):
     space, objectives, constraints = EDGES[edge]
     for budget in (1, 9):
         try:
@@ -284,7 +284,7 @@ def test_a_method_that_never_returns_is_left_behind_with_a_warning(stuck, caplog
     assert "stuck does not return: its thread is left behind" in caplog.text
 
 
-def test_who_waits_for_a_method_that_never_returns_is_released_when_it_is_closed(stuck):
+def test_close_releases_a_waiting_caller(stuck):
     asked = []
     waiting = threading.Thread(target=lambda: asked.append(stuck.ask()))
     waiting.start()
