@@ -7,11 +7,7 @@ from typing import Any
 
 
 def as_number(name: str, value: Any) -> float:
-    """Return ``value`` as a float; raise a ValueError if it is no number (a string is none, nor is True).
-
-    Raises:
-        ValueError: It is no number; a text is none, nor is True.
-    """
+    """Return ``value`` as a float; raise a ValueError if it is no number (a text is none, nor is True)."""
     if not isinstance(value, str | bytes | bool):
         try:
             return float(value)
@@ -21,11 +17,7 @@ def as_number(name: str, value: Any) -> float:
 
 
 def as_whole(name: str, value: Any) -> int:
-    """Return ``value`` as an int; raise a ValueError if it is no whole number (1e4 is one, 1.5 is none).
-
-    Raises:
-        ValueError: It is no whole number; 1e4 is one, 1.5 is none.
-    """
+    """Return ``value`` as an int; raise a ValueError if it is no whole number (1e4 is one, 1.5 is none)."""
     if not as_number(name, value).is_integer():
         raise ValueError(f"{name} is a whole number, not {value!r}")
     return int(value)

@@ -127,11 +127,7 @@ class Signal:
         return Value(self.model_value)
 
     def check_value(self, value: Any) -> None:
-        """Raise a SignalError if ``value`` has another size or type than the signal, or a NaN.
-
-        Raises:
-            SignalError: ``value`` cannot be one of the signal's: it has another size or type, or an entry is NaN.
-        """
+        """Raise a SignalError if ``value`` has another size or type than the signal, or a NaN."""
         if self.is_vector:
             try:
                 array = np.asarray(value, dtype=float)
@@ -151,11 +147,7 @@ class Signal:
             raise SignalError(f"signal {self.name} carries images of {_pixels(model)}, not one of {_pixels(value)}")
 
     def check_port(self, port: InputPort | OutputPort, owner: str) -> None:
-        """Raise a SignalError if ``port`` of the system ``owner`` cannot carry this signal.
-
-        Raises:
-            SignalError: ``port`` cannot carry this signal.
-        """
+        """Raise a SignalError if ``port`` of the system ``owner`` cannot carry this signal."""
         is_vector = port.get_data_type() == PortDataType.kVectorValued
         if is_vector != self.is_vector:
             kinds = {True: "vector", False: "abstract"}
