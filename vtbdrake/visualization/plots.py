@@ -101,18 +101,8 @@ def draw_trajectory(
 
 def draw_t_star(axes: Axes, t_star: float, height: float, *, color: ColorType, style: int = 0) -> None:
     """Mark t*."""
-    axes.plot(
-        t_star,
-        height,
-        MARKERS[style % len(MARKERS)],
-        color=color,
-        mec="black",
-        mew=0.6,
-        ms=6,
-        zorder=3,
-        clip_on=False,
-        gid="t_star",
-    )
+    mark: dict[str, Any] = {"marker": MARKERS[style % len(MARKERS)], "mec": "black", "mew": 0.6, "ms": 6}
+    axes.plot(t_star, height, color=color, zorder=3, clip_on=False, gid="t_star", **mark)
 
 
 def draw_bars(
@@ -418,16 +408,9 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
         handles += axes.plot([], [], "o", color="0.6", mfc="white", label="a constraint violated")
     if sweep.failed.any():
         failed = values[sweep.failed]
-        handles += axes.plot(
-            failed,
-            np.full(failed.size, 0.03),
-            "x",
-            color=FAILED,
-            mew=2,
-            transform=axes.get_xaxis_transform(),
-            label="simulation failed",
-            gid="failed",
-        )
+        place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "gid": "failed"}
+        bottom = np.full(failed.size, 0.03)
+        handles += axes.plot(failed, bottom, "x", color=FAILED, mew=2, label="simulation failed", **place)
     handles += [key for key in keys(threshold=threshold) if key.get_label() != "t*"]
     title = "" if boundary is None else _draw_boundary(axes, sweep, boundary, handles)
     parameter = sweep.parameters[0]

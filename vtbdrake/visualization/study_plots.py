@@ -190,27 +190,10 @@ def draw_points(
         axes.plot(x(points.failed), bottom, gid="failed", transform=axes.get_xaxis_transform(), **_FAILED_STYLE)
 
 
-BROKEN_STYLE: dict[str, Any] = {
-    "ls": "none",
-    "marker": "o",
-    "mfc": "none",
-    "mec": _BROKEN,
-    "ms": 4.5,
-    "mew": 0.8,
-    "zorder": 2,
-}
-_DROPPED_STYLE: dict[str, Any] = {"ls": "none", "marker": "v", "color": _DROPPED, "ms": 4, "mew": 0, "zorder": 1.5}
-_FAILED_STYLE: dict[str, Any] = {
-    "ls": "none",
-    "marker": "x",
-    "color": FAILED,
-    "ms": 6,
-    "mew": 1.5,
-    "zorder": 3,
-    "clip_on": False,
-}
-
-
+_MARK: dict[str, Any] = {"ls": "none", "marker": "o", "zorder": 3}
+BROKEN_STYLE: dict[str, Any] = {**_MARK, "mfc": "none", "mec": _BROKEN, "ms": 4.5, "mew": 0.8, "zorder": 2}
+_DROPPED_STYLE: dict[str, Any] = {**_MARK, "marker": "v", "color": _DROPPED, "ms": 4, "mew": 0, "zorder": 1.5}
+_FAILED_STYLE: dict[str, Any] = {**_MARK, "marker": "x", "color": FAILED, "ms": 6, "mew": 1.5, "clip_on": False}
 # It must stand out from every colour of a map, and from white.
 _BROKEN_ON_A_MAP: dict[str, Any] = {**BROKEN_STYLE, "mec": "#f4a582", "ms": 7, "mew": 1.4}
 
@@ -314,15 +297,8 @@ def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, qualit
     if not isinstance(scale.dimension, Choice) and (not others or 2 * len(best.known) <= len(points.known)):
         order = np.argsort(scale.places(best.known))
         text = f"the best over {_count(others)}" if others else None
-        (line,) = axes.plot(
-            scale.places(best.known)[order],
-            values(best.known, quality)[order],
-            color=_SINGLE,
-            lw=1.2,
-            zorder=2,
-            label=text,
-            gid="h",
-        )
+        at, h = scale.places(best.known)[order], values(best.known, quality)[order]
+        (line,) = axes.plot(at, h, color=_SINGLE, lw=1.2, zorder=2, label=text, gid="h")
         handles = [line] if others else []
     return [*handles, *point_keys(study, points)]
 
@@ -435,15 +411,8 @@ def plot_history(study: Study) -> Figure:
             numbers = np.array([trial.number for trial in points.kept])
             best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.kept, quality))
             # The last best value holds up to the last point.
-            axes.plot(
-                [*numbers, trials[-1].number],
-                [*best, best[-1]],
-                color=BEST,
-                drawstyle="steps-post",
-                lw=1.4,
-                gid="best so far",
-                zorder=2.5,
-            )
+            numbers, best = np.append(numbers, trials[-1].number), np.append(best, best[-1])
+            axes.plot(numbers, best, color=BEST, drawstyle="steps-post", lw=1.4, gid="best so far", zorder=2.5)
         axes.set_ylabel(quality_label(study, quality))
         axes.xaxis.set_major_locator(MaxNLocator(nbins="auto", integer=True))
         finish(axes)
@@ -540,18 +509,9 @@ def plot_pareto(study: Study) -> Figure:
         front_xy = np.array([[trial.values[i], trial.values[j]] for trial in front]).reshape(-1, 2)
         front_xy = front_xy[np.argsort(front_xy[:, 0], kind="stable")]
         # Of three qualities the front is a surface, whose edge is not what a line would show.
+        line = {"ls": "-" if count == 2 else "none", "drawstyle": "steps-pre" if study.signs[i] > 0.0 else "steps-post"}
         axes.plot(
-            *front_xy.T,
-            color=BEST,
-            marker="o",
-            ms=6,
-            mec="white",
-            mew=0.6,
-            ls="-" if count == 2 else "none",
-            lw=1.0,
-            drawstyle="steps-pre" if study.signs[i] > 0.0 else "steps-post",
-            zorder=4,
-            gid="front",
+            *front_xy.T, color=BEST, marker="o", ms=6, mec="white", mew=0.6, lw=1.0, zorder=4, gid="front", **line
         )
         axes.set(xlabel=quality_label(study, i), ylabel=quality_label(study, j))
         finish(axes)
