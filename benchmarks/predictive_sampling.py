@@ -1,7 +1,7 @@
-"""Planning by predictive sampling on a cart-pole: a compiled mental world beside MuJoCo's `rollout`.
+"""Planning by predictive sampling on a cart-pole: a compiled plant and the whole testbed, beside MuJoCo's `rollout`.
 
-Both plan with the same model, the same step (semi-implicit Euler with implicit damping), the same knots, candidates and
-horizon, each in the time that its own way of computing the costs takes.
+All plan with the same model, the same step (semi-implicit Euler with implicit damping), the same knots, number of
+candidates, horizon and cost.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import casadi
 import mujoco
@@ -18,44 +18,44 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from benchmarks.measure import HIGHER, Benchmark, interleaved, ratio
+from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio
 from vtbdrake.components.compiled_plant import PlantRollouts, plant_step
+from vtbdrake.spline import Spline
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, CartPole
+from vtbdrake_diagrams.cart_pole.swing_up import cost, make_reasoner
 
-CANDIDATES, STEPS, STEP, KNOTS = 32, 50, 0.02, 6
-LIMIT, SPREAD = 60.0, 20.0  # N: of the force, and of the candidates about the plan in use
-WEIGHTS = {"pole": 10.0, "cart": 0.1, "velocity": 0.1, "force": 1e-4}
+SCENARIO = CartPoleScenario()
+CANDIDATES, STEP = 32, SCENARIO.period
+STEPS = round(SCENARIO.duration / STEP)
+PLAN: Spline = SCENARIO.plan()
+LIMIT, SPREAD = SCENARIO.force_limit, 20.0  # N: of the force, and of the candidates about the plan in use
+B = PLAN.matrix(STEP * np.arange(STEPS))
 HANGING = np.array([0.0, 0.05, 0.0, 0.0])
 TOLERANCE = 1e-9
 
-
-class Planner(Protocol):
-    """Computes the costs of candidates z, shape (n, K), from the state x0 = [q; v]; the result has the shape (n,)."""
-
-    def __call__(self, x0: np.ndarray, z: np.ndarray) -> np.ndarray: ...
+# The costs of candidates z, shape (n, K), from the state x0 = [q; v]; the result has the shape (n,).
+Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def predictive_sampling(repeats: int = 300, seeds: int = 8) -> list[Benchmark]:
-    """Plans per second, by a compiled plant and by MuJoCo, and how good the swing-ups are at equal wall time."""
+def predictive_sampling(repeats: int = 200, seeds: int = 8) -> list[Benchmark]:
+    """Plans per second by a compiled plant and by MuJoCo, and how good the swing-ups are at equal wall time."""
     step = cart_pole_step()
     ours = compiled_planner(step)
-    theirs = {f"{n} thread{'s' * (n > 1)}": mujoco_planner(n) for n in (1, 2)}
+    theirs = mujoco_planners()
     apart = max(_difference(ours, planner) for planner in theirs.values())
     if not apart <= TOLERANCE:
         raise ArithmeticError(f"the costs of the two engines are {apart:.2g} apart")
-    measured = {name: _race(ours, planner, repeats) for name, planner in theirs.items()}
-    fastest = min(measured, key=lambda name: float(np.median(measured[name][1])))
-    own, other = measured[fastest]
-    micros = ", ".join(f"{name} {1e6 * np.median(t):.0f}" for name, (_, t) in measured.items())
+    times = {name: interleaved(_planning(ours), _planning(p), repeats=repeats, warm_up=5) for name, p in theirs.items()}
+    fastest, (own, other) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
     budget = float(np.median(other))
-    costs = {
+    swings = {
         name: [swing_up(step, planner, budget, seed=seed) for seed in range(seeds)]
         for name, planner in (("compiled", ours), ("MuJoCo", theirs[fastest]))
     }
-    results = ", ".join(
-        f"{name} {np.median([cost for cost, _ in runs]):.0f} in {np.median([plans for _, plans in runs]):.0f} plans"
-        for name, runs in costs.items()
-    )
+    costs = {name: float(np.median([spent for spent, _ in runs])) for name, runs in swings.items()}
+    plans = {name: float(np.median([count for _, count in runs])) for name, runs in swings.items()}
+    micros = ", ".join(f"{1e6 * np.median(t):.0f} ({name})" for name, (_, t) in times.items())
     return [
         Benchmark(
             name="predictive_sampling",
@@ -64,19 +64,44 @@ def predictive_sampling(repeats: int = 300, seeds: int = 8) -> list[Benchmark]:
             goal=5.0,
             better=HIGHER,
             against=f"plans per second of mujoco.rollout {mujoco.__version__}, {fastest}",
-            note=f"us per plan of {CANDIDATES} rollouts of {STEPS * STEP:g} s: compiled {1e6 * np.median(own):.0f}; "
-            f"MuJoCo with {micros}; costs {apart:.1g} apart, n = {repeats}",
+            note=f"us per plan of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e6 * np.median(own):.0f}, MuJoCo "
+            f"{micros}; costs {apart:.1g} apart; n = {repeats}",
         ),
         Benchmark(
             name="predictive_sampling_quality",
-            value=float(np.median([cost for cost, _ in costs["compiled"]])),
+            value=costs["compiled"] / costs["MuJoCo"],
             unit="1",
             goal=None,
-            better="lower",
-            against=f"MuJoCo at the same wall time, {1e3 * budget:.2g} ms for each {1e3 * STEP:g} ms",
-            note=f"cost of a swing-up of 5 s, median of {seeds} seeds: {results} for each sample",
+            better=LOWER,
+            against=f"MuJoCo's swing-up at the same wall time, {1e3 * budget:.2g} ms for each {1e3 * STEP:g} ms",
+            note=f"cost of 5 s, median of {seeds} seeds: {costs['compiled']:.3g} with {plans['compiled']:.0f} plans "
+            f"for each sample, MuJoCo {costs['MuJoCo']:.3g} with {plans['MuJoCo']:.0f}",
         ),
     ]
+
+
+def predictive_sampling_testbed(repeats: int = 40) -> Benchmark:
+    """Plans per second of the reasoner, whose mental copy is the whole testbed, and of MuJoCo."""
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    with make_reasoner(SCENARIO, rollouts=CANDIDATES, sample_period=STEP) as reasoner:
+        times = {
+            name: interleaved(
+                partial(reasoner.decide, testbed, context), _planning(planner), repeats=repeats, warm_up=3
+            )
+            for name, planner in mujoco_planners().items()
+        }
+    fastest, (own, other) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
+    return Benchmark(
+        name="predictive_sampling_testbed",
+        value=ratio(other, own),
+        unit="1",
+        goal=0.1,
+        better=HIGHER,
+        against=f"plans per second of mujoco.rollout {mujoco.__version__}, {fastest}",
+        note=f"ms per decision of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e3 * np.median(own):.1f}, MuJoCo "
+        f"{1e3 * np.median(other):.2f}; n = {repeats}",
+    )
 
 
 def cart_pole_step() -> casadi.Function:
@@ -90,12 +115,17 @@ def cart_pole_step() -> casadi.Function:
 def compiled_planner(step: casadi.Function) -> Planner:
     rollouts = PlantRollouts(
         step,
-        control=polyline(),
-        cost=lambda x, u: _state_cost(x) + WEIGHTS["force"] * casadi.sumsqr(u),
-        final_cost=_state_cost,
+        control=B,
+        cost=lambda x, u: STEP * _state_cost(x),
+        final_cost=lambda x: STEP * _state_cost(x),
         compile=True,
     )
     return lambda x0, z: rollouts(x0, z).costs
+
+
+def mujoco_planners() -> dict[str, Planner]:
+    """By the number of threads, as text."""
+    return {"1 thread": mujoco_planner(1), "2 threads": mujoco_planner(2)}
 
 
 def mujoco_planner(threads: int) -> Planner:
@@ -122,7 +152,6 @@ def mujoco_planner(threads: int) -> Planner:
     first = np.zeros(mujoco.mj_stateSize(model, kind))
     states = np.zeros((CANDIDATES, STEPS, first.size))
     sensors = np.zeros((CANDIDATES, STEPS, model.nsensordata))
-    B = polyline()
     # One thread is the caller's own.
     pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
@@ -133,23 +162,15 @@ def mujoco_planner(threads: int) -> Planner:
         pool.rollout(
             model, data, first[None], u[:, :, None], state=states, sensordata=sensors, skip_checks=False, nstep=STEPS
         )
-        x = states[: len(z), :, 1:5]
-        cost = WEIGHTS["pole"] * (1.0 + np.cos(x[..., 1])) + WEIGHTS["cart"] * x[..., 0] ** 2
-        cost += WEIGHTS["velocity"] * (x[..., 2] ** 2 + x[..., 3] ** 2)
-        return cost.sum(axis=1) + WEIGHTS["force"] * (u**2).sum(axis=1) + float(_state_cost(casadi.DM(x0)))
+        after = _state_costs(states[: len(z), :, 1:5]).sum(axis=1)
+        return STEP * (after + cost(x0))
 
     return costs
 
 
-def polyline() -> np.ndarray:
-    """B of a polyline through knots at equal distances, shape (STEPS, KNOTS)."""
-    times, knots = np.arange(STEPS) / STEPS, np.linspace(0.0, 1.0, KNOTS)
-    return np.array([np.interp(times, knots, unit) for unit in np.eye(KNOTS)]).T
-
-
 def plan(planner: Planner, x0: np.ndarray, current: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """The best of the plan in use and of candidates about it, shape (K,)."""
-    z = current + SPREAD * random.standard_normal((CANDIDATES, KNOTS))
+    z = current + SPREAD * random.standard_normal((CANDIDATES, PLAN.knots))
     z[0] = current
     np.clip(z, -LIMIT, LIMIT, out=z)
     return z[np.argmin(planner(x0, z))]
@@ -158,11 +179,8 @@ def plan(planner: Planner, x0: np.ndarray, current: np.ndarray, random: np.rando
 def swing_up(step: casadi.Function, planner: Planner, budget: float, *, seed: int) -> tuple[float, float]:
     """Cost of 5 s at a receding horizon with ``budget`` seconds of wall time per sample, and plans per sample."""
     random = np.random.default_rng(seed)
-    x, current, spent, plans = HANGING, np.zeros(KNOTS), 0.0, 0
-    count = round(5.0 / STEP)
-    shift = [
-        np.interp(np.linspace(0.0, 1.0, KNOTS) + 1 / STEPS, np.linspace(0.0, 1.0, KNOTS), e) for e in np.eye(KNOTS)
-    ]
+    x, current, spent, plans = HANGING, np.zeros(PLAN.knots), 0.0, 0
+    count, shift = round(5.0 / STEP), PLAN.shift(STEP)
     for _ in range(count):
         begin = time.perf_counter()
         while True:
@@ -170,27 +188,28 @@ def swing_up(step: casadi.Function, planner: Planner, budget: float, *, seed: in
             plans += 1
             if time.perf_counter() - begin >= budget:
                 break
-        spent += float(_state_cost(casadi.DM(x)))
+        spent += STEP * cost(x)
         x = step(x, current[0])[0].full().ravel()
-        current = current @ np.array(shift)
+        current = shift @ current
     return spent, plans / count
 
 
-def _state_cost(x: casadi.SX | casadi.DM) -> casadi.SX | casadi.DM:
-    pole = WEIGHTS["pole"] * (1 + casadi.cos(x[1]))
-    return pole + WEIGHTS["cart"] * x[0] ** 2 + WEIGHTS["velocity"] * casadi.sumsqr(x[2:])
+def _state_cost(x: Any) -> Any:
+    """The same as `cost`, as an expression of CasADi."""
+    return 1.0 + casadi.cos(x[1]) + 0.1 * x[0] ** 2 + 0.01 * casadi.sumsqr(x[2:])
+
+
+def _state_costs(x: np.ndarray) -> np.ndarray:
+    """The same as `cost`, of many states, shape (..., 4)."""
+    return 1.0 + np.cos(x[..., 1]) + 0.1 * x[..., 0] ** 2 + 0.01 * (x[..., 2] ** 2 + x[..., 3] ** 2)
 
 
 def _difference(a: Planner, b: Planner) -> float:
     """Of the costs, relative."""
-    z = SPREAD * np.random.default_rng(0).standard_normal((CANDIDATES, KNOTS))
+    z = SPREAD * np.random.default_rng(0).standard_normal((CANDIDATES, PLAN.knots))
     ours, theirs = a(HANGING, z), b(HANGING, z)
     return float(np.max(np.abs(ours - theirs) / np.abs(theirs)))
 
 
-def _race(ours: Planner, theirs: Planner, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    def run(planner: Planner, random: np.random.Generator) -> Callable[[], np.ndarray]:
-        return partial(plan, planner, HANGING, np.zeros(KNOTS), random)
-
-    a, b = (run(planner, np.random.default_rng(0)) for planner in (ours, theirs))
-    return interleaved(a, b, repeats=repeats, warm_up=5)
+def _planning(planner: Planner) -> Callable[[], np.ndarray]:
+    return partial(plan, planner, HANGING, np.zeros(PLAN.knots), np.random.default_rng(0))

@@ -22,6 +22,7 @@ BENCHMARKS: Registry = {
     "cluster_projection": "benchmarks.cluster:cluster_projection",
     "casadi_system": "benchmarks.casadi_system:casadi_system",
     "predictive_sampling": "benchmarks.predictive_sampling:predictive_sampling",
+    "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
     "hub_round_trip_p50": "benchmarks.hub:hub_round_trip_p50",
     "loop_state_to_command_p50": "benchmarks.loop:loop_state_to_command_p50",
     "loop_misses": "benchmarks.loop:loop_misses",
