@@ -201,6 +201,7 @@ def test_wrong_shape_is_an_error(call, message):
 
 @pytest.mark.parametrize("control", [np.zeros(3), np.full((3, 2), np.nan), np.zeros((0, 2))])
 def test_control_is_a_matrix(control):
-    step = plant_step(cart_pole(0.01), cart_pole(0.01).CreateDefaultContext())
+    plant = cart_pole(0.01)
+    step = plant_step(plant, plant.CreateDefaultContext())
     with pytest.raises(ValueError, match="matrix"):
         PlantRollouts(step, control=control, cost=cost)
