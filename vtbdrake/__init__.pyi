@@ -13,10 +13,14 @@ from vtbdrake.optimization import CVaR as CVaR
 from vtbdrake.optimization import Parameter as Parameter
 from vtbdrake.optimization import Problem as Problem
 from vtbdrake.optimization import Study as Study
+from vtbdrake.reasoning.budget import Budget as Budget
+from vtbdrake.reasoning.reasoner import Reasoner as Reasoner
+from vtbdrake.reasoning.trajectory import Trajectory as Trajectory
 from vtbdrake.recording.log_reader import read_log as read_log
 from vtbdrake.recording.recorder import Recorder as Recorder
 from vtbdrake.recording.replay import replay as replay
 from vtbdrake.rollout import Constraint as Constraint
+from vtbdrake.rollout import Pruning as Pruning
 from vtbdrake.rollout import Quality as Quality
 from vtbdrake.state import Snapshot as Snapshot
 from vtbdrake.testbed import DpsAlone as DpsAlone

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +20,9 @@ from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.01
+
+# Switching times at which a treacherous DPS kills its process, or hangs.
+KILL, HANG = 2.25, 2.5
 
 
 class BangBang(LeafSystem):
@@ -34,9 +40,9 @@ class BangBang(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, strength: float, *, ends: bool = True) -> None:
+    def __init__(self, strength: float, *, ends: bool = True, treacherous: bool = False) -> None:
         super().__init__()
-        self._strength, self._ends = strength, ends
+        self._strength, self._ends, self._treacherous = strength, ends, treacherous
         # Force; the estimate of position and velocity.
         force, estimate = self.DeclareDiscreteState(1), self.DeclareDiscreteState(2)
         self._sensor = self.DeclareVectorInputPort("state", BasicVector(2))
@@ -50,6 +56,10 @@ class BangBang(LeafSystem):
 
     def _update(self, context: Context, discrete: object) -> None:
         (switch,) = self._switch.Eval(context)
+        while self._treacherous and switch == HANG:
+            time.sleep(1.0)
+        if self._treacherous and switch == KILL:
+            os.kill(os.getpid(), signal.SIGKILL)
         t = context.get_time() + 1e-9
         force = self._strength * (1.0 if t < switch else -1.0 if t < 2.0 * switch or not self._ends else 0.0)
         discrete.set_value(0, [force])
@@ -60,12 +70,13 @@ class BangBang(LeafSystem):
 class MassScenario(Scenario):
     """A mass of 1 kg that a force of 1 N moves from rest: after t it is t^2 / 2 further.
 
-    Sampled every 10 ms; the force acts a period after it was decided. When twice the switching time has passed, the
-    mass rests switch^2 further.
+    Its DPS believes what it has sensed last. Sampled every 10 ms; the force acts a period after it was decided. When
+    twice the switching time has passed, the mass rests switch^2 further.
     """
 
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     mass: float = 1.0
+    treacherous: bool = False
 
     def interface(self) -> Interface:
         return Interface(
@@ -75,7 +86,7 @@ class MassScenario(Scenario):
         )
 
     def make_dps(self) -> LeafSystem:
-        return BangBang(1.0)
+        return BangBang(1.0, treacherous=self.treacherous)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         h = PERIOD
@@ -83,6 +94,7 @@ class MassScenario(Scenario):
         mass = builder.add("sys", "mass", LinearSystem(A, B, np.eye(2), np.zeros((2, 1)), h))
         builder.sim_sensor("state", mass.get_output_port())
         builder.sim_actuator("force", mass.get_input_port())
+        builder.believe("sim.sys.mass.discrete_state_0", of=["dps.estimate"], age=PERIOD)
 
 
 @dataclass

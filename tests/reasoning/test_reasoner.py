@@ -7,10 +7,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
-from tests.reasoning.scenarios import MassScenario, SwingUpScenario
+from tests.reasoning.scenarios import HANG, KILL, MassScenario, SwingUpScenario
 from vtbdrake.optimization import Choice, Parameter
-from vtbdrake.reasoning import Budget, Reasoner, ReasonerError
-from vtbdrake.rollout import Constraint, Quality
+from vtbdrake.reasoning import Belief, Budget, Reasoner, ReasonerError
+from vtbdrake.rollout import Constraint, Pruning, Quality
+from vtbdrake.testbed import DpsAlone
 
 SWITCH = Parameter("u.switch", 0.0, 3.0)
 STATE = "sim.sys.mass.y0"
@@ -49,7 +50,7 @@ def decide(reasoner, testbed, *, values=None, at=0.0, **options):
         simulator = testbed.simulator(context)
         simulator.AdvanceTo(at)
     with reasoner:
-        return reasoner.decide(testbed, context, **options)
+        return reasoner.decide(Belief.perfect(testbed, context), **options)
 
 
 # -- known answers
@@ -196,6 +197,205 @@ def test_all_executors_give_the_same_decision(executor, mass):
     assert other.quality == serial.quality
     assert [c.values for c in other.candidates] == [c.values for c in serial.candidates]
     assert all(a.rollouts[0].identical(b.rollouts[0]) for a, b in zip(other.candidates, serial.candidates, strict=True))
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
+def test_when_the_time_is_over_rollouts_under_way_are_cancelled(executor, mass):
+    # A rollout of a million samples takes longer than any budget of the test.
+    workers = None if executor == "serial" else 2
+    reasoner = make(horizon=1e4, sample_period=0.01, executor=executor, workers=workers, budget=Budget(seconds=0.05))
+    decision = decide(reasoner, mass)
+    assert not decision
+    assert decision.end == "time"
+    assert [candidate.status for candidate in decision.candidates] == ["unfinished"]
+    assert "1 did not finish" in decision.message
+    assert "the budget of 0.05 s is spent" in decision.message
+
+
+def test_a_budget_of_time_gives_the_best_so_far(mass):
+    decision = decide(make(method="random", budget=Budget(seconds=0.5)), mass, values={"u.switch": 0.5})
+    finished = [c.quality for c in decision.candidates if c.status == "eligible"]
+    assert decision.end == "time"
+    assert decision.quality == min(finished)
+    assert decision.health.used >= 1.0
+
+
+def test_of_two_budgets_the_one_that_ends_first_counts(mass):
+    decision = decide(make(budget=Budget(rollouts=4, seconds=1e4)), mass)
+    assert (decision.end, decision.health.rollouts) == ("method", 4)
+
+
+def test_a_decision_may_have_a_budget_of_its_own(mass):
+    assert decide(make(), mass, budget=Budget(rollouts=4)).health.rollouts == 4
+    with pytest.raises(ValueError, match="a budget is Budget"):
+        decide(make(), mass, budget=4)
+
+
+def test_workers_that_die_or_hang_make_a_decision_poor(mass):
+    scenario = MassScenario(treacherous=True)
+    options = {"decision": [Choice("u.switch", [1.0, KILL, HANG])], "method": "grid", "executor": "processes"}
+    with make(scenario, **options, workers=2, time_limit=0.5) as reasoner:
+        reasoner.warm_up()
+        belief = Belief.perfect(mass, mass.default_context())
+        decision = reasoner.decide(belief)
+        assert decision.values == {"u.switch": 1.0}
+        assert decision.poor
+        assert "2 of 4 rollouts failed" in decision.doubts[0]
+        messages = {c.values["u.switch"]: c.rollouts[0].message for c in decision.candidates if c.status == "failed"}
+        assert "its worker process died (exit code -9)" in messages[KILL]
+        assert "longer than its time limit" in messages[HANG]
+        # In the budget of time that is left for one that hangs, it is ended, too.
+        decision = reasoner.decide(belief, budget=Budget(seconds=2.0))
+        assert decision.end == "time"
+        assert not any(c.status == "eligible" for c in decision.candidates if c.values["u.switch"] == HANG)
+        assert reasoner.decide(belief, budget=Budget(rollouts=1))
+
+
+# -- candidates that cannot win
+
+HIGHEST = Quality(lambda state: abs(state[0]), of=STATE)
+
+
+def test_pruning_with_a_bound_gives_the_same_choice_with_shorter_rollouts(mass):
+    def highest(left, state):
+        # With full force from now on.
+        return abs(state[0]) + abs(state[1]) * left + left**2 / 2.0
+
+    settings = {
+        "quality": HIGHEST,
+        "sample_period": 0.1,
+        "method": "random",
+        "decision": [Parameter("u.switch", 0, 1.5)],
+    }
+    whole, cut = (
+        decide(make(**settings, pruning=pruning), mass) for pruning in (None, Pruning(bound=highest, of=STATE))
+    )
+    assert cut.values == whole.values
+    assert cut.quality == whole.quality
+    assert cut.health.cut_off > 3
+    for a, b in zip(cut.candidates, whole.candidates, strict=True):
+        if a.status == "cut off":
+            assert b.quality <= a.quality <= cut.quality
+            assert a.rollouts[0].times[-1] < 3.0
+        else:
+            assert a.rollouts[0].identical(b.rollouts[0])
+
+
+@pytest.mark.parametrize("reading", ["integral", "worst"])
+def test_costs_that_only_grow_are_pruned_without_a_bound(reading, mass):
+    cost = Quality(lambda state: abs(state[0] - 0.25), of=STATE, minimize=True, reading=reading)
+    settings = {"quality": cost, "sample_period": 0.1, "method": "grid", "options": {"points": 20}}
+    whole, cut = (decide(make(**settings, pruning=pruning), mass) for pruning in (None, Pruning()))
+    assert cut.values == whole.values
+    assert cut.quality == whole.quality
+    assert cut.health.cut_off > 3
+    assert sum(len(c.rollouts[0].times) for c in cut.candidates) < sum(
+        len(c.rollouts[0].times) for c in whole.candidates
+    )
+
+
+def test_a_violated_constraint_ends_a_rollout(mass):
+    slow = Constraint(lambda state: state[1], of=STATE, at_most=0.5)
+    decision = decide(make(constraints=[slow], sample_period=0.1, method="grid", pruning=Pruning()), mass)
+    # 0.5 m/s is exceeded after 0.6 s at the latest.
+    broken = [c for c in decision.candidates if c.status == "violates"]
+    assert broken
+    assert {c.rollouts[0].end for c in broken} == {"pruned"}
+    assert max(c.rollouts[0].times[-1] for c in broken) == pytest.approx(0.6)
+    assert decision.values["u.switch"] <= 0.6
+
+
+def test_patience_ends_a_rollout_that_gains_nothing(mass):
+    pruning = Pruning(patience=0.35, gain=1e-6)
+    reasoner = make(quality=HIGHEST, sample_period=0.1, method="grid", options={"points": 4}, pruning=pruning)
+    decision = decide(reasoner, mass, values={"u.switch": 0.5})
+    # It comes to rest after 1 s, a period late.
+    first = decision.candidates[0].rollouts[0]
+    assert first.end == "stalled"
+    assert first.times[-1] == pytest.approx(1.4, abs=0.11)
+    assert decision.candidates[0].status == "eligible"
+    assert decision.candidates[0].quality == pytest.approx(0.25, abs=1e-6)
+
+
+def test_pruning_gives_the_same_decision_in_processes(mass):
+    settings = {"quality": HIGHEST, "sample_period": 0.1, "pruning": Pruning(bound=lambda left: 4.5, patience=1.0)}
+    serial, other = (
+        decide(make(**settings, **places), mass)
+        for places in ({"executor": "serial"}, {"executor": "processes", "workers": 2})
+    )
+    assert [c.rollouts[0].end for c in serial.candidates] == [c.rollouts[0].end for c in other.candidates]
+    assert serial.values == other.values
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"patience": 0.0}, "patience is a time in seconds, above 0"),
+        ({"gain": -1.0}, "gain is at least 0"),
+        ({"of": STATE}, "but no bound"),
+        ({"bound": 3.0}, "a bound is a function"),
+    ],
+)
+def test_a_senseless_pruning_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Pruning(**options)
+
+
+def test_patience_with_a_quality_at_the_end_is_refused():
+    with pytest.raises(ValueError, match="patience waits for a gain of the best so far"):
+        make(pruning=Pruning(patience=1.0))
+
+
+def test_a_bound_that_fails_fails_its_rollouts(mass):
+    decision = decide(make(pruning=Pruning(bound=lambda left: float("nan")), budget=Budget(rollouts=2)), mass)
+    assert not decision
+    assert "the bound of a pruning is NaN" in decision.message
+
+
+# -- beliefs
+
+
+def test_a_running_testbed_and_its_dps_alone_give_the_same_decision(mass):
+    context = mass.default_context()
+    mass.write(context, {"u.switch": 3.0})
+    simulator = mass.simulator(context)
+    simulator.AdvanceTo(1.0)
+    alone = DpsAlone(MassScenario())
+    with make(method="grid", options={"points": 25}) as reasoner:
+        decision = reasoner.decide(mass, context)
+        # The estimate is a period old: 0.49 m, 0.99 m/s.
+        assert decision.values["u.switch"] == pytest.approx(1.0, abs=0.13)
+        own = alone.continue_from(mass, context)
+        alone.diagram.GetInputPort("real.sense.state").FixValue(own, mass.read(context, STATE))
+        other = reasoner.decide(alone, own)
+    assert other.values == decision.values
+    assert [c.quality for c in other.candidates] == [c.quality for c in decision.candidates]
+
+
+def test_uncertain_beliefs_are_judged_by_the_risk(mass):
+    belief = Belief.of(mass, mass.default_context())
+
+    def qualities(risk):
+        settings = {"samples": 3, "uncertainty": {"sim.sys.mass.discrete_state_0": [0.1, 0.0]}, "risk": risk}
+        with make(**settings, decision=[Choice("u.switch", [0.5, 1.0])], method="grid") as reasoner:
+            return reasoner.decide(belief)
+
+    worst, mean = qualities("worst"), qualities("mean")
+    for candidate in worst.candidates:
+        # It comes to rest as far from where it was drawn as without uncertainty.
+        values = [rollout.value for rollout in candidate.rollouts]
+        assert len(set(values)) == 3
+        assert candidate.quality == max(values)
+    assert [c.quality for c in mean.candidates] == [
+        pytest.approx(np.mean([rollout.value for rollout in c.rollouts])) for c in worst.candidates
+    ]
+    assert worst.health.rollouts == 9
+    assert worst.health.spread > 0.0
+
+
+def test_without_a_context_there_is_no_decision(mass):
+    with make() as reasoner, pytest.raises(ValueError, match=r"decide\(testbed, context\)"):
+        reasoner.decide(mass)
 
 
 # -- eligible or not
@@ -382,7 +582,7 @@ def test_a_second_decision_at_the_same_time_is_refused_and_the_first_is_finished
     def ask():
         begun.wait()
         try:
-            reasoner.decide(mass, mass.default_context())
+            reasoner.decide(Belief.perfect(mass, context))
         except ReasonerError as error:
             refused.append(str(error))
         finally:
@@ -391,11 +591,11 @@ def test_a_second_decision_at_the_same_time_is_refused_and_the_first_is_finished
     thread = threading.Thread(target=ask)
     thread.start()
     with reasoner:
-        decision = reasoner.decide(mass, context)
+        decision = reasoner.decide(Belief.perfect(mass, context))
         thread.join()
         assert decision
         assert "a decision is under way in another thread" in refused[0]
-        assert reasoner.decide(mass, context).values == decision.values
+        assert reasoner.decide(Belief.perfect(mass, context)).values == decision.values
 
 
 def test_a_closed_reasoner_decides_nothing(mass):

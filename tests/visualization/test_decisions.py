@@ -8,7 +8,7 @@ from pydrake.geometry import Meshcat
 from tests.reasoning.scenarios import MassScenario, SwingUpScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Budget, Reasoner
+from vtbdrake.reasoning import Belief, Budget, Reasoner
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.visualization import make_meshcat, plot_decision, show_decision, show_poses
 
@@ -32,7 +32,7 @@ def swung_up():
     )
     testbed = reasoner.problem.testbed
     with reasoner:
-        yield reasoner, reasoner.decide(testbed, testbed.default_context())
+        yield reasoner, reasoner.decide(Belief.perfect(testbed, testbed.default_context()))
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_several_decided_elements_are_drawn_in_the_order_of_trying():
         executor="serial",
     ) as reasoner:
         testbed = reasoner.problem.testbed
-        decision = reasoner.decide(testbed, testbed.default_context())
+        decision = reasoner.decide(Belief.perfect(testbed, testbed.default_context()))
     _, right = plot_decision(decision).axes
     (best,) = [line for line in right.get_lines() if line.get_gid() == "best"]
     np.testing.assert_array_equal(best.get_xdata(), np.arange(8))

@@ -15,6 +15,7 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 from vtbdrake.optimization.study_file import Outcome, RolloutKey
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.derivative import DerivativeRunner
+from vtbdrake.rollout.pruning import PRUNED
 from vtbdrake.rollout.runner import split
 from vtbdrake.rollout.task import FAILED
 
@@ -156,7 +157,7 @@ class Evaluator:
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
         seen = [outcome for outcome in outcomes if outcome is not None]
-        exact = len(seen) == len(outcomes)
+        exact = len(seen) == len(outcomes) and all(outcome.end != PRUNED for outcome in seen)
         constraints = len(self._problem.constraints)
         if any(outcome.end == FAILED for outcome in seen):
             # After one failed simulation the other conditions change nothing.

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf, isfinite, isnan
-from queue import Empty, SimpleQueue
 
 from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.evaluator import Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyFile, Trial
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.executor import watched
@@ -179,17 +177,9 @@ class StudyRun:
 
     def _ask(self) -> list[Point]:
         """Return what the solver asks for; wait for it until the time limit at most."""
-        if self._deadline == inf:
-            return self._solver.ask()
-        answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
-        # A daemon thread does not keep the program from ending if the solver never answers.
-        threading.Thread(target=_think, args=(self._solver, answer), name="study: solver thinks", daemon=True).start()
-        try:
-            points = answer.get(timeout=max(0.0, self._deadline - time.monotonic()))
-        except Empty:
-            raise _RunEnd(TIME, f"the time is over, while {self._solver.name} was thinking") from None
-        if isinstance(points, BaseException):
-            raise points
+        points = ask_within(self._solver, self._deadline - time.monotonic())
+        if points is None:
+            raise _RunEnd(TIME, f"the time is over, while {self._solver.name} was thinking")
         return points
 
     def _resume(self) -> int:
@@ -305,14 +295,6 @@ class StudyRun:
             assert self._bar is not None
             (value,) = self._evaluator.in_user_terms(self._evaluator.best)
             self._bar.set_postfix_str(f"best {value:.6g}", refresh=False)
-
-
-def _think(solver: Solver, answer: SimpleQueue[list[Point] | BaseException]) -> None:
-    """Put what a solver asks for, or the exception that it raises, into ``answer``."""
-    try:
-        answer.put(solver.ask())
-    except BaseException as error:
-        answer.put(error)
 
 
 def check_budget(problem: Problem, *, rollouts: int | None, seconds: float | None, target: float | None) -> None:

@@ -61,7 +61,7 @@ class Health:
     Attributes:
         rollouts: how many have finished.
         failed: how many of them failed.
-        cut_off: how many of them ended early because their candidate could not win any more.
+        cut_off: how many of them ended early, see `Pruning`.
         rollout_time: the mean wall time of one, in seconds.
         elapsed: the wall time of the decision, in seconds.
         used: the share of the budget that was used, of rollouts or of time; of both the larger one.
@@ -176,7 +176,7 @@ class Decision:
     def _facts(self) -> dict[str, str]:
         health = self.health
         facts = {
-            "rollouts": f"{health.rollouts}, of which {health.failed} failed and {health.cut_off} were cut off; "
+            "rollouts": f"{health.rollouts}, of which {health.failed} failed and {health.cut_off} ended early; "
             f"{health.rollout_time * 1e3:.3g} ms each",
             "time": f"{health.elapsed:.3g} s, {health.used:.0%} of the budget",
             "end": f"{self.end}: {self.message}",

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, State
 
-from vtbdrake.reasoning.reasoner import Budget, Reasoner
-from vtbdrake.rollout.executor import checked_workers
+from vtbdrake.reasoning.budget import Budget
+from vtbdrake.reasoning.reasoner import Reasoner
+from vtbdrake.rollout.start import Start
 from vtbdrake.state import NO_DICT, VariableError, parameter
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
@@ -77,7 +78,7 @@ class OnboardReasoner(SlowPart):
         quality: See `Reasoner`.
         horizon: Of a rollout in seconds from t_k on; longer than the latency.
         budget: Of a decision; it counts rollouts.
-        period, latency, offset, patience: See `SlowPart`; as a decision takes no longer than its latency, the patience is
+        period, latency, offset, patience: See `SlowPart`; a decision takes no longer than its latency, so patience is
             short.
         initial: The decision until the first one is made, a scalar or shape (size,).
         on_request: Whether it decides once for each new request. Otherwise it decides at every t_k, at a receding
@@ -202,10 +203,7 @@ class _Thinker:
         os.nice(self._niceness)
         budget = self._arguments["budget"]
         seconds = min(budget.seconds or inf, self._seconds)
-        reasoner = self._make(**{**self._arguments, "budget": replace(budget, seconds=seconds)})
-        brief = replace(reasoner.task, horizon=reasoner.task.sample_period, threshold=None)
-        # One rollout of one sample per worker.
-        list(reasoner.executor.run(brief, [{}] * checked_workers(self._arguments.get("workers"))))
+        self._make(**{**self._arguments, "budget": replace(budget, seconds=seconds)}).warm_up()
 
     def __call__(
         self, *, dps: DpsState, request: np.ndarray | None = None, **believed: np.ndarray
@@ -246,7 +244,7 @@ class _Thinker:
     def _decide(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
         assert self._reasoner is not None
         self._begin(dps, believed)
-        decision = self._reasoner.decide(self._testbed, self._context)
+        decision = self._reasoner.decide(Start.of(self._testbed, self._context))
         if not decision:
             _log.warning("nothing was decided at t = %g s: %s", dps.time, decision.message)
             return None

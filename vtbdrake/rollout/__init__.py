@@ -9,6 +9,7 @@ from vtbdrake.rollout.executor import (
     make_executor,
 )
 from vtbdrake.rollout.futures import FuturesExecutor
+from vtbdrake.rollout.pruning import Cutoff, Pruning
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.start import Start, StartError
@@ -17,10 +18,12 @@ from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 __all__ = [
     "Constraint",
+    "Cutoff",
     "Executor",
     "FuturesExecutor",
     "Measure",
     "ProcessExecutor",
+    "Pruning",
     "Quality",
     "QualityError",
     "RolloutResult",

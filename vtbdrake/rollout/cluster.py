@@ -16,6 +16,7 @@ from typing import Any
 
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
+from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import failed
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
@@ -57,6 +58,8 @@ class DaskExecutor(Executor):
         WorkerError: the scheduler does not answer.
     """
 
+    cancels = False
+
     def __init__(
         self, client: Client | str | None = None, *, time_limit: float = inf, in_flight: int | None = None
     ) -> None:
@@ -74,13 +77,21 @@ class DaskExecutor(Executor):
         self._sent: OrderedDict[str, str] = OrderedDict()
 
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
+            ValueError: there is a ``cutoff``, which needs processes of our own.
             WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
         """
+        if cutoff is not None:
+            raise ValueError("a Dask cluster cannot cancel rollouts: use executor='processes'")
         name = self._send(self._pickler.pickle(task))
         starts = pack_starts(start, len(points))
         waiting = deque(range(len(points)))

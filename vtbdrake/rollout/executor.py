@@ -11,6 +11,7 @@ import threading
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from types import TracebackType
@@ -19,6 +20,7 @@ from typing import Any, Self
 from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
 from vtbdrake.rollout.start import Start, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
@@ -44,11 +46,21 @@ class Executor(ABC):
 
     What a rollout needs is kept from call to call, so that a call with a single point costs little more than its
     rollout. A task is known by its identity: hand in the same object each time.
+
+    Attributes:
+        cancels: whether it takes a `Cutoff`.
     """
+
+    cancels: bool = True
 
     @abstractmethod
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point, and yield (index of the point, result) as they finish.
 
@@ -62,6 +74,10 @@ class Executor(ABC):
             points: one per rollout.
             start: where the rollouts begin, instead of the task's own s0: one start for all, or one for each point.
                 It is the cheap way to begin elsewhere: nothing is built, and only the start is sent to the workers.
+            cutoff: ends rollouts early. Those that its deadline cancels are not yielded.
+
+        Raises:
+            ValueError: there is a ``cutoff``, and the executor cannot cancel rollouts (see ``cancels``).
         """
 
     def close(self) -> None:
@@ -89,11 +105,20 @@ class SerialExecutor(Executor):
         self._runners = Runners(Testbeds(testbed, kept=kept))
 
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         starts = start_of_each(start, len(points))
         for index, (point, begins) in enumerate(zip(points, starts, strict=True)):
-            yield index, self._runners.run(task, point, start=begins)
+            try:
+                result = self._runners.run(task, point, start=begins, cutoff=cutoff)
+            except CancelledError:
+                return
+            yield index, result
 
     def close(self) -> None:
         self._runners.clear()
@@ -107,6 +132,7 @@ class _Job:
     index: int
     point: Parameters
     start: Start | None
+    cutoff: Cutoff | None
     cancel: threading.Event
     done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException]
 
@@ -131,11 +157,17 @@ class ThreadExecutor(Executor):
         weakref.finalize(self, _stop, self._jobs, self._threads)
 
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         starts = start_of_each(start, len(points))
         if len(points) == 1:  # Without the cost of another thread.
-            yield 0, self._runners.run(task, points[0], start=starts[0])
+            with suppress(CancelledError):
+                yield 0, self._runners.run(task, points[0], start=starts[0], cutoff=cutoff)
             return
         while len(self._threads) < min(self._count, len(points)):
             name = f"rollout-{len(self._threads)}"
@@ -147,11 +179,13 @@ class ThreadExecutor(Executor):
         open_jobs = 0
         try:
             for index, point in enumerate(points):
-                self._jobs.put(_Job(task, index, point, starts[index], cancel, done))
+                self._jobs.put(_Job(task, index, point, starts[index], cutoff, cancel, done))
                 open_jobs += 1
             while open_jobs:
                 result = done.get()
                 open_jobs -= 1
+                if isinstance(result, CancelledError):
+                    continue
                 if isinstance(result, BaseException):
                     raise result
                 yield result
@@ -178,7 +212,8 @@ def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
         try:
             if job.cancel.is_set():
                 raise CancelledError
-            job.done.put((job.index, runners.run(job.task, job.point, start=job.start, cancel=job.cancel)))
+            result = runners.run(job.task, job.point, start=job.start, cutoff=job.cutoff, cancel=job.cancel)
+            job.done.put((job.index, result))
         except BaseException as error:  # Raised again where the results are read.
             job.done.put(error)
         # Keep nothing of the last job while waiting for the next one.

@@ -23,6 +23,7 @@ from vtbdrake.rollout.pickled_task import (
     unpack,
     unpack_start,
 )
+from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import Runners, Testbeds, failed
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
@@ -51,6 +52,8 @@ class FuturesExecutor(Executor):
             An interruption takes back what has not begun; what runs goes on to its end.
     """
 
+    cancels = False
+
     def __init__(self, pool: concurrent.futures.Executor, *, in_flight: int | None = None) -> None:
         if in_flight is not None and in_flight < 1:
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
@@ -60,13 +63,21 @@ class FuturesExecutor(Executor):
         self._rescue: ProcessExecutor | None = None
 
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
+            ValueError: there is a ``cutoff``, which needs processes of our own.
             WorkerError: the task cannot be sent to another process, or the pool takes no more work.
         """
+        if cutoff is not None:
+            raise ValueError("a pool of concurrent.futures cannot cancel rollouts: use executor='processes'")
         pickled = self._pickler.pickle(task)
         starts = pack_starts(start, len(points))
         waiting = deque(range(len(points)))

@@ -14,6 +14,7 @@ import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
+from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
@@ -54,6 +55,7 @@ class RolloutRunner:
         # f first, then what else is measured.
         self._measures = [*([task.quality] if task.quality else []), *task.measures]
         self._readers = {a: self.testbed.reader(a) for measure in self._measures for a in measure.of}
+        self._bound_readers = [self.testbed.reader(a) for a in task.pruning.of] if task.pruning is not None else []
         self._recorders = {address: self.testbed.reader(address) for address in task.record}
         self._times = task.sample_times()
         self._s0 = self.testbed.default_context()
@@ -71,29 +73,36 @@ class RolloutRunner:
         self._changed: set[str] | None = None
 
     def run(
-        self, parameters: Mapping[str, Any], *, start: Start | None = None, cancel: threading.Event | None = None
+        self,
+        parameters: Mapping[str, Any],
+        *,
+        start: Start | None = None,
+        cutoff: Cutoff | None = None,
+        cancel: threading.Event | None = None,
     ) -> RolloutResult:
         """Run one rollout from s0.
 
         Args:
             parameters: address -> value, set in s0.
             start: s0; that of the task if left out. Several rollouts from the same object prepare it once.
+            cutoff: ends the rollout early.
             cancel: stops the rollout when it is set.
 
         Raises:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
             StartError: ``start`` does not fit the testbed.
-            CancelledError: ``cancel`` was set.
+            CancelledError: ``cancel`` was set, or the deadline of ``cutoff`` has passed.
         """
         begin = time.perf_counter()
         self._begin(start)
-        samples = _Samples(self)
+        cutoff = cutoff or Cutoff()
+        samples = _Samples(self, cutoff.to_beat)
         end, message = HORIZON, ""
         with Interruptible() as interruptible:
             try:
                 self._reset(parameters)
                 for t, instant in zip(self._times, self._instants, strict=True):
-                    if cancel is not None and cancel.is_set():
+                    if cutoff.is_over or (cancel is not None and cancel.is_set()):
                         raise CancelledError
                     interruptible.check()
                     status = self._advance(t, instant)
@@ -103,6 +112,9 @@ class RolloutRunner:
                         break
                     if terminated and status is not None:
                         end, message = TERMINATED, status.FormatMessage()
+                        break
+                    if samples.ending:
+                        end, message = samples.ending
                         break
             except SimulationError as failure:
                 end, message = FAILED, str(failure)
@@ -254,8 +266,14 @@ class _FailuresAsOutcomes:
 class _Samples:
     """The samples of the present rollout."""
 
-    def __init__(self, runner: RolloutRunner) -> None:
+    def __init__(self, runner: RolloutRunner, to_beat: float) -> None:
         self._runner = runner
+        task = runner.task
+        self._prospect: Prospect | None = None
+        if task.pruning is not None and task.quality is not None:
+            self._prospect = Prospect(task.pruning, task.quality, task.measures, task.horizon, to_beat)
+        # Why the rollout ends early, in a word and in a sentence.
+        self.ending: tuple[str, str] | None = None
         self._times: list[float] = []
         self._clock = np.nan
         self._samples: list[list[float]] = [[] for _ in runner._measures]
@@ -273,6 +291,10 @@ class _Samples:
             self._record[address].append(value)
         for samples, sample in zip(self._samples, new, strict=True):
             samples.append(sample)
+        if self._prospect is not None:
+            with _FailuresAsOutcomes():
+                values = [read(runner.context) for read in runner._bound_readers]
+            self.ending = self._prospect.take(t, new, values)
         return task.quality is not None and bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
 
     def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
@@ -288,6 +310,8 @@ class _Samples:
         if times.size and end != FAILED:
             if f is not None:
                 t_star, value = _t_star(f, times, samples, task.threshold)
+                if end == PRUNED and self._prospect is not None:
+                    value = self._prospect.reachable
                 h = float(f.quality(np.array(value)))
                 if task.keep_state:
                     state = self._state(parameters, t_star)
@@ -467,6 +491,7 @@ class Runners:
         point: Mapping[str, Any],
         *,
         start: Start | None = None,
+        cutoff: Cutoff | None = None,
         cancel: threading.Event | None = None,
         begin: Callable[[], Any] | None = None,
     ) -> RolloutResult:
@@ -479,6 +504,7 @@ class Runners:
             task: The rollout.
             point: Address, or scenario field with its prefix -> value.
             start: s0; that of the task if left out.
+            cutoff: Ends the rollout early.
             cancel: An event that ends the rollout when it is set.
             begin: Called when the testbed has been built, before the rollout.
         """
@@ -490,7 +516,7 @@ class Runners:
                 return failed(point, str(error))
             if begin is not None:
                 begin()
-            result = runner.run(variables, start=start, cancel=cancel)
+            result = runner.run(variables, start=start, cutoff=cutoff, cancel=cancel)
             return replace(result, parameters=dict(point)) if fields else result
 
     def clear(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.rollout.pruning import Pruning
 from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
@@ -32,12 +33,13 @@ class RolloutResult:
     Attributes:
         parameters: what was set in s0, by address.
         end: why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
-            the testbed asked for the end) or ``failed``.
-        message: the reason of a failure or termination.
+            the testbed asked for the end), ``pruned`` or ``stalled`` (see `Pruning`) or ``failed``.
+        message: the reason of a failure, termination or pruning.
         t_star: t* in seconds from t0, equation (16); of a quality that is read at the end or as an integral the end, of
             one that is read at its worst the time of that. NaN if the rollout failed or had no quality.
         h: f'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
-        value: h in the user's terms: the cost, if f is one, else h.
+        value: h in the user's terms: the cost, if f is one, else h. Of a pruned rollout, the best that it could still
+            have reached.
         measures: what else was asked to be measured, in its order; empty if the rollout failed.
         threshold: f_m, that of f': of a cost, 1 / (1 + the threshold of the cost).
         exceedances: G1, equation (14): the sample times at which f' exceeded f_m, in seconds from t0; all of it only if
@@ -132,6 +134,7 @@ class RolloutTask:
         measures: what else is sampled and read as one number each: further objectives, constraints.
         catch: what f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
             diverges. Otherwise it is raised, and ends the others.
+        pruning: when a rollout that is of no more use ends; None: never.
     """
 
     scenario: Scenario
@@ -145,6 +148,7 @@ class RolloutTask:
     keep_state: bool = False
     measures: tuple[Measure, ...] = ()
     catch: bool = False
+    pruning: Pruning | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.scenario, Scenario):
@@ -173,6 +177,7 @@ class RolloutTask:
                 f"{self.sample_period:g} s, but at most {_MOST_SAMPLES:g} fit into memory: take a longer sample period"
             )
         self._check_threshold()
+        self._check_pruning()
 
     def _check_threshold(self) -> None:
         if self.threshold is None:
@@ -188,6 +193,19 @@ class RolloutTask:
             raise ValueError(
                 f"a threshold ends a rollout at its best so far, but {self.quality.name} is read as "
                 f"{self.quality.reading!r}: leave the threshold out, or read it as 'best'"
+            )
+
+    def _check_pruning(self) -> None:
+        if self.pruning is None:
+            return
+        if not isinstance(self.pruning, Pruning):
+            raise ValueError(f"what ends a rollout early is a Pruning(...), not {self.pruning!r}")
+        if self.quality is None:
+            raise ValueError("pruning compares a quality, and the task has none: leave pruning out")
+        if self.pruning.patience < inf and self.quality.reading != "best":
+            raise ValueError(
+                f"patience waits for a gain of the best so far, but {self.quality.name} is read as "
+                f"{self.quality.reading!r}: leave patience out, or read it as 'best'"
             )
 
     @property

@@ -19,7 +19,8 @@ from vtbdrake.argument_checks import as_number
 from vtbdrake.child_process import ChildProcess, StartError, report_ready
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
-from vtbdrake.rollout.runner import KEPT, Runners, Testbeds, failed
+from vtbdrake.rollout.pruning import Cutoff
+from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds, failed
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
@@ -30,6 +31,8 @@ _log = logging.getLogger(__name__)
 _BRIEF = 0.1
 # A message of at most so many bytes fits into the buffer of a socket: sending it does not wait for the worker.
 _SMALL = 1 << 16
+# A rollout stops at its first sample after a cutoff's deadline. If it does not, after so many seconds, it hangs.
+_GRACE = 0.5
 # What a worker sends besides its answers: the rollout with a time limit begins; its memory has grown too much.
 _BEGUN, _GROWN = b"B", b"G"
 
@@ -73,17 +76,28 @@ class ProcessExecutor(Executor):
             self._workers.append(_Worker(self._kept, self._growth))
 
     def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Start | Sequence[Start] | None = None
+        self,
+        task: RolloutTask,
+        points: Sequence[Parameters],
+        *,
+        start: Start | Sequence[Start] | None = None,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point; see `Executor.run`.
 
         Raises:
             WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
         """
-        yield from self.run_pickled(self._pickler.pickle(task), points, pack_starts(start, len(points)))
+        starts = pack_starts(start, len(points))
+        yield from self.run_pickled(self._pickler.pickle(task), points, starts, cutoff=cutoff)
 
     def run_pickled(
-        self, task: PickledTask, points: Sequence[Parameters], starts: Sequence[bytes]
+        self,
+        task: PickledTask,
+        points: Sequence[Parameters],
+        starts: Sequence[bytes],
+        *,
+        cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point, of a task and with starts that are pickled already; see `run`."""
         if self._running:
@@ -93,33 +107,37 @@ class ProcessExecutor(Executor):
             )
         self._running = True
         try:
-            yield from self._run(task.content, points, starts)
+            yield from self._run(task.content, points, starts, cutoff)
         finally:
             self._running = False
 
     def _run(
-        self, task: bytes, points: Sequence[Parameters], starts: Sequence[bytes]
+        self, task: bytes, points: Sequence[Parameters], starts: Sequence[bytes], cutoff: Cutoff | None
     ) -> Iterator[tuple[int, RolloutResult]]:
         waiting = deque(range(len(points)))
         losses: dict[int, str] = {}
         error: BaseException | None = None
         self.start(len(points))
         try:
-            self._hand_out(task, waiting, points, starts)
+            self._hand_out(task, waiting, points, starts, cutoff)
             left = len(points)
             while left:
                 finished: list[tuple[int, RolloutResult]] = []
-                replies = self._replies()
+                replies = self._replies(cutoff)
                 if not self._workers:
                     raise WorkerError("the executor was closed while it had rollouts to run")
                 for worker, index, reply in replies:
                     if isinstance(reply, RolloutResult):
                         finished.append((index, reply))
+                    elif isinstance(reply, CancelledError):
+                        left -= 1
                     elif isinstance(reply, str):
                         # The rollout that it had not begun is not at fault.
                         waiting.extendleft(job for job in worker.jobs if job != index)
                         self._replace(worker)
-                        if index in losses:
+                        if cutoff is not None and cutoff.is_over:
+                            left -= 1
+                        elif index in losses:
                             finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
                         else:
                             _log.warning("rollout %d is tried again: %s", index, reply)
@@ -127,9 +145,12 @@ class ProcessExecutor(Executor):
                             waiting.append(index)
                     else:
                         error = error or reply
+                if cutoff is not None and cutoff.is_over:
+                    left -= len(waiting)
+                    waiting.clear()
                 if error is None:
                     # Workers go on while the caller uses the finished results.
-                    self._hand_out(task, waiting, points, starts)
+                    self._hand_out(task, waiting, points, starts, cutoff)
                 left -= len(finished)
                 yield from finished
                 if error is not None:
@@ -141,17 +162,22 @@ class ProcessExecutor(Executor):
                 worker.kill()
 
     def _hand_out(
-        self, task: bytes, waiting: deque[int], points: Sequence[Parameters], starts: Sequence[bytes]
+        self,
+        task: bytes,
+        waiting: deque[int],
+        points: Sequence[Parameters],
+        starts: Sequence[bytes],
+        cutoff: Cutoff | None,
     ) -> None:
         """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
         for idle in [worker for worker in self._workers if not worker.jobs]:
             worker = self._replace(idle) if waiting and idle.grown else idle
-            while waiting and not self._give(worker, task, waiting, points, starts):
+            while waiting and not self._give(worker, task, waiting, points, starts, cutoff):
                 worker = self._replace(worker)  # It died while it was idle or starting.
         for worker in self._workers:
             if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # `_replies` notices a worker that has died.
-                self._give(worker, task, waiting, points, starts)
+                self._give(worker, task, waiting, points, starts, cutoff)
 
     def _give(
         self,
@@ -160,11 +186,12 @@ class ProcessExecutor(Executor):
         waiting: deque[int],
         points: Sequence[Parameters],
         starts: Sequence[bytes],
+        cutoff: Cutoff | None,
     ) -> bool:
         """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
         index = waiting[0]
-        kind = b"R" if self._time_limit == inf else b"L"
-        message = kind + pickle.dumps((index, pack(points[index])))
+        limited = self._time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
+        message = (b"L" if limited else b"R") + pickle.dumps((index, pack(points[index]), cutoff))
         start = starts[index]
         if worker.jobs and len(message) + (0 if worker.has(start) else len(start)) > _SMALL:
             return True
@@ -183,7 +210,7 @@ class ProcessExecutor(Executor):
         self._starts_lost = 0
         return True
 
-    def _replies(self) -> list[tuple[_Worker, int, Any]]:
+    def _replies(self, cutoff: Cutoff | None) -> list[tuple[_Worker, int, Any]]:
         """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
         busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
         if not busy:
@@ -197,7 +224,7 @@ class ProcessExecutor(Executor):
                 try:
                     message = connection.recv_bytes()
                     if message == _BEGUN:
-                        worker.begin(self._time_limit)
+                        worker.begin(self._time_limit, cutoff)
                     elif message == _GROWN:
                         worker.grown = True
                     else:
@@ -208,7 +235,9 @@ class ProcessExecutor(Executor):
                     code = worker.child.wait()
                     replies.append((worker, index, f"its worker process died (exit code {code})"))
             elif time.monotonic() >= worker.deadline:
-                replies.append((worker, index, f"it took longer than its time limit of {self._time_limit:g} s"))
+                hung = cutoff is not None and cutoff.is_over
+                reason = "it did not stop" if hung else f"it took longer than its time limit of {self._time_limit:g} s"
+                replies.append((worker, index, reason))
         return replies
 
     def _replace(self, worker: _Worker) -> _Worker:
@@ -256,9 +285,12 @@ class _Worker:
             self._start = start
         self.connection.send_bytes(message)
 
-    def begin(self, time_limit: float) -> None:
+    def begin(self, time_limit: float, cutoff: Cutoff | None) -> None:
         """Start the time limit: the worker has its testbed and begins its rollout."""
-        self.deadline = time.monotonic() + time_limit
+        now = time.monotonic()
+        self.deadline = now + time_limit
+        if cutoff is not None:
+            self.deadline = min(self.deadline, max(now, cutoff.deadline) + _GRACE)
 
     def finish(self, index: int, outcome: Any) -> None:
         """Remove the rollout that is done; the worker goes on with the one that was given ahead."""
@@ -318,10 +350,10 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
             if kind == b"S":
                 start = content
                 continue
-            index, point = pickle.loads(content)
+            index, point, cutoff = pickle.loads(content)
             assert load is not None, "a worker got a rollout before its task"
             begin = partial(connection.send_bytes, _BEGUN) if kind == b"L" else None
-            reply = answer(index, partial(_rollout, runners, load, point, start, begin))
+            reply = answer(index, partial(_rollout, runners, load, point, start, cutoff, begin))
             if limit == inf:
                 limit = _memory() + growth
             elif _memory() > limit:
@@ -333,9 +365,14 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
 
 
 def _rollout(
-    runners: Runners, load: Callable[[], RolloutTask], point: bytes, start: bytes, begin: Callable[[], Any] | None
+    runners: Runners,
+    load: Callable[[], RolloutTask],
+    point: bytes,
+    start: bytes,
+    cutoff: Cutoff | None,
+    begin: Callable[[], Any] | None,
 ) -> RolloutResult:
-    return runners.run(load(), unpack(point), start=unpack_start(start), begin=begin)
+    return runners.run(load(), unpack(point), start=unpack_start(start), cutoff=cutoff, begin=begin)
 
 
 def _memory() -> float:

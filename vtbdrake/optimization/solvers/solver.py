@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isinf, isnan
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -346,3 +348,31 @@ class Solver(ABC):
     def close(self) -> None:
         """Release what the solver holds; it is not asked again."""
         return
+
+
+def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
+    """Return what a solver asks for; None if it is still thinking after ``seconds``: then it can only be closed.
+
+    Raises:
+        Exception: any error of the method.
+    """
+    if seconds == math.inf:
+        return solver.ask()
+    answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
+    # A daemon thread does not keep the program from ending if the solver never answers.
+    threading.Thread(target=_think, args=(solver, answer), name=f"{solver.name} thinks", daemon=True).start()
+    try:
+        points = answer.get(timeout=max(0.0, seconds))
+    except Empty:
+        return None
+    if isinstance(points, BaseException):
+        raise points
+    return points
+
+
+def _think(solver: Solver, answer: SimpleQueue[list[Point] | BaseException]) -> None:
+    """Put what a solver asks for, or the exception that it raises, into ``answer``."""
+    try:
+        answer.put(solver.ask())
+    except BaseException as error:
+        answer.put(error)

@@ -1,0 +1,297 @@
+"""One decision under way: candidates are proposed, simulated and compared until the budget is spent."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import inf, nan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vtbdrake.optimization.evaluator import Evaluator
+from vtbdrake.optimization.risk import Worst
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
+from vtbdrake.optimization.study_file import RolloutKey
+from vtbdrake.reasoning.budget import Budget
+from vtbdrake.reasoning.decision import CUT_OFF, ELIGIBLE, FAILED, UNFINISHED, VIOLATES, Candidate, Decision, Health
+from vtbdrake.reasoning.space import same_values
+from vtbdrake.rollout import Cutoff, RolloutResult
+from vtbdrake.rollout.pruning import PRUNED, STALLED
+from vtbdrake.rollout.start import Start
+from vtbdrake.testbed.interrupt import Interruptible
+
+if TYPE_CHECKING:
+    from vtbdrake.reasoning.reasoner import Reasoner
+
+# Why a decision ended.
+ROLLOUTS, TIME, METHOD = "rollouts", "time", "method"
+
+# Candidate 0 as a point of the search: it sets nothing, so that the DPS goes on with the plan in use.
+KEEP: Point = ()
+
+# With pruning, so many candidates are tried before the best one so far is the one to beat. It does not depend on the
+# number of workers: a decision is the same with any.
+_ROUND = 8
+
+# A method that asks so often in a row for known candidates only has nothing more to try.
+_KNOWN_BATCHES = 50
+
+
+class _BudgetSpentError(Exception):
+    """The end of a decision in the middle of a batch."""
+
+    def __init__(self, end: str, message: str) -> None:
+        super().__init__(message)
+        self.end = end
+
+
+class Thinking:
+    """One decision under way.
+
+    Args:
+        reasoner: whose decision it is.
+        budget: how much it may take.
+        starts: where the rollouts begin, one per sample of the belief.
+        held: address -> value of the plan in use.
+        given: a plan as a point of the search, or None.
+        begin: when the decision was asked for, by `time.monotonic`.
+    """
+
+    def __init__(
+        self,
+        reasoner: Reasoner,
+        budget: Budget,
+        starts: Sequence[Start],
+        held: Mapping[str, Any],
+        given: Point | None,
+        begin: float,
+    ) -> None:
+        self._reasoner = reasoner
+        self._budget = budget
+        self._deadline = inf if budget.seconds is None else begin + budget.seconds
+        self._problem = reasoner.problem
+        self._starts = starts
+        self._time = starts[0].time
+        self._held = held
+        self._given = given
+        self._begin = begin
+        self._results: dict[RolloutKey, RolloutResult] = {}
+        self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
+        self._count = 0
+        # The candidates in the order in which they were proposed; the plan in use is the first.
+        self._proposed: dict[Point, None] = {KEEP: None}
+
+    def decision(self) -> Decision:
+        """Think until the budget is spent or the method has finished."""
+        try:
+            end, message = METHOD, self._think()
+        except _BudgetSpentError as spent:
+            end, message = spent.end, str(spent)
+        return self._conclude(end, message)
+
+    def _think(self) -> str:
+        """Try candidates; return how the method ended."""
+        reasoner = self._reasoner
+        self._evaluator.evaluate([KEEP])
+        start, known = self._given or self._in_use(), []
+        if start is not None and same_values(self._values(start), self._held):
+            # To set what is set already changes nothing.
+            self._results |= {(start, sample): self._results[KEEP, sample] for sample in range(reasoner.samples)}
+            known = self._evaluator.evaluate([start])
+        elif start is not None:
+            known = self._try([start])
+        solver = reasoner.solver(self._time, budget=self._affordable(), start=start)
+        try:
+            # They are paid for.
+            solver.tell([replace(evaluation, effort=0.0) for evaluation in known])
+            return self._iterate(solver)
+        finally:
+            solver.close()
+
+    def _in_use(self) -> Point | None:
+        """Return the plan in use as a point of the search; None if it lies outside the ranges."""
+        try:
+            return self._reasoner.space.point(self._held, self._time)
+        except ValueError:
+            return None
+
+    def _values(self, point: Point) -> dict[str, Any]:
+        """Return what a candidate sets, address -> value."""
+        return {} if point == KEEP else self._reasoner.space.values(point, self._held, self._time)
+
+    def _iterate(self, solver: Solver) -> str:
+        silent = 0
+        while silent < _KNOWN_BATCHES:
+            asked = ask_within(solver, self._deadline - time.monotonic())
+            if asked is None:
+                raise _BudgetSpentError(TIME, f"{self._time_spent()}, while {solver.name} was thinking")
+            points = [self._problem.point(point) for point in asked]
+            if not points:
+                return f"{solver.name}: {solver.message}"
+            before = self._count
+            solver.tell(self._try(points))
+            silent = 0 if self._count > before else silent + 1
+        return f"{solver.name} asks for known candidates only"
+
+    def _try(self, points: Sequence[Point]) -> list[Evaluation]:
+        count = len(points) if self._reasoner.task.pruning is None else _ROUND
+        evaluations = []
+        for k in range(0, len(points), count):
+            now = points[k : k + count]
+            self._proposed |= dict.fromkeys(point for point in now if (point, 0) not in self._results)
+            evaluations += self._evaluator.evaluate(now)
+        return evaluations
+
+    def _affordable(self) -> int | None:
+        """Return how many more candidates the budget of rollouts allows; None: any number."""
+        rollouts = self._budget.rollouts
+        if rollouts is None:
+            return None
+        count = (rollouts - self._count) // self._reasoner.samples
+        if count == 0:
+            raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
+        return count
+
+    def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
+        executor, rollouts = self._reasoner.executor, self._budget.rollouts
+        if time.monotonic() >= self._deadline:
+            raise _BudgetSpentError(TIME, self._time_spent())
+        now = keys if rollouts is None else keys[: rollouts - self._count]
+        if now:
+            points = [self._values(point) for point, _ in now]
+            starts = [self._starts[sample] for _, sample in now]
+            results = executor.run(self._reasoner.task, points, start=starts, **self._cutoff())
+            self._take(results, now)
+        if any(key not in self._results for key in now):
+            raise _BudgetSpentError(TIME, self._time_spent())
+        if len(now) < len(keys):
+            assert rollouts is not None
+            raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
+
+    def _take(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
+        try:
+            with Interruptible() as interruptible:
+                for index, result in results:
+                    self._results[keys[index]] = result
+                    self._count += 1
+                    interruptible.check()
+        finally:
+            results.close()  # type: ignore[attr-defined]
+
+    def _cutoff(self) -> dict[str, Cutoff]:
+        """Return the argument that ends rollouts early, for an executor that has one."""
+        if not self._reasoner.executor.cancels:
+            return {}
+        best, risk = self._evaluator.best, self._problem.risk
+        # Under another risk, a sample that is worse may belong to a candidate that is better.
+        comparable = self._reasoner.samples == 1 or isinstance(risk, Worst)
+        known = nan if best is None or not comparable else self._evaluator.in_user_terms(best)[0]
+        return {"cutoff": Cutoff(deadline=self._deadline, to_beat=known)}
+
+    def _time_spent(self) -> str:
+        return f"the budget of {self._budget.seconds:g} s is spent"
+
+    # -- the answer
+
+    def _conclude(self, end: str, message: str) -> Decision:
+        problem = self._problem
+        candidates = tuple(self._candidate(*item) for item in enumerate(self._proposed))
+        eligible = [candidate for candidate in candidates if candidate.status == ELIGIBLE]
+        sign = 1.0 if problem.objectives[0].minimize else -1.0
+        ranked = sorted(eligible, key=lambda candidate: (sign * candidate.quality, candidate.number))
+        best = ranked[0] if ranked else None
+        improvement = margin = nan
+        if best is not None and candidates[0].status == ELIGIBLE:
+            improvement = sign * (candidates[0].quality - best.quality) + 0.0
+        if len(ranked) > 1:
+            margin = sign * (ranked[1].quality - ranked[0].quality) + 0.0
+        elapsed = time.monotonic() - self._begin
+        results = [self._results[point, sample] for point, sample in self._keys() if (point, sample) in self._results]
+        budget = self._budget
+        health = Health(
+            rollouts=len(results),
+            failed=sum(result.failed for result in results),
+            cut_off=sum(result.end in (PRUNED, STALLED) for result in results),
+            rollout_time=float(np.mean([result.wall_time for result in results])) if results else nan,
+            elapsed=elapsed,
+            used=max(len(results) / (budget.rollouts or inf), elapsed / (budget.seconds or inf)),
+            improvement=improvement,
+            margin=margin,
+            spread=nan if best is None else best.spread,
+        )
+        return Decision(
+            values={} if best is None else best.values,
+            quality=nan if best is None else best.quality,
+            chosen=None if best is None else best.number,
+            candidates=candidates,
+            health=health,
+            end=end,
+            message=message if best is not None else f"no candidate is eligible ({_why_none(candidates)}); {message}",
+            time=self._time,
+            doubts=tuple(_doubts(candidates, ranked, results)),
+            name=problem.objectives[0].name,
+            minimize=problem.objectives[0].minimize,
+            starts=tuple(self._starts),
+        )
+
+    def _keys(self) -> Iterator[RolloutKey]:
+        return ((point, sample) for point in self._proposed for sample in range(self._reasoner.samples))
+
+    def _candidate(self, number: int, point: Point) -> Candidate:
+        results = [self._results.get((point, sample)) for sample in range(self._reasoner.samples)]
+        evaluation = self._evaluator.evaluation(point)
+        finished = tuple(result for result in results if result is not None)
+        if evaluation.failed:
+            status = FAILED
+        elif len(finished) < len(results):
+            status = UNFINISHED
+        elif not evaluation.feasible:
+            status = VIOLATES
+        else:
+            status = ELIGIBLE if evaluation.exact else CUT_OFF
+        known = status in (ELIGIBLE, VIOLATES, CUT_OFF)
+        return Candidate(
+            number=number,
+            values=self._values(point) or dict(self._held),
+            status=status,
+            quality=self._evaluator.in_user_terms(evaluation)[0] if known else nan,
+            violations=evaluation.violations,
+            rollouts=finished,
+        )
+
+
+def _spent(rollouts: int) -> str:
+    return f"the budget of {rollouts} rollouts is spent"
+
+
+def _why_none(candidates: Sequence[Candidate]) -> str:
+    counts = Counter(candidate.status for candidate in candidates)
+    what = {FAILED: "failed", CUT_OFF: "were cut off", VIOLATES: "violated a constraint", UNFINISHED: "did not finish"}
+    reasons = [f"{counts[status]} {text}" for status, text in what.items() if counts[status]]
+    messages = [rollout.message for candidate in candidates for rollout in candidate.rollouts if rollout.failed]
+    return ", ".join(reasons) + (f"; the first failure: {messages[0]}" if messages else "")
+
+
+def _doubts(
+    candidates: Sequence[Candidate], ranked: Sequence[Candidate], results: Sequence[RolloutResult]
+) -> Iterator[str]:
+    """Yield what speaks against a decision.
+
+    Args:
+        candidates: all.
+        ranked: the eligible ones, from the best to the worst.
+        results: all rollouts that have finished.
+    """
+    failures = [result.message for result in results if result.failed]
+    if failures:
+        yield f"{len(failures)} of {len(results)} rollouts failed, the first: {failures[0]}"
+    if len(candidates) == 1:
+        yield "nothing but the plan in use was tried: the budget is too small, or a rollout too slow"
+    unfinished = sum(candidate.status == UNFINISHED for candidate in candidates)
+    if unfinished:
+        yield f"{unfinished} of {len(candidates)} candidates did not finish"
+    if len(ranked) > 1 and ranked[0].quality == ranked[-1].quality:
+        yield f"all {len(ranked)} eligible candidates are equally good: within the horizon, the quality ignores them"
