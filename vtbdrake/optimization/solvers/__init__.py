@@ -97,6 +97,8 @@ def make_solver(
 def _find(name: object) -> str:
     if not isinstance(name, str):
         raise SolverError(f"a solver is given by its name, one of {', '.join(CATALOGUE)}, not by {name!r}")
+    if name in CATALOGUE:
+        return name
     names = {_plain(known): known for known in CATALOGUE}
     if _plain(name) in names:
         return names[_plain(name)]

@@ -1,0 +1,84 @@
+"""What a decision costs beside its rollouts."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+import numpy as np
+
+from benchmarks.measure import LOWER, Benchmark, seconds, spread
+from vtbdrake.optimization import Parameter
+from vtbdrake.reasoning import Belief, Budget, Reasoner, Starter
+from vtbdrake.rollout import Quality, RolloutRunner
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+
+AHEAD = "sim.sys.climber.base.x"
+# The plan in use first, and then one candidate per worker.
+ROLLOUTS, WORKERS = 3, 2
+
+
+def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
+    """Milliseconds that a decision of the walking SpaceClimber takes beyond its rollouts.
+
+    The running robot decides about its heading again and again, a sample of its DPS later each time, by rollouts in two
+    warm processes: the plan in use, and then two candidates side by side. What is subtracted from the wall time of
+    `Reasoner.decide` is that of the first rollout and of the longer one of the two others, as their workers measure it,
+    without what each worker does to begin at another start: that is measured apart and not subtracted. So all the rest
+    counts: the state of the DPS, the world as it is believed to be, the way to the workers and back, the beginning
+    there, and the choice.
+    """
+    scenario = SpaceClimberScenario()
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    simulator.AdvanceTo(1.01)
+    context = simulator.get_context()
+    reasoner = Reasoner(
+        scenario=scenario,
+        decision=[Parameter("u.heading", -0.5, 0.5)],
+        quality=Quality(float, AHEAD, reading="end"),
+        horizon=horizon,
+        sample_period=horizon,
+        budget=Budget(rollouts=ROLLOUTS),
+        method="random",
+        executor="processes",
+        workers=WORKERS,
+    )
+    overheads, taken = [], []
+    with reasoner:
+        for k in range(decisions + 3):
+            simulator.AdvanceTo(1.01 + (k + 1) * scenario.period)
+            begin = time.perf_counter()
+            decision = reasoner.decide(testbed, context)
+            elapsed = time.perf_counter() - begin
+            first, *others = [candidate.rollouts[0].wall_time for candidate in decision.candidates]
+            if k >= 3:  # The first ones build the testbeds of the workers.
+                overheads.append(elapsed - first - max(others))
+                taken.append(elapsed)
+    runner = RolloutRunner(reasoner.task)
+    starter = Starter(runner.testbed)
+    belief = Belief.of(testbed, context)
+    one, other = starter.start(belief), starter.start(belief)
+
+    def begin_at(*starts: object) -> None:
+        for start in starts:
+            runner.run({}, start=start)
+
+    ours = np.array(overheads) * 1e3
+    anew, again = (
+        1e3 * np.median([seconds(partial(begin_at, *starts)) for _ in range(decisions)]) / 2
+        for starts in ((one, other), (one, one))
+    )
+    ours += 2 * max(float(anew - again), 0.0)
+    parts = {"the belief": lambda: Belief.of(testbed, context), "its start": lambda: starter.start(belief)}
+    told = ", ".join(f"{name} {1e3 * np.median([seconds(f) for _ in range(200)]):.2f} ms" for name, f in parts.items())
+    return Benchmark(
+        name="decision_overhead",
+        value=float(np.median(ours)),
+        unit="ms",
+        goal=1.0,
+        better=LOWER,
+        against="the rollouts of the same decisions",
+        note=f"{spread(ours, unit='ms')}, of {1e3 * np.median(taken):.3g} ms a decision of {ROLLOUTS} rollouts on "
+        f"{WORKERS} workers; of which {told}, and {anew - again:.2f} ms to begin elsewhere in a worker",
+    )
