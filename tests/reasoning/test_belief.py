@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, LeafSystem
 
 from tests.reasoning.scenarios import MassScenario
@@ -119,6 +120,22 @@ def test_with_a_perfect_belief_the_mental_rollout_is_the_true_future(executor):
         results = dict(workers.run(task, [{}, {}], start=belief.start(scenario.mental().build())))
     for result in results.values():
         np.testing.assert_array_equal(result.record[elbow], future)
+
+
+def test_a_perfect_belief_of_a_discrete_walk_is_exact_contacts_included():
+    pose = "sim.sys.climber.base.pose"
+    scenario = SpaceClimberScenario(
+        simulator_config=SimulatorConfig(),
+        plant_config=MultibodyPlantConfig(time_step=0.02, contact_model="point", discrete_contact_approximation="sap"),
+    )
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    simulator.AdvanceTo(1.01)
+    start = Belief.perfect(testbed, simulator.get_context()).start(scenario.build())
+    task = RolloutTask(scenario, 0.5, record=[pose, "sim.sense.foot_contact.foot_contact"], sample_period=0.1)
+    found = RolloutRunner(task).run({}, start=start).record
+    np.testing.assert_array_equal(found[pose], _future(task, testbed, simulator, pose))
+    assert found["sim.sense.foot_contact.foot_contact"].any(axis=1).all(), "a foot is always on the ground"
 
 
 def test_a_perfect_belief_reaches_a_world_with_another_integrator():
