@@ -87,6 +87,16 @@ def test_rollout_that_reaches_a_stop_is_marked():
     assert batch.valid.tolist() == [True, False]
 
 
+def test_largest_overrun_of_all_steps_counts():
+    x, u = casadi.SX.sym("x", 1), casadi.SX.sym("u", 1)
+    step = casadi.Function("step", [x, u], [x, u], ["x", "u"], ["x_next", "overrun"])
+    rollouts = PlantRollouts(step, control=hat_functions(), cost=cost, compile=False)
+    z = np.array([[-1.0, -2.0, 0.5, -2.0, -1.0], [-1.0, -2.0, -0.5, -2.0, -1.0]])
+    batch = rollouts([0.0], z)
+    np.testing.assert_allclose(batch.overruns, (z @ hat_functions().T).max(axis=1))
+    assert batch.valid.tolist() == [False, True]
+
+
 def test_rollout_that_diverges_is_marked():
     step = casadi.SX.sym("x", 1), casadi.SX.sym("u", 1)
     explosive = casadi.Function("step", list(step), [1e30 * step[0] ** 2, -1.0], ["x", "u"], ["x_next", "overrun"])
