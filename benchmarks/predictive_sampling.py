@@ -22,8 +22,9 @@ from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio
 from vtbdrake.components.compiled_plant import PlantRollouts, plant_step
 from vtbdrake.spline import Spline
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.decision import cost
 from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, CartPole
-from vtbdrake_diagrams.cart_pole.swing_up import cost, make_reasoner
+from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner
 
 SCENARIO = CartPoleScenario()
 CANDIDATES, STEP = 32, SCENARIO.period

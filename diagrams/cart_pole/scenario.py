@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from math import inf
 from operator import itemgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 from drake import lcmt_acrobot_u, lcmt_acrobot_x, lcmt_scope
@@ -21,6 +22,9 @@ from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, Virtual
 from vtbdrake_diagrams.cart_pole.dps import JOINTS, PERCEIVED, make_dps
 from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES
 
+if TYPE_CHECKING:
+    from vtbdrake.reasoning import OnboardReasoner
+
 
 def _plant(time_step: float) -> MultibodyPlantConfig:
     # Unsampled: else, a step of the plant comes before the sensors of the same instant.
@@ -29,10 +33,11 @@ def _plant(time_step: float) -> MultibodyPlantConfig:
 
 @dataclass
 class CartPoleScenario(Scenario):
-    """Drake's cart-pole under a plan of forces; the command ``u.plan`` = [t_begin, knots in N] is what is decided.
+    """Drake's cart-pole under a plan of forces [t_begin, knots in N], which is what is decided.
 
-    The pole hangs at the angle 0 and stands at pi. A mental copy simulates the same cart-pole with a time step that is
-    as long as the sample period.
+    The plan is the command ``u.plan``; or, with ``onboard``, the decision of a reasoner that is a part of the DPS,
+    ``dps.planner``. The pole hangs at the angle 0 and stands at pi. A mental copy simulates the same cart-pole with a
+    time step that is as long as the sample period.
     """
 
     plant_config: MultibodyPlantConfig = field(default_factory=lambda: _plant(0.005))
@@ -44,6 +49,13 @@ class CartPoleScenario(Scenario):
     order: str = "linear"
     knots: int = 10
     duration: float = 1.0
+    # Whether the DPS decides the plan itself; and in a mental copy of it, where it does not reason again.
+    onboard: bool = False
+    is_mental: bool = False
+    # The time from one decision to the next, and the time that one takes, in seconds; and its budget.
+    thinking_period: float = 0.06
+    thinking_time: float = 0.06
+    rollouts: int = 20
     # Errors of the sensors, exact by default; latency in periods.
     position_errors: ErrorModel = field(default_factory=ErrorModel)
     velocity_errors: ErrorModel = field(default_factory=ErrorModel)
@@ -65,16 +77,15 @@ class CartPoleScenario(Scenario):
         return Spline(self.order, self.knots, self.duration)
 
     def mental(self) -> CartPoleScenario:
-        """Return the scenario of the mental copy: one time step per sample, and sensors without random errors."""
+        """Return the scenario of the mental copy: one time step per sample, sensors without random errors."""
         errors = {
             name: replace(getattr(self, name), noise=0.0, drift=0.0, dropout=0.0)
             for name in ("position_errors", "velocity_errors")
         }
-        return replace(self, plant_config=_plant(self.period), **errors)
+        return replace(self, plant_config=_plant(self.period), is_mental=True, **errors)
 
     def interface(self) -> Interface:
         age = 5 * self.period
-        limit = np.full(self.knots, self.force_limit)
         return Interface(
             sense=[
                 Signal(
@@ -83,25 +94,27 @@ class CartPoleScenario(Scenario):
                 Signal("joint_velocity", size=JOINTS, unit="m/s, rad/s", lower=-100.0, upper=100.0, max_age=age),
             ],
             act=[Signal("force", size=1, unit="N", lower=-self.force_limit, upper=self.force_limit, idle=0.0)],
-            commands=[
-                Signal(
-                    "plan", size=1 + self.knots, unit="s, N", lower=np.append(-inf, -limit), upper=np.append(inf, limit)
-                )
-            ],
+            commands=[] if self.onboard else [self._plan_command()],
+        )
+
+    def _plan_command(self) -> Signal:
+        limit = np.full(self.knots, self.force_limit)
+        return Signal(
+            "plan", size=1 + self.knots, unit="s, N", lower=np.append(-inf, -limit), upper=np.append(inf, limit)
         )
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.
 
         The cart-pole speaks the messages of Drake's acrobot, which has two joints and one drive, too; CART_POLE_PLAN
-        carries the plan.
+        carries the plan if it is a command.
         """
         joints = {"joint_position": ("theta1", "theta2"), "joint_velocity": ("theta1Dot", "theta2Dot")}
         return Deployment(
             protocol=Protocol(
                 sense=[vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp")],
                 act=[vector_map("CART_POLE_FORCE", lcmt_acrobot_u, {"force": "tau"}, stamp="timestamp")],
-                commands=[vector_map("CART_POLE_PLAN", lcmt_scope, {"plan": "value"})],
+                commands=[] if self.onboard else [vector_map("CART_POLE_PLAN", lcmt_scope, {"plan": "value"})],
             ),
             period=self.period,
             guards={"fallback": {"force": Zero()}},
@@ -109,7 +122,27 @@ class CartPoleScenario(Scenario):
         )
 
     def make_dps(self) -> Diagram:
-        return make_dps(self.plan(), period=self.period, force_limit=self.force_limit)
+        planner = self._make_planner() if self.onboard else None
+        return make_dps(self.plan(), period=self.period, force_limit=self.force_limit, planner=planner)
+
+    def _make_planner(self) -> OnboardReasoner:
+        # Imported here: without it, the DPS needs no optimization.
+        from vtbdrake.reasoning import OnboardReasoner
+        from vtbdrake_diagrams.cart_pole.decision import reasoning
+
+        arguments = reasoning(self, "dps.planner.candidate", rollouts=self.rollouts)
+        named = {name: arguments.pop(name) for name in ("decision", "quality", "horizon", "budget")}
+        return OnboardReasoner(
+            1 + self.knots,
+            scenario=self,
+            period=self.thinking_period,
+            latency=self.thinking_time,
+            # Late is better than a new worker, whose start takes some seconds.
+            patience=5.0 / self.thinking_time,
+            mental=self.is_mental,
+            options=arguments,
+            **named,
+        )
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the machine runs without a plant.

@@ -2,65 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import Context
 
-from vtbdrake.reasoning import Budget, Decision, Reasoner, Trajectory
-from vtbdrake.rollout import Quality
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.reasoning import Decision, Reasoner
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.cart_pole.decision import reasoning
+from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
 from vtbdrake_diagrams.cart_pole.scenario import CartPoleScenario
 
 Array = NDArray[np.float64]
 
-
-def cost(state: Array) -> float:
-    """Return the cost of a state [x, theta, x', theta']: 0 where the pole stands still in the middle of the rail."""
-    x, theta, speed, rate = state.tolist()
-    return float(1.0 + np.cos(theta) + 0.1 * x**2 + 0.01 * speed**2 + 0.01 * rate**2)
-
-
-def plan_of(scenario: CartPoleScenario, address: str = "u.plan") -> Trajectory:
-    """Return what is decided: the knots of the plan, within the limits of the force."""
-    limit = scenario.force_limit
-    return Trajectory(address, scenario.knots, scenario.duration, scenario.order, lower=-limit, upper=limit)
+# The longest time in which processes start, or a decision is made, in seconds.
+_PATIENCE = 60.0
 
 
 def make_reasoner(scenario: CartPoleScenario, *, rollouts: int = 32, **options: Any) -> Reasoner:
-    """Return the reasoner of the swing-up: predictive sampling with a horizon as long as a plan.
+    """Return a reasoner that decides the command ``u.plan`` of a cart-pole.
 
     Args:
         scenario: That of the running cart-pole.
         rollouts: Budget of a decision.
-        options: Further arguments of `Reasoner`, which replace those given here.
+        options: Further arguments of `Reasoner`, which replace those of `reasoning`.
     """
-    given = {
-        "decision": [plan_of(scenario)],
-        "quality": Quality(cost, of="plant.state", reading="integral", minimize=True),
-        "horizon": scenario.duration,
-        "sample_period": 2.0 * scenario.period,
-        "budget": Budget(rollouts=rollouts),
-        "method": "predictive-sampling",
-        "options": {"sigma": 0.3},
-    }
-    return Reasoner(scenario=scenario, **{**given, **options})
+    return Reasoner(scenario=scenario, **{**reasoning(scenario, "u.plan", rollouts=rollouts), **options})
 
 
 @dataclass(frozen=True)
 class Swing:
-    """A swing-up in simulation, one row per decision.
+    """The course of a swing-up.
 
     Attributes:
-        times: When each decision was made, in s, shape (n,).
-        states: [x, theta, x', theta'] then, shape (n, 4), in m and rad.
-        decisions: What was decided.
+        times: In s, shape (n,).
+        states: [x, theta, x', theta'] at these times, shape (n, 4), in m and rad.
+        decisions: What was decided at each of them, if a reasoner outside the DPS did.
     """
 
     times: Array
     states: Array
-    decisions: tuple[Decision, ...]
+    decisions: tuple[Decision, ...] = ()
 
     @property
     def tilt(self) -> Array:
@@ -79,19 +68,73 @@ def swing_up(reasoner: Reasoner, scenario: CartPoleScenario, *, seconds: float =
         seconds: Duration of the simulation in seconds.
         every: Time from one decision to the next, in seconds.
     """
-    rows = list(_decide(reasoner, scenario, np.arange(round(seconds / every)) * every))
-    times, states, decisions = zip(*rows, strict=True)
-    return Swing(np.array(times), np.array(states), decisions)
-
-
-def _decide(reasoner: Reasoner, scenario: CartPoleScenario, times: Array) -> Iterator[tuple[float, Array, Decision]]:
     testbed = scenario.build()
     context = testbed.default_context()
+    decisions = []
+
+    def decide() -> None:
+        decisions.append(reasoner.decide(testbed, context))
+        if decisions[-1]:
+            decisions[-1].apply(testbed, context)
+
+    return replace(_simulated(testbed, context, seconds, every, decide), decisions=tuple(decisions))
+
+
+def swing_up_onboard(scenario: CartPoleScenario, *, seconds: float = 6.0, every: float = 0.1) -> Swing:
+    """Simulate a cart-pole that hangs at rest, and whose DPS decides the plan itself (``onboard=True``).
+
+    Thinking takes the time that the scenario declares, while the cart-pole moves on.
+
+    Args:
+        scenario: The cart-pole.
+        seconds: Duration of the simulation in seconds.
+        every: Time from one sample of the result to the next, in seconds.
+    """
+    testbed = scenario.build()
+    return _simulated(testbed, testbed.default_context(), seconds, every, lambda: None)
+
+
+def _simulated(
+    testbed: VirtualTestbed, context: Context, seconds: float, every: float, pause: Callable[[], None]
+) -> Swing:
+    """Simulate, and call ``pause`` at each sample."""
     simulator = testbed.simulator(context)
     state = testbed.reader("plant.state")
+    times = np.arange(round(seconds / every)) * every
+    states = []
     for time in times.tolist():
         simulator.AdvanceTo(time)
-        decision = reasoner.decide(testbed, context)
-        if decision:
-            decision.apply(testbed, context)
-        yield time, np.array(state(context)), decision
+        states.append(np.array(state(context)))
+        pause()
+    return Swing(times, np.array(states))
+
+
+def swing_up_on_machine(
+    scenario: CartPoleScenario, *, seconds: float = 6.0, record: str | os.PathLike[str] | None = None
+) -> Swing:
+    """Swing up the cart-pole of a machine in a process of its own, over LCM.
+
+    The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: the
+    clock is that of the simulated world. So the result does not depend on what else this computer does, as long as it
+    finds time for some rollouts per decision.
+
+    Args:
+        scenario: The cart-pole.
+        seconds: Duration in seconds of the machine's world.
+        record: A new file in which the loop is recorded, for `vtbdrake.replay`.
+    """
+    period, states = scenario.period, []
+    with Hub(port=0) as hub, MachineProcess(scenario, hub.url, lock_step=True, period=period):
+        deployment = Deployment.of(scenario).in_lock_step("joint_velocity")
+        with scenario.deploy(hub.url, deployment=deployment, record=record) as runtime:
+            perceived = runtime.target.reader(PERCEIVED)
+
+            def cycle_is_done() -> bool:
+                states.append(np.array(perceived(runtime.context)))
+                runtime.slow_parts.wait(_PATIENCE)
+                return False
+
+            runtime.slow_parts.wait(_PATIENCE)
+            runtime.take_over()
+            runtime.run(cycles=round(seconds / period), until=cycle_is_done)
+    return Swing(period * np.arange(len(states)), np.array(states))

@@ -59,6 +59,8 @@ class SplineCommand(LeafSystem):
         if size < 1:
             raise ValueError(f"SplineCommand: a value has at least one entry, not {size}")
         self._spline, self._size = spline, int(size)
+        # Computed here, since it takes longer than a cycle of a loop.
+        _ = spline.pieces
         self._after = None if after is None else _vector(after, self._size)
         self._plan = self.DeclareVectorInputPort("plan", 1 + spline.knots * self._size)
         value = self.DeclareDiscreteState(np.zeros(self._size))

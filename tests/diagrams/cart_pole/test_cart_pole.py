@@ -135,8 +135,8 @@ def test_the_mental_copy_has_the_same_dps_and_a_coarser_world() -> None:
     assert mental.position_errors == ErrorModel(bias=0.1, latency=1)
     ours, theirs = DpsAlone(scenario).variables(), DpsAlone(mental).variables()
     assert [(v.address, v.shape) for v in ours.values()] == [(v.address, v.shape) for v in theirs.values()]
-    # Fields that are the same all the way.
-    assert replace(mental, plant_config=scenario.plant_config, position_errors=scenario.position_errors) == scenario
+    kept = {name: getattr(scenario, name) for name in ("plant_config", "position_errors", "is_mental")}
+    assert replace(mental, **kept) == scenario
 
 
 def test_scenario_comes_back_from_its_file(tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
-"""The swing-up by decisions at a receding horizon, in simulation."""
+"""The swing-up by decisions at a receding horizon, in simulation and on a machine."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 
+import vtbdrake as vtb
 from vtbdrake.reasoning import Belief
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
-from vtbdrake_diagrams.cart_pole.swing_up import cost, make_reasoner, plan_of, swing_up
+from vtbdrake_diagrams.cart_pole.decision import cost, plan_of
+from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner, swing_up, swing_up_on_machine, swing_up_onboard
 
 UPRIGHT, HANGING = np.array([0.0, np.pi, 0.0, 0.0]), np.zeros(4)
 
@@ -64,8 +68,23 @@ def test_the_chosen_plan_predicts_the_true_future_where_the_mental_copy_is_as_fi
     assert decision.quality == pytest.approx(np.trapezoid(costs, times), rel=1e-12)
 
 
+def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
+    swing = swing_up_onboard(CartPoleScenario(onboard=True), seconds=3.3)
+    assert swing.tilt[-5:].max() < 0.4
+    assert np.abs(swing.states[:, 0]).max() < 3.0
+
+
+def test_over_lcm_the_dps_decides_for_a_machine_in_a_process_of_its_own(tmp_path: Path) -> None:
+    scenario = CartPoleScenario(onboard=True, rollouts=8)
+    swing = swing_up_on_machine(scenario, seconds=0.6, record=tmp_path / "swing.lcm")
+    assert swing.tilt[0] == pytest.approx(np.pi)
+    # Without decisions there is no force, and the pole hangs still.
+    assert swing.tilt.min() < np.pi - 0.02
+    assert vtb.replay(tmp_path / "swing.lcm").identical
+
+
 def test_the_plan_is_a_trajectory_of_the_testbed() -> None:
     scenario = CartPoleScenario(order="cubic", knots=6, force_limit=30.0)
-    plan = plan_of(scenario)
+    plan = plan_of(scenario, "u.plan")
     plan.find(scenario.build().variables())
     assert (plan.lower, plan.upper, plan.duration) == ((-30.0,), (30.0,), scenario.duration)
