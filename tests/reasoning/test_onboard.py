@@ -136,7 +136,7 @@ def test_what_cannot_be_believed_is_no_ground_for_a_decision(caplog):
     alone.simulator(context).AdvanceTo(0.3)
     shown = planner(alone, context)
     assert (shown["decision"], shown["valid"], shown["missed"]) == (0.0, 0.0, 1.0)
-    assert f"{PLANNER}.state must be finite" in caplog.text
+    assert f"the belief about {STATE} is missing" in caplog.text
 
 
 def test_copy_that_thinks_decides_alike():

@@ -103,7 +103,7 @@ def test_it_decides_beside_the_loop_as_in_a_simulation():
 
 
 def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
-    with Loop(PusherScenario(rollouts=10, latency=0.5)) as real:
+    with Loop(PusherScenario(rollouts=100_000, latency=0.5)) as real:
         worker = real.worker
         real.ask(1.0)
         os.kill(worker, signal.SIGKILL)
@@ -120,6 +120,8 @@ def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
             real.ask(request)
             real.run_patiently(60)
         assert (real.read("valid"), real.read("taken")) == (1.0, request)
+        # The time is over long before the rollouts are.
+        assert 1.0 <= real.read("rollouts") < 100_000.0
         assert real.worker != worker
 
 

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, State
 
+from vtbdrake.reasoning.belief import Belief, BeliefError
 from vtbdrake.reasoning.budget import Budget
 from vtbdrake.reasoning.reasoner import Reasoner
-from vtbdrake.rollout.start import Start
-from vtbdrake.state import NO_DICT, VariableError, parameter
+from vtbdrake.state import NO_DICT, parameter
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
-from vtbdrake.testbed.switch import COMMAND
 
 if TYPE_CHECKING:
     from vtbdrake.reasoning.space import Element
@@ -78,8 +77,8 @@ class OnboardReasoner(SlowPart):
         quality: See `Reasoner`.
         horizon: Of a rollout in seconds from t_k on; longer than the latency.
         budget: Of a decision; it counts rollouts.
-        period, latency, offset, patience: See `SlowPart`; a decision takes no longer than its latency, so patience is
-            short.
+        period, latency, offset, patience: See `SlowPart`. As a decision takes no longer than its latency, the patience
+            is short.
         initial: The decision until the first one is made, a scalar or shape (size,).
         on_request: Whether it decides once for each new request. Otherwise it decides at every t_k, at a receding
             horizon, and the latency is at most the period.
@@ -128,7 +127,7 @@ class OnboardReasoner(SlowPart):
         }
         believed = dict(believed or {})
         super().__init__(
-            _Thinker(arguments, seconds=_SHARE * latency, niceness=niceness),
+            _Thinker(arguments, _SHARE * latency, niceness),
             inputs=believed,
             outputs={_DECISION: size, **dict.fromkeys((_QUALITY, _IMPROVEMENT, _ROLLOUTS), 1)},
             period=period,
@@ -185,25 +184,22 @@ class _Thinker:
         niceness: Of the process beside a loop, and of its workers.
     """
 
-    def __init__(self, arguments: Mapping[str, Any], *, seconds: float, niceness: int) -> None:
+    def __init__(self, arguments: Mapping[str, Any], seconds: float, niceness: int) -> None:
         self._arguments = dict(arguments)
         self._seconds, self._niceness = seconds, niceness
-        self.__setstate__(self.__dict__)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("_arguments", "_seconds", "_niceness")}
-
-    def __setstate__(self, state: Mapping[str, Any]) -> None:
-        self.__dict__.update(state)
+        self._budget: Budget = replace(self._arguments["budget"], seconds=None)
         self._reasoner: Reasoner | None = None
         self._taking_turns = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Thinker, (self._arguments, self._seconds, self._niceness)
 
     def prepare(self) -> None:
         """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""
         os.nice(self._niceness)
         budget = self._arguments["budget"]
-        seconds = min(budget.seconds or inf, self._seconds)
-        self._make(**{**self._arguments, "budget": replace(budget, seconds=seconds)}).warm_up()
+        self._budget = replace(budget, seconds=min(budget.seconds or inf, self._seconds))
+        self._make(**self._arguments).warm_up()
 
     def __call__(
         self, *, dps: DpsState, request: np.ndarray | None = None, **believed: np.ndarray
@@ -217,58 +213,54 @@ class _Thinker:
         """
         with self._taking_turns:
             if self._reasoner is None:
-                budget = replace(self._arguments["budget"], seconds=None)
-                self._make(**{**self._arguments, "budget": budget, "executor": "serial", "workers": None})
+                self._make(**{**self._arguments, "executor": "serial", "workers": None})
+            assert self._reasoner is not None
             try:
-                return self._decide(dps, believed)
-            except VariableError as error:
+                decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget)
+            except BeliefError as error:
                 _log.warning("nothing was decided at t = %g s: %s", dps.time, error)
                 return None
+            if not decision:
+                _log.warning("nothing was decided at t = %g s: %s", dps.time, decision.message)
+                return None
+            # What is decided may be some entries only.
+            decision.apply(self._testbed, self._context)
+            return {
+                _DECISION: np.atleast_1d(self._variables[_CANDIDATE].get(self._context)),
+                _QUALITY: np.array([decision.quality]),
+                _IMPROVEMENT: np.array([decision.health.improvement]),
+                _ROLLOUTS: np.array([float(decision.health.rollouts)]),
+            }
 
     def _make(self, **arguments: Any) -> Reasoner:
         self._reasoner = reasoner = Reasoner(**arguments)
-        testbed = reasoner.problem.testbed
+        self._testbed = testbed = reasoner.problem.testbed
+        self._context = testbed.default_context()
         parts = {path: part for path, part in slow_parts(testbed.diagram).items() if isinstance(part, OnboardReasoner)}
         if [part.mental for part in parts.values()] != [True]:
             raise ValueError(
                 f"the mental scenario {type(testbed.scenario).__name__} reasons itself: give its OnboardReasoner "
                 "mental=True, by a field that Scenario.mental() sets"
             )
-        (self._path,) = parts
+        ((path, part),) = parts.items()
+        self._variables = {element.name: testbed.variables()[f"{path}.{element.name}"] for element in part.variables}
+        self._places = {name: testbed.dps_layout.slice_of(variable) for name, variable in self._variables.items()}
         for element in self._arguments["decision"]:
-            if element.address.partition("[")[0] != f"{self._path}.{_CANDIDATE}":
-                raise ValueError(f"a reasoner on board decides {self._path}.{_CANDIDATE}, not {element.address}")
-        self._testbed, self._context = testbed, testbed.default_context()
+            if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
+                raise ValueError(f"a reasoner on board decides {path}.{_CANDIDATE}, not {element.address}")
         return reasoner
 
-    def _decide(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
-        assert self._reasoner is not None
-        self._begin(dps, believed)
-        decision = self._reasoner.decide(Start.of(self._testbed, self._context))
-        if not decision:
-            _log.warning("nothing was decided at t = %g s: %s", dps.time, decision.message)
-            return None
-        decision.apply(self._testbed, self._context)
-        return {
-            _DECISION: np.atleast_1d(self._testbed.read(self._context, f"{self._path}.{_CANDIDATE}")),
-            _QUALITY: np.array([decision.quality]),
-            _IMPROVEMENT: np.array([decision.health.improvement]),
-            _ROLLOUTS: np.array([float(decision.health.rollouts)]),
-        }
-
-    def _begin(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> None:
-        """Set the mental testbed to the state of the DPS, with the plan in use as the candidate."""
-        testbed, context, part = self._testbed, self._context, self._path
-        testbed.dps_layout.put(context, dps.contents)
-        context.SetTime(dps.time)
-        values = {f"{part}.{name}": value for name, value in believed.items()}
-        values |= {f"{COMMAND}{name}": value for name, value in dps.commands.items()}
-        values[f"{part}.{_CANDIDATE}"] = testbed.read(context, f"{part}.{_DECISION}")
-        values[f"{part}.{_CANDIDATE_AT}"] = np.array(dps.time)
-        variables = testbed.variables()
-        testbed.write(context, {a: np.reshape(value, variables[a].shape) for a, value in values.items()})
-        if testbed.believes:
-            testbed.start_from_belief(context)
+    def _belief(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> Belief:
+        """Return the belief of a DPS in which the plan in use is the candidate."""
+        contents = dps.contents
+        self._testbed.dps_layout.check(contents)
+        numbers, places = contents.numbers.copy(), self._places
+        values = {**believed, _CANDIDATE: numbers[places[_DECISION]], _CANDIDATE_AT: dps.time}
+        for name, value in values.items():
+            numbers[places[name]] = value
+        candidate = self._variables[_CANDIDATE]
+        candidate.set(self._context, numbers[places[_CANDIDATE]].reshape(candidate.shape))
+        return Belief(replace(dps, contents=replace(contents, numbers=numbers)))
 
 
 def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency: float, niceness: int) -> None:
