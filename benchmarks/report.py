@@ -30,6 +30,7 @@ BENCHMARKS: Registry = {
     "cycle_overhead": "benchmarks.loop:cycle_overhead",
     "loop_against_drake": "benchmarks.loop:loop_against_drake",
     "slow_part_misses": "benchmarks.slow_part:slow_part_misses",
+    "loop_p99_beside_reasoner": "benchmarks.onboard:loop_p99_beside_reasoner",
     "recording_cost": "benchmarks.recording:recording_cost",
     "replay_rtf": "benchmarks.recording:replay_rtf",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
