@@ -14,6 +14,7 @@ from vtbdrake.optimization import Parameter as Parameter
 from vtbdrake.optimization import Problem as Problem
 from vtbdrake.optimization import Study as Study
 from vtbdrake.reasoning.budget import Budget as Budget
+from vtbdrake.reasoning.onboard import OnboardReasoner as OnboardReasoner
 from vtbdrake.reasoning.reasoner import Reasoner as Reasoner
 from vtbdrake.reasoning.trajectory import Trajectory as Trajectory
 from vtbdrake.recording.log_reader import read_log as read_log
