@@ -156,6 +156,11 @@ class CartPoleScenario(Scenario):
         builder.add_sensor("joint_position", JointEncoders(plant, joints, period=T, errors=self.position_errors))
         builder.add_sensor("joint_velocity", JointTachometers(plant, joints, period=T, errors=self.velocity_errors))
         builder.sim_actuator("force", plant.get_actuation_input_port(instance))
+        self.add_beliefs(builder)
+
+    def add_beliefs(self, builder: VirtualTestbedBuilder) -> None:
+        """Declare that what the DPS perceives sets the joints of the simulated world."""
+        T = self.period
         for k, name in enumerate(JOINT_NAMES):
             for i, (value, errors) in enumerate(
                 (("position", self.position_errors), ("velocity", self.velocity_errors))
