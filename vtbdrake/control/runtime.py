@@ -301,9 +301,7 @@ class Runtime(Stepped):
     def prepare(self, mode: str | None = None, **sides: Any) -> Preparation:
         """Check whether switches can be thrown (first phase), without changing anything.
 
-        Args:
-            mode: As in `VirtualTestbed.switch`.
-            **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
+        The arguments, ``sense`` and ``act`` among them, are those of `VirtualTestbed.switch`.
         """
         return prepare(self, mode, **sides)
 
@@ -321,11 +319,7 @@ class Runtime(Stepped):
         perform(self, preparation.sense, preparation.act)
 
     def switch(self, mode: str | None = None, **sides: Any) -> None:
-        """Prepare and perform a switch. Call it in the thread that runs the cycles, or between cycles.
-
-        Args:
-            mode: As in `VirtualTestbed.switch`.
-            **sides: ``sense`` and ``act``, as in `VirtualTestbed.switch`.
+        """Prepare and perform a switch, see `prepare`. Call it in the thread that runs the cycles, or between cycles.
 
         Raises:
             SwitchRefusedError: There are reasons against the switch; nothing has changed.
