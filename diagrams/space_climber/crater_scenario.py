@@ -139,6 +139,7 @@ class CraterScenario(SpaceClimberScenario):
             of=["dps.impl.navigator.position", "dps.env.position[2]", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
             by=lambda p, height, roll, pitch, yaw: [*p, height + float(ground(*p)), roll, pitch, yaw],
         )
+        self._believe_motion(builder)
         self._believe_joints(builder)
 
 

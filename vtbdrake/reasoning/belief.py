@@ -35,8 +35,8 @@ class World:
     """A true simulated world, for a perfect belief.
 
     Attributes:
-        contents: of the whole testbed.
-        values: by address, all that can be set in the simulated world.
+        contents: Of the whole testbed.
+        values: By address, all that can be set in the simulated world.
     """
 
     contents: FlatState
@@ -51,8 +51,8 @@ class Belief:
     (`VirtualTestbedBuilder.believe`), and so is all that no rule sets. A belief is plain data, which can be pickled.
 
     Attributes:
-        dps: the DPS: its state, parameters and commands, and the sensor values that it has received last.
-        world: the true world, of a perfect belief; None for every other one.
+        dps: The DPS: its state, parameters and commands, and the sensor values that it has received last.
+        world: The true world, of a perfect belief; None for every other one.
     """
 
     dps: DpsState
@@ -67,11 +67,11 @@ class Belief:
         """Return the belief of the DPS in ``context``.
 
         Args:
-            target: a testbed, or a DPS alone: the target of a Runtime, say.
-            context: of the target; it stays as it is.
+            target: A testbed, or a DPS alone: the target of a Runtime, say.
+            context: Of the target; it stays as it is.
 
         Raises:
-            ValueError: the context belongs to another target.
+            ValueError: The context belongs to another target.
         """
         target.check_context(context)
         return cls(target.dps_state(context))
@@ -84,7 +84,7 @@ class Belief:
         mental scenario, all variables of the world that both have are the true ones.
 
         Raises:
-            ValueError: the context belongs to another testbed.
+            ValueError: The context belongs to another testbed.
         """
         testbed.check_context(context)
         settable = [v for a, v in testbed.variables().items() if a.startswith("sim.") and not v.derived]
@@ -117,15 +117,15 @@ class Starter:
     A rule says how old its estimates are (``age``). They are not extrapolated: the mental world is late by that much.
 
     Args:
-        mental: the testbed of the rollouts.
-        uncertainty: by address of a variable of the simulated world, how uncertain the belief about it is: a standard
+        mental: The testbed of the rollouts.
+        uncertainty: By address of a variable of the simulated world, how uncertain the belief about it is: a standard
             deviation, a covariance matrix, or a function (believed value, random generator) -> value. A variable
             without a rule is uncertain about its value in the mental scenario.
-        seed: with the number of a sample, determines its random numbers, in the same way for every belief.
-        max_age: the largest age of a belief in seconds.
+        seed: With the number of a sample, determines its random numbers, in the same way for every belief.
+        max_age: The largest age of a belief in seconds.
 
     Raises:
-        BeliefError: an uncertainty is of no variable of the simulated world, or does not fit its shape.
+        BeliefError: An uncertainty is of no variable of the simulated world, or does not fit its shape.
     """
 
     def __init__(
@@ -187,11 +187,11 @@ class Starter:
         """Return where a rollout begins in the world as it is believed to be.
 
         Args:
-            belief: of the DPS.
-            now: the present time of the DPS in seconds, from which the age of the belief follows.
+            belief: Of the DPS.
+            now: The present time of the DPS in seconds, from which the age of the belief follows.
 
         Raises:
-            BeliefError: the belief is too old; its DPS does not fit that of the mental testbed; an estimate is
+            BeliefError: The belief is too old; its DPS does not fit that of the mental testbed; an estimate is
                 missing (not finite) or lies outside the bounds of its variable; or the mental scenario has no rules.
         """
         self._check(belief, now)
@@ -206,7 +206,7 @@ class Starter:
         of its variable is clipped. Without uncertainty, all are the believed one.
 
         Raises:
-            BeliefError: as in `start`.
+            BeliefError: As in `start`.
         """
         if not self._draws or belief.world is not None:
             return [self.start(belief, now=now)] * samples

@@ -30,10 +30,10 @@ class Start:
     sim, as in every copy of a running robot, and initialization events, which have happened, do not happen again.
 
     Attributes:
-        time: t0 in seconds.
-        contents: of systems of the testbed, in one of its layouts: ``dps_layout``, ``start_layout`` or
+        time: When the rollout begins, t0, in seconds.
+        contents: Of systems of the testbed, in one of its layouts: ``dps_layout``, ``start_layout`` or
             ``whole_layout``.
-        values: set on top, by address: commands u, say, or a parameter of the world.
+        values: Set on top, by address: commands u, say, or a parameter of the world.
     """
 
     time: float
@@ -57,7 +57,7 @@ class Start:
         The future of a running simulation equals a rollout from it as described at `AddressedDiagram.fork`.
 
         Raises:
-            ValueError: the context belongs to another testbed.
+            ValueError: The context belongs to another testbed.
         """
         testbed.check_context(context)
         carried = [v for a, v in testbed.variables().items() if (v.hidden or a.startswith(COMMAND)) and not v.derived]
@@ -69,14 +69,14 @@ class Beginning:
     """The context from which the rollouts of one runner begin; it is set to one start after another.
 
     Args:
-        testbed: the testbed of the rollouts.
-        default: s0 of the task: what a start does not hold.
-        copier: copies between contexts of the testbed.
+        testbed: The testbed of the rollouts.
+        default: The task's own s0, for what a start does not hold.
+        copier: Copies between contexts of the testbed.
 
     Attributes:
-        start: the present one; None is the task's own s0.
-        context: where the next rollout begins.
-        hidden: addresses of the hidden variables that any start so far has set.
+        start: The present one; None is the task's own s0.
+        context: Where the next rollout begins.
+        hidden: Addresses of the hidden variables that any start so far has set.
     """
 
     def __init__(self, testbed: VirtualTestbed, default: Context, copier: StateCopier) -> None:
@@ -95,7 +95,7 @@ class Beginning:
         """Begin at ``start``; None begins at the task's s0.
 
         Raises:
-            StartError: the start does not fit the testbed. The next rollout begins at the task's s0 then.
+            StartError: The start does not fit the testbed. The next rollout begins at the task's s0 then.
         """
         if start is self.start:
             return
@@ -149,11 +149,11 @@ def start_of_each(start: Start | Sequence[Start] | None, count: int) -> list[Sta
     """Return the start of each of ``count`` rollouts.
 
     Args:
-        start: one for all, or one for each; None is the task's own s0.
-        count: the number of rollouts.
+        start: One for all, or one for each; None is the task's own s0.
+        count: The number of rollouts.
 
     Raises:
-        StartError: it is no start, or there are too many or too few.
+        StartError: It is no start, or there are too many or too few.
     """
     starts: list[Start | None] = list(start) if isinstance(start, Sequence) else [start] * count
     for one in starts:

@@ -23,9 +23,9 @@ class FlatState:
     """The contents of some leaf systems, taken by a `StateLayout`: plain data, which pickles quickly.
 
     Attributes:
-        names: the groups and their sizes, see `StateLayout.names`.
-        numbers: all of them, one after another, shape (n,); read only.
-        abstract: the abstract states as arrays, by ``path/index/part``.
+        names: The groups and their sizes, see `StateLayout.names`.
+        numbers: All of them, one after another, shape (n,); read only.
+        abstract: The abstract states as arrays, by ``path/index/part``.
     """
 
     names: tuple[str, ...]
@@ -39,16 +39,16 @@ class StateLayout:
     What SceneGraph and cameras hold is not part of it, nor is a plant's memory of its last discrete step.
 
     Args:
-        diagram: the Diagram.
-        state: selects the systems whose state belongs to the layout, by path.
-        parameters: selects the systems whose parameters belong to it.
+        diagram: The Diagram.
+        state: Selects the systems whose state belongs to the layout, by path.
+        parameters: Selects the systems whose parameters belong to it.
 
     Attributes:
         names: ``path/group/index (size)`` of each numeric group, then ``path/abstract`` of each system with abstract
             state. Layouts with the same names exchange their contents.
 
     Raises:
-        SnapshotError: a system keeps an abstract value that no codec can carry.
+        SnapshotError: A system keeps an abstract value that no codec can carry.
     """
 
     def __init__(self, diagram: Diagram, *, state: Callable[[str], bool], parameters: Callable[[str], bool]) -> None:
@@ -91,7 +91,7 @@ class StateLayout:
         """Return the contents in a root context.
 
         Raises:
-            SnapshotError: an abstract state has become something that its codec does not take.
+            SnapshotError: An abstract state has become something that its codec does not take.
         """
         numbers = np.empty(self.size)
         for system, groups in self._groups:
@@ -115,8 +115,8 @@ class StateLayout:
         """Set the contents of a root context.
 
         Raises:
-            LayoutError: they are of another layout. Nothing has been set then.
-            SnapshotError: the arrays of an abstract state do not fit.
+            LayoutError: They are of another layout. Nothing has been set then.
+            SnapshotError: The arrays of an abstract state do not fit.
         """
         self.check(contents)
         writers = [(system, codecs.writer(_of(path, contents.abstract))) for path, system, codecs in self._abstract]
@@ -131,7 +131,7 @@ class StateLayout:
         """Raise an error if the contents are of another layout.
 
         Raises:
-            LayoutError: they are; it names the first difference.
+            LayoutError: They are; it names the first difference.
         """
         if contents.names != self.names:
             raise LayoutError(difference(contents.names, self.names))

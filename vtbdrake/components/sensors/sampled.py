@@ -97,8 +97,8 @@ class SampledSensor(LeafSystem):
         So the DPS of a mental copy gets what the DPS itself would have got, until the copy's sensors sample.
 
         Args:
-            context: of this sensor, in the state of the world in which it is to go on.
-            y: shape (n,).
+            context: Of this sensor, in the state of the world in which it is to go on.
+            y: Shape (n,).
         """
         context.SetDiscreteState(self._output, y)
         if self._stage is not None:
