@@ -41,6 +41,7 @@ BENCHMARKS: Registry = {
     "auto_regret": "benchmarks.auto_regret:auto_regret",
     "racing_savings": "benchmarks.study:racing_savings",
     "time_to_target": "benchmarks.gait:time_to_target",
+    "crater_decision_time": "benchmarks.crater:crater_decision_time",
 }
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")

@@ -1,11 +1,14 @@
-"""Application O4 in the table of answers."""
+"""Applications O4 and R1 in the table of answers."""
 
 from __future__ import annotations
 
 from math import isfinite
 
+import numpy as np
+
 from vtbdrake.optimization import Boundary
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.space_climber import crater
 from vtbdrake_diagrams.space_climber.payload import (
     EARTH,
     ENVIRONMENTS,
@@ -69,3 +72,57 @@ def _range(boundary: Boundary) -> str:
     if best[0] > boundary.lower:
         parts.append(f"best phase {best[0]:g} to {best[1]:g}")
     return f"{boundary.lower:g} to {upper} kg" + (f" ({'; '.join(parts)})" if parts else "")
+
+
+def heading(full: bool) -> Answer:
+    """Answer R1: which heading takes the robot from the bottom of a crater to its rim?
+
+    The short version decides among the paper's discrete headings in 10 craters, each in a world that differs from the
+    robot's model. The long one takes 20, explains the failures in each, and decides by a continuous search, too.
+    """
+    cases = [crater.decide_and_climb(seed, difference=seed) for seed in range(20 if full else 10)]
+    answered = [case for case in cases if case.climb is not None]
+    reached = [case for case in answered if case.climb is not None and case.climb.reached]
+    first = cases[0]
+    notes = [
+        "; ".join(_climb(case) for case in cases),
+        f"headings that do not pass: {'; '.join(_reasons(case) for case in (cases if full else cases[:1]))}",
+    ]
+    if full:
+        searched = [
+            crater.decide_and_climb(case.seed, difference=case.seed, method="CEM", rollouts=4 * crater.HEADINGS.size)
+            for case in cases
+        ]
+        notes.append(f"continuous search: {'; '.join(_climb(case) for case in searched)}")
+    chosen = np.degrees(first.decision.values.get(crater.HEADING, np.nan))
+    return Answer(
+        id="R1",
+        question="Which heading takes the robot from the bottom of a crater to its rim?",
+        answer=f"{chosen:.0f} deg in crater 0; {len(reached)} of {len(answered)} chosen headings reach the rim",
+        unit="",
+        interval=None,
+        paper=crater.PAPER,
+        holds=len(reached) == len(answered) > 0,
+        note=". ".join(notes),
+    )
+
+
+def _climb(case: crater.Case) -> str:
+    passable = [f"{np.degrees(angle):.0f}" for angle, passes in sorted(case.passable.items()) if passes]
+    seen = f"crater {case.seed}: passable {', '.join(passable) or 'none'}"
+    if case.climb is None:
+        return seen
+    chosen, climb = np.degrees(case.climb.heading), case.climb
+    end = (
+        f"reached the rim in {climb.duration:.0f} s" if climb.reached else f"ended {climb.distance:.0f} m from the axis"
+    )
+    return f"{seen}; {chosen:.0f} deg {end}"
+
+
+def _reasons(case: crater.Case) -> str:
+    failing = [angle for angle, passes in sorted(case.passable.items()) if not passes]
+    reasons = crater.explain(crater.model(case.seed), failing)
+    texts = [
+        f"{np.degrees(angle):.0f} deg {' or '.join(found) or 'several at once'}" for angle, found in reasons.items()
+    ]
+    return f"crater {case.seed}: {', '.join(texts)}"

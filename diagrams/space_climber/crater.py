@@ -1,0 +1,244 @@
+"""Application R1: the robot stands at the bottom of a crater; which heading takes it to the rim?
+
+The question in the paper's words: s^0 = phi, the heading, in [-45, 45] deg; q(t) = z(t), the elevation; f = z; f_m is
+infinite, and t_m is 300 s. The robot asks its own testbed: the rollouts begin at its belief, in its map of the crater.
+
+The world differs from the map, see `differing`: its ground is rough, its friction and the robot's mass are others.
+Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
+that no heading counts as passable which only is with good luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import SimulatorStatus
+
+import vtbdrake as vtb
+from vtbdrake.reasoning import Budget, Decision, Reasoner
+from vtbdrake.rollout import RolloutResult, make_executor
+from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.space_climber.crater_scenario import PASSED, CraterScenario
+
+HEADING = "u.heading"
+WALK = "u.walk"
+ELEVATION = "sim.sys.climber.base.height"
+MASS = "sim.sys.climber.base.mass"
+POSE = "sim.sys.climber.base.pose"
+
+HORIZON = 300.0
+# A multiple of the DPS's period.
+SAMPLE_PERIOD = 2.0
+# How long the robot may really walk, in s: a heading that passes the rim in the mental copy just in time is not wrong.
+LONGEST_CLIMB = 450.0
+LIMIT = np.radians(45.0)
+HEADINGS = np.radians(np.arange(-45.0, 46.0, 15.0))
+PAPER = "0 deg works well"
+
+# A simulated robot that has come no further for so long, in s, is stuck.
+PATIENCE = 30.0
+# How long the robot stands before it is asked, in s: its estimates are then its own.
+STANDING = 2.0
+
+# What a world differs by: ranges of the factors of friction and of the torso's mass, and the standard deviation of its
+# ground in m.
+FRICTION_RANGE = (0.9, 1.1)
+MASS_RANGE = (0.9, 1.1)
+ROUGHNESS = 0.03
+CAUTION = FRICTION_RANGE[0]
+
+# Why a heading fails: the change of the scenario's fields with which it would not.
+COUNTERFACTUALS: dict[str, Mapping[str, Any]] = {
+    "too steep for its friction": {"friction": 1.2},
+    "boulders": {"boulders": False},
+    "the gully": {"gullies": False},
+}
+
+
+def elevation(z: float) -> float:
+    """Return f of the paper: the elevation z over the crater's floor, in m."""
+    return max(z, 0.0)
+
+
+def model(seed: int) -> CraterScenario:
+    """Return the robot's model of the crater of this seed, from which it reasons."""
+    nominal = CraterScenario(seed=seed, patience=PATIENCE)
+    return replace(nominal, friction=CAUTION * nominal.friction)
+
+
+@dataclass(frozen=True)
+class World:
+    """A simulated reality, which differs from the robot's model of it.
+
+    Attributes:
+        scenario: its crater, its roughness and its friction.
+        mass: factor of the torso's mass.
+    """
+
+    scenario: CraterScenario
+    mass: float = 1.0
+
+
+def differing(seed: int, difference: int) -> World:
+    """Return a world with the crater ``seed``; ``difference`` is the seed of friction, mass and roughness."""
+    rng = np.random.default_rng([seed, difference])
+    nominal = CraterScenario(seed=seed)
+    friction = nominal.friction * float(rng.uniform(*FRICTION_RANGE))
+    world = replace(nominal, friction=friction, roughness=ROUGHNESS, roughness_seed=difference)
+    return World(world, mass=float(rng.uniform(*MASS_RANGE)))
+
+
+def heading_reasoner(
+    scenario: CraterScenario, *, method: str = "grid", rollouts: int = HEADINGS.size + 1, **options: Any
+) -> Reasoner:
+    """Return the reasoner of the robot, which decides its heading.
+
+    Args:
+        scenario: the robot's model.
+        method: ``grid`` for the discrete headings of the paper, or another method for a continuous search.
+        rollouts: the budget; the plan in use, heading 0, counts too, although the grid need not try it again.
+        options: of `Reasoner`.
+    """
+    if method == "grid":
+        options = {"options": {"points": HEADINGS.size}, **options}
+    return Reasoner(
+        scenario=scenario,
+        decision=[vtb.Parameter(HEADING, -LIMIT, LIMIT)],
+        quality=vtb.Quality(elevation, of=ELEVATION),
+        budget=Budget(rollouts=rollouts),
+        method=method,
+        **{"horizon": HORIZON, "sample_period": SAMPLE_PERIOD, **options},
+    )
+
+
+def heading_problem(scenario: CraterScenario) -> vtb.Problem:
+    """Return problem (18) over the heading in the mental copy of a scenario, from its own start, for the landscape."""
+    return vtb.Problem(
+        scenario=scenario.mental(),
+        parameters=[vtb.Parameter(HEADING, -LIMIT, LIMIT)],
+        quality=vtb.Quality(elevation, of=ELEVATION),
+        horizon=HORIZON,
+        sample_period=SAMPLE_PERIOD,
+    )
+
+
+@dataclass(frozen=True)
+class Climb:
+    """How a climb ended.
+
+    Attributes:
+        heading: in rad.
+        reached: whether the robot has passed the rim.
+        elevation: of the torso at the end, in m.
+        duration: in s, from the command on.
+        distance: from the crater's axis at the end, in m.
+    """
+
+    heading: float
+    reached: bool
+    elevation: float
+    duration: float
+    distance: float
+
+
+class Expedition:
+    """A robot in a world: it stands at the bottom, decides about its heading, and goes."""
+
+    def __init__(self, world: World) -> None:
+        self.testbed: VirtualTestbed = world.scenario.build()
+        context = self.testbed.default_context()
+        self.testbed.write(context, {WALK: 0.0, MASS: world.mass * self.testbed.read(context, MASS)})
+        self._simulator = self.testbed.simulator(context)
+        self._simulator.AdvanceTo(STANDING)
+
+    def decide(self, reasoner: Reasoner) -> Decision:
+        """Give the one command, to walk, and let the robot decide in which direction, before it makes a step."""
+        context = self._simulator.get_mutable_context()
+        self.testbed.write(context, {WALK: 1.0})
+        return reasoner.decide(self.testbed, context)
+
+    def climb(self, heading: float) -> Climb:
+        """Walk with a heading (rad) until the end, for at most `LONGEST_CLIMB`."""
+        context = self._simulator.get_mutable_context()
+        self.testbed.write(context, {HEADING: heading, WALK: 1.0})
+        begin = context.get_time()
+        status = self._simulator.AdvanceTo(begin + LONGEST_CLIMB)
+        x, y, z = self.testbed.read(context, POSE)[:3]
+        ended = status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition
+        return Climb(
+            heading=heading,
+            reached=ended and PASSED in status.FormatMessage(),
+            elevation=float(z),
+            duration=context.get_time() - begin,
+            distance=float(np.hypot(x, y)),
+        )
+
+
+def passes(rollout: RolloutResult) -> bool:
+    """Return whether the robot passes the rim in a rollout."""
+    return PASSED in rollout.message
+
+
+def explain(
+    scenario: CraterScenario, headings: Sequence[float], *, executor: str = "processes"
+) -> dict[float, list[str]]:
+    """Find out why headings fail: which change of the crater, alone, takes the robot to the rim.
+
+    Args:
+        scenario: the robot's model.
+        headings: in rad.
+        executor: see `Problem.sweep`.
+
+    Returns:
+        For each heading the reasons among `COUNTERFACTUALS`; none means that a single change does not suffice.
+    """
+    problem = heading_problem(scenario)
+    keys = [(heading, name) for name in COUNTERFACTUALS for heading in headings]
+    points = [{HEADING: h, **{f"scenario.{k}": v for k, v in COUNTERFACTUALS[name].items()}} for h, name in keys]
+    with make_executor(executor, testbed=problem.testbed, rollouts=len(points)) as workers:
+        results = run_rollouts(workers, problem.task, points, description="counterfactuals")
+    reasons: dict[float, list[str]] = {heading: [] for heading in headings}
+    for (heading, name), result in zip(keys, results, strict=True):
+        if result is not None and passes(result):
+            reasons[heading].append(name)
+    return reasons
+
+
+@dataclass(frozen=True)
+class Case:
+    """One crater: what the robot decided, and what came of it.
+
+    Attributes:
+        seed: of the crater.
+        decision: the robot's.
+        climb: what came of it in the world; None if the robot saw no way to the rim.
+    """
+
+    seed: int
+    decision: Decision
+    climb: Climb | None
+
+    @property
+    def passable(self) -> dict[float, bool]:
+        """Return for each heading that was tried (rad) whether it passes the rim in the robot's mind."""
+        tried = [candidate for candidate in self.decision.candidates if candidate.rollouts]
+        return {float(c.values[HEADING]): passes(c.rollouts[0]) for c in tried}
+
+
+def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
+    """Let the robot decide in the crater ``seed`` and walk in a world that differs.
+
+    Args:
+        seed: of the crater.
+        difference: of the world, see `differing`.
+        options: of `heading_reasoner`.
+    """
+    expedition = Expedition(differing(seed, difference))
+    with heading_reasoner(model(seed), **options) as reasoner:
+        decision = expedition.decide(reasoner)
+    promising = decision.chosen is not None and passes(decision.candidates[decision.chosen].rollouts[0])
+    return Case(seed, decision, expedition.climb(float(decision.values[HEADING])) if promising else None)

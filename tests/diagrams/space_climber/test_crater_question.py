@@ -1,0 +1,73 @@
+"""Question R1: the robot decides from its belief, and worlds differ from its model; short horizons."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vtbdrake.rollout import RolloutRunner
+from vtbdrake_diagrams.space_climber import CraterScenario
+from vtbdrake_diagrams.space_climber.crater import (
+    CAUTION,
+    COUNTERFACTUALS,
+    FRICTION_RANGE,
+    HEADING,
+    HEADINGS,
+    MASS_RANGE,
+    POSE,
+    STANDING,
+    WALK,
+    Expedition,
+    World,
+    differing,
+    elevation,
+    heading_problem,
+    heading_reasoner,
+    model,
+)
+
+
+def test_f_is_the_elevation() -> None:
+    assert [elevation(z) for z in (0.2, 6.2, -1.0)] == [0.2, 6.2, 0.0]
+
+
+def test_worlds_differ_within_what_the_robot_expects() -> None:
+    worlds = [differing(seed, difference) for seed in range(4) for difference in range(20)]
+    frictions = [world.scenario.friction / CraterScenario().friction for world in worlds]
+    masses = [world.mass for world in worlds]
+    for found, (lower, upper) in ((frictions, FRICTION_RANGE), (masses, MASS_RANGE)):
+        assert lower <= min(found) < lower + 0.02
+        assert upper - 0.02 < max(found) <= upper
+    assert differing(2, 3) == differing(2, 3)
+    assert differing(2, 3) != differing(2, 4)
+    assert model(2).friction == pytest.approx(CAUTION * CraterScenario().friction)
+    assert model(2).mental().roughness == 0.0
+    for fields in COUNTERFACTUALS.values():
+        model(2).with_fields(fields)
+
+
+def test_the_robot_decides_while_it_stands_in_a_world_that_differs() -> None:
+    world = World(CraterScenario(seed=1, boulders=False, roughness=0.03, friction=0.55), mass=1.05)
+    expedition = Expedition(world)
+    scenario = replace(model(1), boulders=False)
+    with heading_reasoner(scenario, horizon=4.0, executor="serial") as reasoner:
+        decision = expedition.decide(reasoner)
+        angles = sorted(float(candidate.values[HEADING]) for candidate in decision.candidates)
+    np.testing.assert_allclose(angles, HEADINGS, atol=1e-12)
+    assert decision.time == pytest.approx(STANDING)
+    assert decision
+    # The floor is flat: the torso's height.
+    assert decision.quality == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_mental_robot_walks_in_the_direction_of_its_heading() -> None:
+    problem = heading_problem(replace(model(1), boulders=False))
+    task = replace(problem.task, horizon=14.0, record=(POSE,))
+    runner = RolloutRunner(task, problem.testbed)
+    poses = {angle: runner.run({HEADING: angle, WALK: 1.0}).record[POSE] for angle in (-0.5, 0.4)}
+    for angle, pose in poses.items():
+        way = pose[-1, :2] - pose[len(pose) // 2, :2]
+        assert np.arctan2(way[1], way[0]) == pytest.approx(angle, abs=0.1)
+        assert np.hypot(*way) == pytest.approx(0.19 * 6.0, rel=0.15)
