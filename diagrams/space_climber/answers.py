@@ -23,6 +23,8 @@ from vtbdrake_diagrams.space_climber.payload import (
 
 # How far simulated and static limit of the locked robot may be apart, in kg: the step at which masses were tried.
 LOCKED_STEP = 1.0
+# From how many samples of its belief the robot in the crater tries each heading.
+SAMPLES = 3
 
 
 def payload(full: bool) -> Answer:
@@ -80,7 +82,7 @@ def heading(full: bool) -> Answer:
     The short version decides among the paper's discrete headings in 10 craters, each in a world that differs from the
     robot's model. The long one takes 20, explains the failures in each, and decides by a continuous search, too.
     """
-    cases = [crater.decide_and_climb(seed, difference=seed) for seed in range(20 if full else 10)]
+    cases = [crater.decide_and_climb(seed, difference=seed, samples=SAMPLES) for seed in range(20 if full else 10)]
     answered = [case for case in cases if case.climb is not None]
     reached = [case for case in answered if case.climb is not None and case.climb.reached]
     first = cases[0]
@@ -90,7 +92,7 @@ def heading(full: bool) -> Answer:
     ]
     if full:
         searched = [
-            crater.decide_and_climb(case.seed, difference=case.seed, method="CEM", rollouts=4 * crater.HEADINGS.size)
+            crater.decide_and_climb(case.seed, difference=case.seed, method="CEM", candidates=24, samples=SAMPLES)
             for case in cases
         ]
         notes.append(f"continuous search: {'; '.join(_climb(case) for case in searched)}")
@@ -122,7 +124,5 @@ def _climb(case: crater.Case) -> str:
 def _reasons(case: crater.Case) -> str:
     failing = [angle for angle, passes in sorted(case.passable.items()) if not passes]
     reasons = crater.explain(crater.model(case.seed), failing)
-    texts = [
-        f"{np.degrees(angle):.0f} deg {' or '.join(found) or 'several at once'}" for angle, found in reasons.items()
-    ]
+    texts = [f"{np.degrees(angle):.0f} deg {' or '.join(found) or 'unexplained'}" for angle, found in reasons.items()]
     return f"crater {case.seed}: {', '.join(texts)}"

@@ -5,13 +5,15 @@ infinite, and t_m is 300 s. The robot asks its own testbed: the rollouts begin a
 
 The world differs from the map, see `differing`: its ground is rough, its friction and the robot's mass are others.
 Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
-that no heading counts as passable which only is with good luck.
+that no heading counts as passable which only is with good luck. Among boulders a decimeter decides; so each heading can
+be tried from several samples of the belief, of which the worst counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -49,9 +51,11 @@ STANDING = 2.0
 FRICTION_RANGE = (0.9, 1.1)
 MASS_RANGE = (0.9, 1.1)
 ROUGHNESS = 0.03
+# Of the believed pose: standard deviations of x and y in m, and of yaw in rad.
+POSE_UNCERTAINTY = (0.1, 0.1, 0.0, 0.0, 0.0, 0.02)
 CAUTION = FRICTION_RANGE[0]
 
-# Why a heading fails: the change of the scenario's fields with which it would not.
+# A reason for which a heading may fail -> the change of the scenario's fields that takes it away.
 COUNTERFACTUALS: dict[str, Mapping[str, Any]] = {
     "too steep for its friction": {"friction": 1.2},
     "boulders": {"boulders": False},
@@ -93,26 +97,35 @@ def differing(seed: int, difference: int) -> World:
 
 
 def heading_reasoner(
-    scenario: CraterScenario, *, method: str = "grid", rollouts: int = HEADINGS.size + 1, **options: Any
+    scenario: CraterScenario, *, method: str = "grid", candidates: int = HEADINGS.size, samples: int = 1, **options: Any
 ) -> Reasoner:
     """Return the reasoner of the robot, which decides its heading.
 
     Args:
         scenario: the robot's model.
         method: ``grid`` for the discrete headings of the paper, or another method for a continuous search.
-        rollouts: the budget; the plan in use, heading 0, counts too, although the grid need not try it again.
+        candidates: how many headings are tried, beside the plan in use.
+        samples: how many samples of the belief each is tried from; with more than one, pose and mass are uncertain.
         options: of `Reasoner`.
     """
+    given: dict[str, Any] = {"horizon": HORIZON, "sample_period": SAMPLE_PERIOD}
     if method == "grid":
-        options = {"options": {"points": HEADINGS.size}, **options}
+        given["options"] = {"points": candidates}
+    if samples > 1:
+        given["uncertainty"] = {POSE: POSE_UNCERTAINTY, MASS: _uncertain_mass}
     return Reasoner(
         scenario=scenario,
         decision=[vtb.Parameter(HEADING, -LIMIT, LIMIT)],
         quality=vtb.Quality(elevation, of=ELEVATION),
-        budget=Budget(rollouts=rollouts),
+        budget=Budget(rollouts=(candidates + 1) * samples),
         method=method,
-        **{"horizon": HORIZON, "sample_period": SAMPLE_PERIOD, **options},
+        samples=samples,
+        **{**given, **options},
     )
+
+
+def _uncertain_mass(believed: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return believed * rng.uniform(*MASS_RANGE)
 
 
 def heading_problem(scenario: CraterScenario) -> vtb.Problem:
@@ -186,7 +199,9 @@ def passes(rollout: RolloutResult) -> bool:
 def explain(
     scenario: CraterScenario, headings: Sequence[float], *, executor: str = "processes"
 ) -> dict[float, list[str]]:
-    """Find out why headings fail: which change of the crater, alone, takes the robot to the rim.
+    """Find out why headings fail: which change of the crater takes the robot to the rim.
+
+    Single changes are tried first; where none suffices, pairs of them, and then all three.
 
     Args:
         scenario: the robot's model.
@@ -194,18 +209,26 @@ def explain(
         executor: see `Problem.sweep`.
 
     Returns:
-        For each heading the reasons among `COUNTERFACTUALS`; none means that a single change does not suffice.
+        For each heading the reasons among `COUNTERFACTUALS`; several that count together are one, joined by "and". An
+        empty list means that not even all changes suffice.
     """
     problem = heading_problem(scenario)
-    keys = [(heading, name) for name in COUNTERFACTUALS for heading in headings]
-    points = [{HEADING: h, **{f"scenario.{k}": v for k, v in COUNTERFACTUALS[name].items()}} for h, name in keys]
-    with make_executor(executor, testbed=problem.testbed, rollouts=len(points)) as workers:
-        results = run_rollouts(workers, problem.task, points, description="counterfactuals")
     reasons: dict[float, list[str]] = {heading: [] for heading in headings}
-    for (heading, name), result in zip(keys, results, strict=True):
-        if result is not None and passes(result):
-            reasons[heading].append(name)
+    tries = len(reasons) * len(COUNTERFACTUALS)
+    with make_executor(executor, testbed=problem.testbed, rollouts=tries) as workers:
+        for size in range(1, len(COUNTERFACTUALS) + 1):
+            open_ = [heading for heading, found in reasons.items() if not found]
+            keys = [(names, heading) for names in combinations(COUNTERFACTUALS, size) for heading in open_]
+            points = [{HEADING: heading, **_changed(names)} for names, heading in keys]
+            results = run_rollouts(workers, problem.task, points, description="counterfactuals")
+            for (names, heading), result in zip(keys, results, strict=True):
+                if result is not None and passes(result):
+                    reasons[heading].append(" and ".join(names))
     return reasons
+
+
+def _changed(names: Sequence[str]) -> dict[str, Any]:
+    return {f"scenario.{field}": value for name in names for field, value in COUNTERFACTUALS[name].items()}
 
 
 @dataclass(frozen=True)
@@ -226,7 +249,7 @@ class Case:
     def passable(self) -> dict[float, bool]:
         """Return for each heading that was tried (rad) whether it passes the rim in the robot's mind."""
         tried = [candidate for candidate in self.decision.candidates if candidate.rollouts]
-        return {float(c.values[HEADING]): passes(c.rollouts[0]) for c in tried}
+        return {float(c.values[HEADING]): all(map(passes, c.rollouts)) for c in tried}
 
 
 def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
@@ -240,5 +263,5 @@ def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
     expedition = Expedition(differing(seed, difference))
     with heading_reasoner(model(seed), **options) as reasoner:
         decision = expedition.decide(reasoner)
-    promising = decision.chosen is not None and passes(decision.candidates[decision.chosen].rollouts[0])
+    promising = decision.chosen is not None and all(map(passes, decision.candidates[decision.chosen].rollouts))
     return Case(seed, decision, expedition.climb(float(decision.values[HEADING])) if promising else None)
