@@ -10,14 +10,13 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-from tests.reasoning.scenarios import MassScenario
 from tests.testbeds import PENDULUM, AcrobotScenario
 from vtbdrake.components.sensors import JointEncoders
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.reasoning import Belief, BeliefError, Starter
 from vtbdrake.rollout import ProcessExecutor, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
 from vtbdrake.state import discrete_state
-from vtbdrake.testbed import DpsAlone, Interface, Signal
+from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 THETA, OMEGA = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
@@ -54,7 +53,7 @@ class Tracker(LeafSystem):
 
 
 @dataclass
-class TrackedScenario(MassScenario):
+class TrackedScenario(Scenario):
     """A swinging pendulum whose encoder is late, and a DPS that tracks it."""
 
     latency: int = 3
@@ -307,7 +306,7 @@ def test_an_old_belief_is_refused(tracked):
 
 
 def test_a_world_without_rules_is_refused():
-    testbed = MassScenario().build()
+    testbed = AcrobotScenario().build()
     with pytest.raises(BeliefError, match="declare them with VirtualTestbedBuilder.believe"):
         Belief.of(testbed, testbed.default_context()).start(testbed)
 
