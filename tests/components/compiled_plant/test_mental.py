@@ -13,8 +13,9 @@ from vtbdrake.components.sensors import JointEncoders, JointTachometers
 from vtbdrake.rollout import Quality
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.decision import cost
 from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES
-from vtbdrake_diagrams.cart_pole.swing_up import cost, make_reasoner
+from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner
 
 STATE = [f"sim.sys.cart_pole.{joint}.{value}" for value in ("position", "velocity") for joint in JOINT_NAMES]
 
