@@ -114,9 +114,9 @@ def swing_up_on_machine(
 ) -> Swing:
     """Swing up the cart-pole of a machine in a process of its own, over LCM.
 
-    The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: the
-    clock is that of the simulated world. So the result does not depend on what else this computer does, as long as it
-    finds time for some rollouts per decision.
+    The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: no
+    deadline is missed. But a decision takes no more wall time than ``thinking_time`` grants, so that a busy computer
+    finds time for fewer rollouts than ``rollouts``.
 
     Args:
         scenario: The cart-pole.
