@@ -90,7 +90,7 @@ class Decision:
         values: address -> value of the chosen candidate; empty if none is eligible.
         quality: of the chosen candidate, over all samples, in the user's terms; NaN if none is eligible.
         chosen: the number of the chosen candidate; None if none is eligible.
-        candidates: all that were tried; the first is the plan in use.
+        candidates: the plan in use, and all others of which a rollout has finished.
         health: how it was reached.
         end: why it ended: ``rollouts`` or ``time`` (the budget was spent), ``method`` (the method has finished).
         message: the same in a sentence; without a decision, why no candidate is eligible.

@@ -81,6 +81,8 @@ class Thinking:
         self._results: dict[RolloutKey, RolloutResult] = {}
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
+        # The plan in use as a point of the search, if it is one.
+        self._same: Point | None = None
         # The candidates in the order in which they were proposed; the plan in use is the first.
         self._proposed: dict[Point, None] = {KEEP: None}
 
@@ -94,20 +96,23 @@ class Thinking:
 
     def _think(self) -> str:
         """Try candidates; return how the method ended."""
-        reasoner = self._reasoner
-        self._evaluator.evaluate([KEEP])
-        start, known = self._given or self._in_use(), []
+        reasoner, rollouts = self._reasoner, self._budget.rollouts
+        start = self._given or self._in_use()
         if start is not None and same_values(self._values(start), self._held):
-            # To set what is set already changes nothing.
-            self._results |= {(start, sample): self._results[KEEP, sample] for sample in range(reasoner.samples)}
-            known = self._evaluator.evaluate([start])
-        elif start is not None:
-            known = self._try([start])
-        solver = reasoner.solver(self._time, budget=self._affordable(), start=start)
+            self._same = start
+        first = [KEEP] if start is None else [KEEP, start]
+        # The plan in use is never simulated twice.
+        taken = len(first) - (self._same is not None)
+        affordable = None if rollouts is None else rollouts // reasoner.samples - taken
+        known: list[Evaluation] = []
+        if reasoner.task.pruning is not None or (affordable is not None and affordable <= 0):
+            # Otherwise, they keep the workers busy together with the first batch of the method.
+            known, first = self._try(first)[1:], []
+        if affordable is not None and affordable <= 0:
+            raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
+        solver = reasoner.solver(self._time, budget=affordable, start=start)
         try:
-            # They are paid for.
-            solver.tell([replace(evaluation, effort=0.0) for evaluation in known])
-            return self._iterate(solver)
+            return self._iterate(solver, first, known)
         finally:
             solver.close()
 
@@ -122,53 +127,57 @@ class Thinking:
         """Return what a candidate sets, address -> value."""
         return {} if point == KEEP else self._reasoner.space.values(point, self._held, self._time)
 
-    def _iterate(self, solver: Solver) -> str:
+    def _iterate(self, solver: Solver, first: Sequence[Point], known: Sequence[Evaluation]) -> str:
+        """Try what a method asks for; return how it ended.
+
+        Args:
+            solver: the method.
+            first: what is tried together with its first batch; the first of it is not its own.
+            known: evaluations that it is told with its first batch.
+        """
         silent = 0
         while silent < _KNOWN_BATCHES:
             asked = ask_within(solver, self._deadline - time.monotonic())
             if asked is None:
                 raise _BudgetSpentError(TIME, f"{self._time_spent()}, while {solver.name} was thinking")
             points = [self._problem.point(point) for point in asked]
+            before = self._count
+            evaluations = self._try([*first, *points])
             if not points:
                 return f"{solver.name}: {solver.message}"
-            before = self._count
-            solver.tell(self._try(points))
+            given = [*known, *evaluations[1 : len(first)]]
+            # Their rollouts are not charged to the method.
+            solver.tell([*evaluations[len(first) :], *(replace(evaluation, effort=0.0) for evaluation in given)])
+            first, known = [], []
             silent = 0 if self._count > before else silent + 1
         return f"{solver.name} asks for known candidates only"
 
     def _try(self, points: Sequence[Point]) -> list[Evaluation]:
-        count = len(points) if self._reasoner.task.pruning is None else _ROUND
+        count = max(1, len(points)) if self._reasoner.task.pruning is None else _ROUND
         evaluations = []
         for k in range(0, len(points), count):
             now = points[k : k + count]
-            self._proposed |= dict.fromkeys(point for point in now if (point, 0) not in self._results)
+            self._proposed |= dict.fromkeys(p for p in now if (p, 0) not in self._results and p != self._same)
             evaluations += self._evaluator.evaluate(now)
         return evaluations
-
-    def _affordable(self) -> int | None:
-        """Return how many more candidates the budget of rollouts allows; None: any number."""
-        rollouts = self._budget.rollouts
-        if rollouts is None:
-            return None
-        count = (rollouts - self._count) // self._reasoner.samples
-        if count == 0:
-            raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
-        return count
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
         executor, rollouts = self._reasoner.executor, self._budget.rollouts
         if time.monotonic() >= self._deadline:
             raise _BudgetSpentError(TIME, self._time_spent())
-        now = keys if rollouts is None else keys[: rollouts - self._count]
+        new = [key for key in keys if key[0] != self._same]
+        now = new if rollouts is None else new[: rollouts - self._count]
         if now:
             points = [self._values(point) for point, _ in now]
             starts = [self._starts[sample] for _, sample in now]
-            results = executor.run(self._reasoner.task, points, start=starts, **self._cutoff())
-            self._take(results, now)
+            self._take(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), now)
+        if self._same is not None:
+            # To set what is set already changes nothing.
+            kept = {sample: result for (point, sample), result in self._results.items() if point == KEEP}
+            self._results |= {(self._same, sample): result for sample, result in kept.items()}
         if any(key not in self._results for key in now):
             raise _BudgetSpentError(TIME, self._time_spent())
-        if len(now) < len(keys):
-            assert rollouts is not None
+        if len(now) < len(new):
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
 
     def _take(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
@@ -198,7 +207,9 @@ class Thinking:
 
     def _conclude(self, end: str, message: str) -> Decision:
         problem = self._problem
-        candidates = tuple(self._candidate(*item) for item in enumerate(self._proposed))
+        begun = {point for point, _ in self._results} | {KEEP}
+        tried = [point for point in self._proposed if point in begun]
+        candidates = tuple(self._candidate(number, point) for number, point in enumerate(tried))
         eligible = [candidate for candidate in candidates if candidate.status == ELIGIBLE]
         sign = 1.0 if problem.objectives[0].minimize else -1.0
         ranked = sorted(eligible, key=lambda candidate: (sign * candidate.quality, candidate.number))
@@ -263,7 +274,7 @@ class Thinking:
         )
 
 
-def _spent(rollouts: int) -> str:
+def _spent(rollouts: int | None) -> str:
     return f"the budget of {rollouts} rollouts is spent"
 
 
@@ -290,8 +301,5 @@ def _doubts(
         yield f"{len(failures)} of {len(results)} rollouts failed, the first: {failures[0]}"
     if len(candidates) == 1:
         yield "nothing but the plan in use was tried: the budget is too small, or a rollout too slow"
-    unfinished = sum(candidate.status == UNFINISHED for candidate in candidates)
-    if unfinished:
-        yield f"{unfinished} of {len(candidates)} candidates did not finish"
     if len(ranked) > 1 and ranked[0].quality == ranked[-1].quality:
         yield f"all {len(ranked)} eligible candidates are equally good: within the horizon, the quality ignores them"
