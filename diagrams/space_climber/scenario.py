@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from operator import itemgetter
 
 import numpy as np
 from pydrake.geometry import Box, DefaultProximityProperties, SceneGraphConfig
@@ -190,7 +189,7 @@ class SpaceClimberScenario(Scenario):
             "dps.act.joint_position",
         )
         for i, name in enumerate(JOINT_NAMES):
-            builder.believe(f"sim.sys.climber.{name}.position", of=[encoders], by=itemgetter(i))
+            builder.believe(f"sim.sys.climber.{name}.position", of=[f"{encoders}[{i}]"])
             builder.believe(
                 f"sim.sys.climber.{name}.velocity",
                 of=[next_command, command, "dps.act.rate"],

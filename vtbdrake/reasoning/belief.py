@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
@@ -147,9 +147,11 @@ class Starter:
         self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and _resumes(s)}
         self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and _resumes(s)}
         self._targets = [_Target(mental, rule) for rule in mental.belief_rules]
+        self._copied = _Copied([t for t in self._targets if t.is_copy and t.rule.target not in (uncertainty or {})])
+        self._computed = [target for target in self._targets if target not in self._copied.targets]
         self._estimates = {
             address: (variable, mental.dps_layout.slice_of(variable))
-            for target in self._targets
+            for target in self._computed
             for address in target.rule.of
             for variable in [self._variables[address]]
         }
@@ -257,7 +259,7 @@ class Starter:
                 estimates[address] = numbers[place].reshape(variable.shape)
             else:
                 estimates[address] = numbers.item(place.start)
-        return self._prior | {target.rule.target: target.value(estimates) for target in self._targets}
+        return self._prior | {target.rule.target: target.value(estimates) for target in self._computed}
 
     def _continue(self, context: Context, dps: DpsState) -> None:
         context.SetTime(dps.time)
@@ -279,6 +281,7 @@ class Starter:
         context, layout = self._context, self._mental.start_layout
         contents = layout.take(context)
         numbers, rest, later = np.array(contents.numbers), {}, {}
+        self._copied.write(dps.contents.numbers, numbers)
         for address, value in believed.items():
             kind, place = self._kinds[address]
             if place is not None:
@@ -327,7 +330,20 @@ class _Target:
         # An infinite value is within no bounds.
         largest = np.finfo(float).max
         self._least, self._most = np.maximum(lower, -largest), np.minimum(upper, largest)
+        # Where the estimate and the variable lie, if the one is the other.
+        self.source = mental.dps_layout.slice_of(mental.variables()[rule.of[0]]) if rule.by is None else None
+        self.place = mental.start_layout.slice_of(self.variable)
         self._interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
+
+    @property
+    def is_copy(self) -> bool:
+        """Return whether one number, as it lies in the contents of the DPS, is the believed value."""
+        return self.source is not None and self.place is not None and self.variable.shape == ()
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the bounds of a scalar; an infinite value is within none."""
+        return self._interval
 
     def value(self, estimates: Mapping[str, Any]) -> ArrayLike:
         """Return what is believed of the variable, within its bounds.
@@ -354,6 +370,28 @@ class _Target:
                 f"lie in {variable.bounds_text()}"
             )
         return np.clip(believed, self._least, self._most)
+
+
+class _Copied:
+    """Variables that are believed to be an estimate each, such as joint angles: all at once."""
+
+    def __init__(self, targets: Sequence[_Target]) -> None:
+        self.targets = targets
+        self._from = np.array([target.source.start for target in targets if target.source], dtype=int)
+        self._to = np.array([target.place.start for target in targets if target.place], dtype=int)
+        self._least, self._most = np.array([target.interval for target in targets]).reshape(-1, 2).T
+
+    def write(self, estimates: np.ndarray, numbers: np.ndarray) -> None:
+        """Write what is believed into the numbers of a start.
+
+        Raises:
+            BeliefError: A value is missing, or lies beyond the bounds.
+        """
+        values = estimates[self._from]
+        if not ((values >= self._least) & (values <= self._most)).all():
+            told = zip(self.targets, values.tolist(), strict=True)
+            values = np.array([target.value({target.rule.of[0]: value}) for target, value in told])
+        numbers[self._to] = values
 
 
 def _resume(system: System, root: Context, value: Any) -> None:
