@@ -143,6 +143,8 @@ class Starter:
         self._seed = seed
         self._variables = mental.variables()
         self._context = mental.default_context()
+        self._default = mental.start_layout.take(self._context)
+        self._dps = mental.dps_layout.indices_in(mental.start_layout)
         vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
         self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and _resumes(s)}
         self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and _resumes(s)}
@@ -241,16 +243,18 @@ class Starter:
             )
 
     def _believed(self, dps: DpsState) -> dict[str, ArrayLike]:
-        """Let the mental DPS continue from ``dps``, and return what it believes, by address."""
+        """Return what a DPS believes that is not a mere copy of an estimate, by address."""
         if not self._targets:
             raise BeliefError(
                 f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
                 "declare them with VirtualTestbedBuilder.believe, or take Belief.perfect"
             )
-        self._continue(self._context, dps)
+        self._check_dps(dps)
         for name in self._sensors:
             if name not in dps.received:
                 raise BeliefError(f"the DPS has not received {name} yet, so that it does not know its world")
+        if None in [place for _, place in self._estimates.values()]:
+            self._mental.dps_layout.put(self._context, dps.contents)
         numbers, estimates = dps.contents.numbers, {}
         for address, (variable, place) in self._estimates.items():
             if place is None:
@@ -261,12 +265,10 @@ class Starter:
                 estimates[address] = numbers.item(place.start)
         return self._prior | {target.rule.target: target.value(estimates) for target in self._computed}
 
-    def _continue(self, context: Context, dps: DpsState) -> None:
-        context.SetTime(dps.time)
+    def _check_dps(self, dps: DpsState) -> None:
         try:
-            self._mental.dps_layout.put(context, dps.contents)
-            self._variables.write(context, self._commands(dps))
-        except (LayoutError, VariableError) as error:
+            self._mental.dps_layout.check(dps.contents)
+        except LayoutError as error:
             raise BeliefError(
                 f"the DPS that believes does not fit that of the mental scenario {self._mental.scenario!r}: {error}"
             ) from error
@@ -277,10 +279,10 @@ class Starter:
         return {address: value for address, value in commands.items() if address in self._variables}
 
     def _start(self, dps: DpsState, believed: Mapping[str, ArrayLike]) -> Start:
-        """Return the start of a world that is as believed, in which the DPS has been set already."""
-        context, layout = self._context, self._mental.start_layout
-        contents = layout.take(context)
-        numbers, rest, later = np.array(contents.numbers), {}, {}
+        """Return the start of a world that is as believed, in which the DPS goes on."""
+        context, layout, commands = self._context, self._mental.start_layout, self._commands(dps)
+        numbers, rest, later = np.array(self._default.numbers), {}, {}
+        numbers[self._dps] = dps.contents.numbers
         self._copied.write(dps.contents.numbers, numbers)
         for address, value in believed.items():
             kind, place = self._kinds[address]
@@ -290,9 +292,12 @@ class Starter:
                 later[address] = value
             else:
                 rest[address] = value
-        layout.put(context, replace(contents, numbers=numbers))
+        context.SetTime(dps.time)
+        abstract = {**self._default.abstract, **dps.contents.abstract}
+        layout.put(context, replace(self._default, numbers=numbers, abstract=abstract))
         try:
-            self._variables.write(context, rest)
+            # The commands matter here to actuators alone.
+            self._variables.write(context, rest | commands if self._actuators else rest)
         except VariableError as error:
             raise BeliefError(f"the world cannot be as it is believed to be: {error}") from error
         for name, sensor in self._sensors.items():
@@ -300,15 +305,17 @@ class Starter:
         own = self._mental.dps.GetMyContextFromRoot(context)
         for name, actuator in self._actuators.items():
             _resume(actuator, context, self._mental.dps.GetOutputPort(name).Eval(own))
-        return Start(dps.time, layout.take(context), {**self._commands(dps), **later})
+        return Start(dps.time, layout.take(context), {**commands, **later})
 
     def _perfect(self, dps: DpsState, world: World) -> Start:
         hidden = {a: value for a, value in world.values.items() if a in self._variables and self._variables[a].hidden}
         values = {**self._commands(dps), **hidden}
         if world.contents.names == self._mental.whole_layout.names:
             return Start(dps.time, world.contents, values)
+        self._check_dps(dps)
         context = self._mental.default_context()
-        self._continue(context, dps)
+        context.SetTime(dps.time)
+        self._mental.dps_layout.put(context, dps.contents)
         shapes = {v.address: v.shape for v in self._variables.values() if not v.derived}
         alike = {a: value for a, value in world.values.items() if shapes.get(a) == np.shape(value)}
         try:

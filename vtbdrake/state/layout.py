@@ -54,7 +54,8 @@ class StateLayout:
     def __init__(self, diagram: Diagram, *, state: Callable[[str], bool], parameters: Callable[[str], bool]) -> None:
         self._groups: list[tuple[System, list[tuple[str, int, slice]]]] = []
         self._abstract: list[tuple[str, System, AbstractState]] = []
-        names, start = [], 0
+        self._slices: dict[str, slice] = {}
+        start = 0
         for path, system in leaves(diagram):
             if is_scene_graph(system) or is_camera(system) or not (state(path) or parameters(path)):
                 continue
@@ -68,14 +69,19 @@ class StateLayout:
             for group, index in ((group, index) for group, count in counts.items() for index in range(count)):
                 size = group_size(context, group, index)
                 groups.append((group, index, slice(start, start + size)))
-                names.append(f"{path}/{group}/{index} ({size})")
+                self._slices[f"{path}/{group}/{index} ({size})"] = groups[-1][-1]
                 start += size
             if groups:
                 self._groups.append((system, groups))
             if state(path) and (codecs := abstract_state(path, system, context)):
                 self._abstract.append((path, system, codecs))
-        self.names = (*names, *(f"{path}/abstract" for path, _, _ in self._abstract))
+        self.names = (*self._slices, *(f"{path}/abstract" for path, _, _ in self._abstract))
         self.size = start
+
+    def indices_in(self, whole: StateLayout) -> np.ndarray:
+        """Return where in the numbers of a layout that holds this one the numbers of this one lie, shape (size,)."""
+        places = [whole._slices[name] for name in self._slices]
+        return np.concatenate([np.arange(place.start, place.stop) for place in places] or [np.arange(0)])
 
     def slice_of(self, variable: Variable) -> slice | None:
         """Return where in the numbers the value of a variable lies, in C order; None if it does not lie there."""
