@@ -78,8 +78,9 @@ def test_part_is_refused_by_name(change, reason):
         plant_dynamics(plant, plant.CreateDefaultContext())
 
 
-def test_locked_joint_is_refused_by_name():
-    plant = cart_pole(0.01)
+@pytest.mark.parametrize("time_step", [0.0, 0.01])
+def test_locked_joint_is_refused_by_name(time_step):
+    plant = cart_pole(time_step)
     context = plant.CreateDefaultContext()
     plant.GetJointByName("hinge").Lock(context)
     with pytest.raises(UnsupportedPlantError, match="the joint hinge is locked"):

@@ -255,7 +255,7 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
         joint = plant.get_joint(index)
         if joint.type_name() not in (REVOLUTE, PRISMATIC, WELD, FLOATING):
             yield f"the joint {joint.name()} is of type {joint.type_name()}"
-        elif joint.num_velocities() and plant.time_step() > 0.0 and joint.is_locked(context):
+        elif joint.is_locked(context):
             yield f"the joint {joint.name()} is locked"
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
