@@ -7,11 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ZeroOrderHold
 
 from tests.reasoning.pusher import CANDIDATE, PERIOD, PLANNER, STATE, PusherScenario
+from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.optimization import Parameter
 from vtbdrake.pickling import dumps
-from vtbdrake.reasoning import Budget, OnboardReasoner
+from vtbdrake.reasoning import Budget, OnboardReasoner, Trajectory
 from vtbdrake.rollout import Quality, RolloutTask, Start
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.testbed import DpsAlone
@@ -154,6 +157,55 @@ def test_copy_that_thinks_decides_alike():
     assert not other.snapshot(copy).compare(testbed.snapshot(context))
     assert planner(other, copy)["valid"] == 1.0
     assert pickle.loads(dumps(part.function))
+
+
+@dataclass
+class PlanScenario(PusherScenario):
+    """The force is a plan, decided every 0.1 s."""
+
+    every: float = 0.1
+    latency: float = 0.1
+
+    def make_dps(self):
+        plan = Trajectory(CANDIDATE, 4, 1.0, "linear", lower=-5.0, upper=5.0)
+        builder = DiagramBuilder()
+        reasoner = OnboardReasoner(
+            5,
+            scenario=self,
+            decision=[plan],
+            quality=Quality(distance, of=[STATE], reading="integral", minimize=True),
+            horizon=1.0,
+            budget=Budget(rollouts=8),
+            period=self.every,
+            latency=self.latency,
+            believed={"state": 2},
+            mental=not self.reasons,
+            options={"method": "predictive-sampling"},
+        )
+        planner = builder.AddNamedSystem("planner", reasoner)
+        follow = builder.AddNamedSystem("follow", SplineCommand(plan.spline, period=PERIOD, after=0.0))
+        goal = builder.AddNamedSystem("goal", ZeroOrderHold(PERIOD, 1))
+        builder.ExportInput(planner.GetInputPort("state"), "state")
+        builder.ExportInput(goal.get_input_port(), "goal")
+        builder.Connect(planner.GetOutputPort("decision"), follow.GetInputPort("plan"))
+        builder.ExportOutput(follow.GetOutputPort("value"), "force")
+        return builder.Build()
+
+
+def distance(state):
+    return (state[0] - GOAL) ** 2 + 0.1 * state[1] ** 2
+
+
+def test_plan_that_is_decided_anew_comes_to_the_goal():
+    testbed, simulator, context = asked(PlanScenario())
+    simulator.AdvanceTo(1.35)
+    plan = testbed.read(context, f"{PLANNER}.decision")
+    # It begins at a sample, and is followed from when it is shown.
+    assert testbed.read(context, f"{PLANNER}.sampled_at") == pytest.approx(1.2) and plan[0] <= 1.2 + 1e-9
+    weights = Trajectory(CANDIDATE, 4, 1.0, "linear", lower=-5.0, upper=5.0).values(plan[1:], [1.34 - plan[0]])
+    assert testbed.read(context, "dps.follow.value") == pytest.approx(weights.item())
+    # Without a force, it would be at -0.3 m.
+    assert testbed.read(context, STATE)[0] == pytest.approx(GOAL, abs=0.2)
 
 
 @dataclass
