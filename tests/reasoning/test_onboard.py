@@ -129,6 +129,7 @@ def test_without_an_eligible_candidate_the_plan_stays_and_the_dps_falls_back(cap
     testbed.write(context, {"u.request": 2.0})
     simulator.AdvanceTo(SAMPLED + 2.0 * HORIZON)
     assert planner(testbed, context)["missed"] == 2.0
+    assert caplog.text.count("nothing was decided") == 1
 
 
 def test_what_cannot_be_believed_is_no_ground_for_a_decision(caplog):

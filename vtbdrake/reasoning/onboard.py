@@ -189,6 +189,7 @@ class _Thinker:
         self._seconds, self._niceness = seconds, niceness
         self._budget: Budget = replace(self._arguments["budget"], seconds=None)
         self._reasoner: Reasoner | None = None
+        self._last_reason = ""
         self._taking_turns = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -217,11 +218,13 @@ class _Thinker:
             assert self._reasoner is not None
             try:
                 decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget)
+                reason = "" if decision else decision.message
             except BeliefError as error:
-                _log.warning("nothing was decided at t = %g s: %s", dps.time, error)
-                return None
-            if not decision:
-                _log.warning("nothing was decided at t = %g s: %s", dps.time, decision.message)
+                reason = str(error)
+            if reason and reason != self._last_reason:  # Once, not with every sample.
+                _log.warning("nothing was decided at t = %g s: %s", dps.time, reason)
+            self._last_reason = reason
+            if reason:
                 return None
             # What is decided may be some entries only.
             decision.apply(self._testbed, self._context)
