@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from tests.reasoning.scenarios import HANG, KILL, MassScenario, SwingUpScenario
 from vtbdrake.optimization import Choice, Parameter
 from vtbdrake.reasoning import Belief, Budget, Reasoner, ReasonerError
-from vtbdrake.rollout import Constraint, Pruning, Quality
+from vtbdrake.rollout import Constraint, ProcessExecutor, Pruning, Quality, SerialExecutor, ThreadExecutor
 from vtbdrake.testbed import DpsAlone
 
 SWITCH = Parameter("u.switch", 0.0, 3.0)
@@ -40,6 +40,13 @@ def make(scenario=None, **changes):
 @pytest.fixture(scope="module")
 def mass():
     return MassScenario().build()
+
+
+@pytest.fixture(scope="module")
+def executors():
+    """By name; a process takes a second to start."""
+    with SerialExecutor() as serial, ThreadExecutor(2) as threads, ProcessExecutor(2) as processes:
+        yield {"serial": serial, "threads": threads, "processes": processes}
 
 
 def decide(reasoner, testbed, *, values=None, at=0.0, **options):
@@ -187,11 +194,11 @@ def test_decisions_at_other_times_try_other_candidates(mass):
     assert not set(tried(0.0)) & set(tried(0.02))
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
-def test_all_executors_give_the_same_decision(executor, mass):
+@pytest.mark.parametrize("name", ["threads", "processes"])
+def test_all_executors_give_the_same_decision(name, executors, mass):
     serial, other = (
-        decide(make(executor=name, workers=workers, budget=Budget(rollouts=20)), mass, at=0.3)
-        for name, workers in (("serial", None), (executor, 2))
+        decide(make(executor=executor, budget=Budget(rollouts=20)), mass, at=0.3)
+        for executor in ("serial", executors[name])
     )
     assert other.values == serial.values
     assert other.quality == serial.quality
@@ -199,11 +206,10 @@ def test_all_executors_give_the_same_decision(executor, mass):
     assert all(a.rollouts[0].identical(b.rollouts[0]) for a, b in zip(other.candidates, serial.candidates, strict=True))
 
 
-@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
-def test_when_the_time_is_over_rollouts_under_way_are_cancelled(executor, mass):
+@pytest.mark.parametrize("name", ["serial", "threads", "processes"])
+def test_when_the_time_is_over_rollouts_under_way_are_cancelled(name, executors, mass):
     # A rollout of a million samples takes longer than any budget of the test.
-    workers = None if executor == "serial" else 2
-    reasoner = make(horizon=1e4, sample_period=0.01, executor=executor, workers=workers, budget=Budget(seconds=0.05))
+    reasoner = make(horizon=1e4, sample_period=0.01, executor=executors[name], budget=Budget(seconds=0.05))
     decision = decide(reasoner, mass)
     assert not decision
     assert decision.end == "time"
@@ -245,7 +251,7 @@ def test_workers_that_die_or_hang_make_a_decision_poor(mass):
         assert "its worker process died (exit code -9)" in messages[KILL]
         assert "longer than its time limit" in messages[HANG]
         # In the budget of time that is left for one that hangs, it is ended, too.
-        decision = reasoner.decide(belief, budget=Budget(seconds=2.0))
+        decision = reasoner.decide(belief, budget=Budget(seconds=0.5))
         assert decision.end == "time"
         assert not any(c.status == "eligible" for c in decision.candidates if c.values["u.switch"] == HANG)
         assert reasoner.decide(belief, budget=Budget(rollouts=1))
@@ -317,12 +323,9 @@ def test_patience_ends_a_rollout_that_gains_nothing(mass):
     assert decision.candidates[0].quality == pytest.approx(0.25, abs=1e-6)
 
 
-def test_pruning_gives_the_same_decision_in_processes(mass):
+def test_pruning_gives_the_same_decision_in_processes(executors, mass):
     settings = {"quality": HIGHEST, "sample_period": 0.1, "pruning": Pruning(bound=lambda left: 4.5, patience=1.0)}
-    serial, other = (
-        decide(make(**settings, **places), mass)
-        for places in ({"executor": "serial"}, {"executor": "processes", "workers": 2})
-    )
+    serial, other = (decide(make(**settings, executor=executors[name]), mass) for name in ("serial", "processes"))
     assert [c.rollouts[0].end for c in serial.candidates] == [c.rollouts[0].end for c in other.candidates]
     assert serial.values == other.values
 
@@ -391,6 +394,24 @@ def test_uncertain_beliefs_are_judged_by_the_risk(mass):
     ]
     assert worst.health.rollouts == 9
     assert worst.health.spread > 0.0
+
+
+def test_a_wrong_belief_costs_as_much_as_it_is_wrong_and_the_spread_warns_of_it(mass):
+    context = mass.default_context()
+    mass.write(context, {"dps.estimate": [0.36, 0.0]})  # It is at 0.
+    settings = {"method": "grid", "options": {"points": 31}, "budget": Budget(rollouts=32 * 4)}
+    with make(**settings) as reasoner:
+        decision = reasoner.decide(mass, context)
+    # From 0.36 m it has 0.8^2 m to go.
+    assert decision.values["u.switch"] == pytest.approx(0.8)
+    assert decision.quality == pytest.approx(0.0, abs=1e-9)
+    uncertainty = {"sim.sys.mass.discrete_state_0": [0.36, 0.0]}
+    with make(**settings, samples=4, uncertainty=uncertainty) as reasoner:
+        assert reasoner.decide(mass, context).health.spread > 0.05
+    decision.apply(mass, context)
+    simulator = mass.simulator(context)
+    simulator.AdvanceTo(3.0)
+    assert distance(mass.read(context, STATE)) == pytest.approx(0.36, abs=1e-9)
 
 
 def test_without_a_context_there_is_no_decision(mass):
