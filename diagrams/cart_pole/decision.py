@@ -26,14 +26,14 @@ def plan_of(scenario: CartPoleScenario, address: str) -> Trajectory:
     return Trajectory(address, scenario.knots, scenario.duration, scenario.order, lower=-limit, upper=limit)
 
 
-def reasoning(scenario: CartPoleScenario, address: str, *, rollouts: int) -> dict[str, Any]:
+def reasoning(scenario: CartPoleScenario, address: str, budget: Budget) -> dict[str, Any]:
     """Return the arguments of a `Reasoner` that decides the plan at ``address``; the horizon is that of the plan."""
     return {
         "decision": [plan_of(scenario, address)],
         "quality": Quality(cost, of="plant.state", reading="integral", minimize=True),
         "horizon": scenario.duration,
         "sample_period": 2.0 * scenario.period,
-        "budget": Budget(rollouts=rollouts),
+        "budget": budget,
         "method": "predictive-sampling",
         "options": {"sigma": 0.3},
     }

@@ -25,6 +25,9 @@ from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES
 if TYPE_CHECKING:
     from vtbdrake.reasoning import OnboardReasoner
 
+# In lock-step, the longest wall time of a decision, in seconds.
+_PATIENCE = 10.0
+
 
 def _plant(time_step: float) -> MultibodyPlantConfig:
     # Unsampled: else, a step of the plant comes before the sensors of the same instant.
@@ -56,6 +59,8 @@ class CartPoleScenario(Scenario):
     thinking_period: float = 0.06
     thinking_time: float = 0.06
     rollouts: int = 20
+    # Whether the machine waits, so that a decision on board may take longer than thinking_time by the wall clock.
+    lock_step: bool = False
     # Errors of the sensors, exact by default; latency in periods.
     position_errors: ErrorModel = field(default_factory=ErrorModel)
     velocity_errors: ErrorModel = field(default_factory=ErrorModel)
@@ -110,7 +115,7 @@ class CartPoleScenario(Scenario):
         carries the plan if it is a command.
         """
         joints = {"joint_position": ("theta1", "theta2"), "joint_velocity": ("theta1Dot", "theta2Dot")}
-        return Deployment(
+        deployment = Deployment(
             protocol=Protocol(
                 sense=[vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp")],
                 act=[vector_map("CART_POLE_FORCE", lcmt_acrobot_u, {"force": "tau"}, stamp="timestamp")],
@@ -120,6 +125,7 @@ class CartPoleScenario(Scenario):
             guards={"fallback": {"force": Zero()}},
             pace="joint_velocity",
         )
+        return deployment.in_lock_step("joint_velocity") if self.lock_step else deployment
 
     def make_dps(self) -> Diagram:
         planner = self._make_planner() if self.onboard else None
@@ -127,10 +133,11 @@ class CartPoleScenario(Scenario):
 
     def _make_planner(self) -> OnboardReasoner:
         # Imported here: without it, the DPS needs no optimization.
-        from vtbdrake.reasoning import OnboardReasoner
+        from vtbdrake.reasoning import Budget, OnboardReasoner
         from vtbdrake_diagrams.cart_pole.decision import reasoning
 
-        arguments = reasoning(self, "dps.planner.candidate", rollouts=self.rollouts)
+        budget = Budget(rollouts=self.rollouts, seconds=_PATIENCE if self.lock_step else None)
+        arguments = reasoning(self, "dps.planner.candidate", budget)
         named = {name: arguments.pop(name) for name in ("decision", "quality", "horizon", "budget")}
         return OnboardReasoner(
             1 + self.knots,
@@ -138,7 +145,7 @@ class CartPoleScenario(Scenario):
             period=self.thinking_period,
             latency=self.thinking_time,
             # Late is better than a new worker, whose start takes some seconds.
-            patience=5.0 / self.thinking_time,
+            patience=2.0 * _PATIENCE / self.thinking_time,
             mental=self.is_mental,
             options=arguments,
             **named,

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
-from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
-from vtbdrake.reasoning import Decision, Reasoner
+from vtbdrake.reasoning import Budget, Decision, Reasoner
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.cart_pole.decision import reasoning
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
@@ -34,7 +33,7 @@ def make_reasoner(scenario: CartPoleScenario, *, rollouts: int = 32, **options: 
         rollouts: Budget of a decision.
         options: Further arguments of `Reasoner`, which replace those of `reasoning`.
     """
-    return Reasoner(scenario=scenario, **{**reasoning(scenario, "u.plan", rollouts=rollouts), **options})
+    return Reasoner(scenario=scenario, **{**reasoning(scenario, "u.plan", Budget(rollouts=rollouts)), **options})
 
 
 @dataclass(frozen=True)
@@ -114,27 +113,29 @@ def swing_up_on_machine(
 ) -> Swing:
     """Swing up the cart-pole of a machine in a process of its own, over LCM.
 
-    The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: no
-    deadline is missed. But a decision takes no more wall time than ``thinking_time`` grants, so that a busy computer
-    finds time for fewer rollouts than ``rollouts``.
+    The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: the
+    clock is that of the simulated world, and the result does not depend on what else this computer does.
 
     Args:
         scenario: The cart-pole.
         seconds: Duration in seconds of the machine's world.
         record: A new file in which the loop is recorded, for `vtbdrake.replay`.
     """
+    scenario = replace(scenario, lock_step=True)
     period, states = scenario.period, []
-    with Hub(port=0) as hub, MachineProcess(scenario, hub.url, lock_step=True, period=period):
-        deployment = Deployment.of(scenario).in_lock_step("joint_velocity")
-        with scenario.deploy(hub.url, deployment=deployment, record=record) as runtime:
-            perceived = runtime.target.reader(PERCEIVED)
+    with (
+        Hub(port=0) as hub,
+        MachineProcess(scenario, hub.url, lock_step=True, period=period),
+        scenario.deploy(hub.url, record=record) as runtime,
+    ):
+        perceived = runtime.target.reader(PERCEIVED)
 
-            def cycle_is_done() -> bool:
-                states.append(np.array(perceived(runtime.context)))
-                runtime.slow_parts.wait(_PATIENCE)
-                return False
-
+        def cycle_is_done() -> bool:
+            states.append(np.array(perceived(runtime.context)))
             runtime.slow_parts.wait(_PATIENCE)
-            runtime.take_over()
-            runtime.run(cycles=round(seconds / period), until=cycle_is_done)
+            return False
+
+        runtime.slow_parts.wait(_PATIENCE)
+        runtime.take_over()
+        runtime.run(cycles=round(seconds / period), until=cycle_is_done)
     return Swing(period * np.arange(len(states)), np.array(states))

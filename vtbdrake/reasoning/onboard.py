@@ -66,8 +66,7 @@ class OnboardReasoner(SlowPart):
 
     In a simulation the thinking time is the latency, and the budget is one of rollouts, so that a decision can be
     repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop it thinks in
-    processes of its own, and the budget ends after 0.8 of the latency at the latest; the best candidate by then is the
-    decision.
+    processes of its own, and the budget ends after 0.8 of the latency; the best candidate by then is the decision.
 
     Args:
         size: Entries of the decision.
@@ -76,7 +75,8 @@ class OnboardReasoner(SlowPart):
             (``dps.<path>.candidate``, or one entry ``dps.<path>.candidate[0]``).
         quality: See `Reasoner`.
         horizon: Of a rollout in seconds from t_k on; longer than the latency.
-        budget: Of a decision; it counts rollouts.
+        budget: Of a decision; it counts rollouts. Its seconds, if given, take the place of 0.8 of the latency: more,
+            say, for a machine in lock-step, which waits.
         period, latency, offset, patience: See `SlowPart`. As a decision takes no longer than its latency, the patience
             is short.
         initial: The decision until the first one is made, a scalar or shape (size,).
@@ -199,7 +199,7 @@ class _Thinker:
         """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""
         os.nice(self._niceness)
         budget = self._arguments["budget"]
-        self._budget = replace(budget, seconds=min(budget.seconds or inf, self._seconds))
+        self._budget = replace(budget, seconds=budget.seconds or self._seconds)
         self._make(**self._arguments).warm_up()
 
     def __call__(

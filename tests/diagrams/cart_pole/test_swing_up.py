@@ -75,13 +75,11 @@ def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
 
 
 def test_over_lcm_the_dps_decides_for_a_machine_in_a_process_of_its_own(tmp_path: Path) -> None:
-    # Much time for few rollouts, so that a busy computer finds it, too.
-    scenario = CartPoleScenario(onboard=True, rollouts=3, thinking_time=1.0, thinking_period=1.0, duration=2.0)
-    swing = swing_up_on_machine(scenario, seconds=1.5, record=tmp_path / "swing.lcm")
+    scenario = CartPoleScenario(onboard=True, rollouts=8)
+    swing = swing_up_on_machine(scenario, seconds=0.8, record=tmp_path / "swing.lcm")
     assert swing.tilt[0] == pytest.approx(np.pi)
     # Without decisions there is no force, and the pole hangs still.
-    assert swing.tilt[: round(1.0 / scenario.period)].min() == pytest.approx(np.pi)
-    assert swing.tilt.min() < np.pi - 1e-3
+    assert swing.tilt.min() < np.pi - 0.02
     assert vtb.replay(tmp_path / "swing.lcm").identical
 
 
