@@ -228,7 +228,7 @@ def test_a_budget_of_time_gives_the_best_so_far(mass):
 
 def test_of_two_budgets_the_one_that_ends_first_counts(mass):
     decision = decide(make(budget=Budget(rollouts=4, seconds=1e4)), mass)
-    assert (decision.end, decision.health.rollouts) == ("method", 4)
+    assert (decision.end, decision.health.rollouts) == ("rollouts", 4)
 
 
 def test_a_decision_may_have_a_budget_of_its_own(mass):

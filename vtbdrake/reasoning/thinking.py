@@ -135,7 +135,7 @@ class Thinking:
             first: what is tried together with its first batch; the first of it is not its own.
             known: evaluations that it is told with its first batch.
         """
-        silent = 0
+        silent, rollouts = 0, self._budget.rollouts
         while silent < _KNOWN_BATCHES:
             asked = ask_within(solver, self._deadline - time.monotonic())
             if asked is None:
@@ -143,6 +143,8 @@ class Thinking:
             points = [self._problem.point(point) for point in asked]
             before = self._count
             evaluations = self._try([*first, *points])
+            if not points and rollouts is not None and rollouts - self._count < self._reasoner.samples:
+                raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
             if not points:
                 return f"{solver.name}: {solver.message}"
             given = [*known, *evaluations[1 : len(first)]]
