@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 from vtbdrake.optimization.parameter import Dimension
@@ -82,7 +83,7 @@ def make_solver(
     """
     factory = solver_type(name)
     canonical = _find(name) if isinstance(name, str) else name.__name__
-    allowed = [option for option in inspect.signature(factory).parameters if option not in ("search", "name")]
+    allowed = _options(factory)
     for option in options:
         if option not in allowed:
             near = difflib.get_close_matches(option, allowed, n=1)
@@ -92,6 +93,12 @@ def make_solver(
         space=tuple(space), objectives=objectives, constraints=constraints, seed=seed, budget=budget, start=start
     )
     return factory(search, name=canonical, **options)
+
+
+@cache
+def _options(kind: type[Solver]) -> list[str]:
+    """Return the names of a solver's options; cached, as a reasoner makes a solver for each decision."""
+    return [option for option in inspect.signature(kind).parameters if option not in ("search", "name")]
 
 
 def _find(name: object) -> str:
