@@ -55,7 +55,8 @@ class CartPoleScenario(Scenario):
     # Whether the DPS decides the plan itself; and in a mental copy of it, where it does not reason again.
     onboard: bool = False
     is_mental: bool = False
-    # The time from one decision to the next, and the time that one takes, in seconds; and its budget.
+    # The time from one decision to the next, and the time that one takes, in seconds; and its budget. By the clock,
+    # two periods of it go to the way there and back: give 0.1 s or more there.
     thinking_period: float = 0.06
     thinking_time: float = 0.06
     rollouts: int = 20
@@ -136,7 +137,9 @@ class CartPoleScenario(Scenario):
         from vtbdrake.reasoning import Budget, OnboardReasoner
         from vtbdrake_diagrams.cart_pole.decision import reasoning
 
-        budget = Budget(rollouts=self.rollouts, seconds=_PATIENCE if self.lock_step else None)
+        # A loop with this period takes a result that is there two cycles before it is due.
+        seconds = 0.8 * max(self.thinking_time - 2.0 * self.period, 0.1 * self.thinking_time)
+        budget = Budget(rollouts=self.rollouts, seconds=_PATIENCE if self.lock_step else seconds)
         arguments = reasoning(self, "dps.planner.candidate", budget)
         named = {name: arguments.pop(name) for name in ("decision", "quality", "horizon", "budget")}
         return OnboardReasoner(
