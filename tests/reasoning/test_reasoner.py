@@ -246,7 +246,7 @@ def test_workers_that_die_or_hang_make_a_decision_poor(mass):
         decision = reasoner.decide(belief)
         assert decision.values == {"u.switch": 1.0}
         assert decision.poor
-        assert "2 of 4 rollouts failed" in decision.doubts[0]
+        assert "2 of 4 rollouts failed" in decision.warnings[0]
         messages = {c.values["u.switch"]: c.rollouts[0].message for c in decision.candidates if c.status == "failed"}
         assert "its worker process died (exit code -9)" in messages[KILL]
         assert "longer than its time limit" in messages[HANG]
@@ -452,7 +452,7 @@ def test_a_quality_that_fails_fails_its_candidates_only(mass):
     decision = decide(make(quality=quality, sample_period=0.05, method="grid"), mass)
     assert 0.5 < decision.quality < 1.0
     assert decision.poor
-    assert "rollouts failed, the first: QualityError: " in decision.doubts[0]
+    assert "rollouts failed, the first: QualityError: " in decision.warnings[0]
     assert decision.health.failed == sum(c.status == "failed" for c in decision.candidates) > 0
 
 
@@ -489,14 +489,14 @@ def test_health_tells_improvement_margin_and_time(mass):
 def test_a_quality_that_ignores_the_decision_is_reported(mass):
     decision = decide(make(horizon=0.01, sample_period=0.01, budget=Budget(rollouts=6)), mass)
     assert decision.keeps_plan
-    assert any("all 6 eligible candidates are equally good" in doubt for doubt in decision.doubts)
+    assert any("all 6 eligible candidates are equally good" in warning for warning in decision.warnings)
 
 
 def test_a_budget_for_the_plan_in_use_alone_is_reported(mass):
     decision = decide(make(budget=Budget(rollouts=1)), mass)
     assert decision.keeps_plan
     assert decision.end == "rollouts"
-    assert any("nothing but the plan in use was tried" in doubt for doubt in decision.doubts)
+    assert any("nothing but the plan in use was tried" in warning for warning in decision.warnings)
 
 
 def test_a_decision_is_applied_and_carried_out(mass):

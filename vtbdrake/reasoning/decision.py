@@ -95,7 +95,7 @@ class Decision:
         end: why it ended: ``rollouts`` or ``time`` (the budget was spent), ``method`` (the method has finished).
         message: the same in a sentence; without a decision, why no candidate is eligible.
         time: the DPS's time for which it was made, in seconds.
-        doubts: what speaks against it, one sentence each; empty if nothing does.
+        warnings: what speaks against it, one sentence each; empty if nothing does.
         name: of the quality.
         minimize: whether the quality is a cost.
         starts: where the rollouts began, one per sample of the belief.
@@ -109,7 +109,7 @@ class Decision:
     end: str
     message: str
     time: float
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     name: str
     minimize: bool = False
     starts: tuple[Start, ...] = field(default=(), repr=False)
@@ -119,8 +119,8 @@ class Decision:
 
     @property
     def poor(self) -> bool:
-        """Return whether something speaks against it, see ``doubts``."""
-        return bool(self.doubts)
+        """Return whether something speaks against it, see ``warnings``."""
+        return bool(self.warnings)
 
     @property
     def keeps_plan(self) -> bool:
@@ -150,7 +150,7 @@ class Decision:
         return f"Decision({chosen}{kept}: {self.name} = {self.quality:.6g}{poor}; {tried})"
 
     def __str__(self) -> str:
-        """Show the best candidates, the health and the doubts as text."""
+        """Show the best candidates, the health and the warnings as text."""
         shown, marks = self.ranked[:_SHOWN], {self.chosen: "*"}
         table = [("candidate", "values", self.name, "status")]
         table += [(f"{c.number}{marks.get(c.number, '')}", c.text, _number(c), c.status) for c in shown]
@@ -187,7 +187,7 @@ class Decision:
             facts["margin to the second best"] = f"{health.margin:.4g}"
         if health.spread > 0.0:
             facts["spread over the samples"] = f"{health.spread:.4g}"
-        return facts | ({"doubts": "; ".join(self.doubts)} if self.doubts else {})
+        return facts | ({"warnings": "; ".join(self.warnings)} if self.warnings else {})
 
     def _repr_html_(self) -> str:
         """Show the facts and the quality trajectories of the candidates in a notebook."""

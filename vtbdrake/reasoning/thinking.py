@@ -244,7 +244,7 @@ class Thinking:
             end=end,
             message=message if best is not None else f"no candidate is eligible ({_why_none(candidates)}); {message}",
             time=self._time,
-            doubts=tuple(_doubts(candidates, ranked, results)),
+            warnings=tuple(_warnings(candidates, ranked, results)),
             name=problem.objectives[0].name,
             minimize=problem.objectives[0].minimize,
             starts=tuple(self._starts),
@@ -288,7 +288,7 @@ def _why_none(candidates: Sequence[Candidate]) -> str:
     return ", ".join(reasons) + (f"; the first failure: {messages[0]}" if messages else "")
 
 
-def _doubts(
+def _warnings(
     candidates: Sequence[Candidate], ranked: Sequence[Candidate], results: Sequence[RolloutResult]
 ) -> Iterator[str]:
     """Yield what speaks against a decision.
