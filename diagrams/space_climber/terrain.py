@@ -19,9 +19,9 @@ d high in every direction; beyond, the ground is flat. What was chosen, and why:
   h^-2.5 between 6 and 50 cm. Counts of blocks on the moon follow power laws too (Cintala and McBride, NASA TM 104804,
   1995); the exponent, and how dense the fields are, are assumed.
 
-First versions were steeper and had more harmonics, gullies and boulders; they left no passable direction in half of the
-craters, so that there was nothing to decide there. The present numbers come from the slopes of 40 craters, not from
-rollouts.
+First versions were steeper and had more harmonics, gullies and boulders. Rollouts in craters 0 to 8 showed that half of
+them had no passable direction, so that there was nothing to decide there. So the terrain was made easier twice. The
+present depth, slopes and harmonics were chosen by the slopes of 40 craters.
 
 The gully, the boulders and the fine part of the mesh lie in the sector around the x axis that a robot may enter which
 sets out from the middle with a heading within 45 deg.
