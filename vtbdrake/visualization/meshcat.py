@@ -24,6 +24,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import Context
 
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
@@ -201,19 +202,23 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    built: list[tuple[Motion, VirtualTestbed]] = []
+    # A context of a terrain with many shapes takes as long as building it: there is one per scenario.
+    built: list[tuple[Motion, VirtualTestbed, Context]] = []
     for name, motion in motions.items():
-        testbed = next((t for other, t in built if other.scenario == motion.scenario), None)
-        if testbed is None:
+        known = next((known for known in built if known[0].scenario == motion.scenario), None)
+        if known is None:
             testbed = motion.scenario.build()
-            _draw(meshcat, testbed, f"{prefix}/surroundings/{len(built)}", moving=False)
-            built.append((motion, testbed))
+            known = motion, testbed, testbed.default_context()
+            _draw(meshcat, *known[1:], f"{prefix}/surroundings/{len(built)}", moving=False)
+            built.append(known)
+        _, testbed, context = known
         states = _states(motion, testbed, f"{prefix}/{name}")
         instants = np.linspace(0, len(states) - 1, count).round().astype(int)
         for k, sample in enumerate(dict.fromkeys(instants.tolist())):
             _draw(
                 meshcat,
                 testbed,
+                context,
                 f"{prefix}/{name}/{k}",
                 moving=True,
                 state=states[sample],
@@ -226,6 +231,7 @@ def show_poses(
 def _draw(
     meshcat: Meshcat,
     testbed: VirtualTestbed,
+    context: Context,
     path: str,
     *,
     moving: bool,
@@ -236,7 +242,7 @@ def _draw(
     """Draw the moving or the anchored bodies of a plant, in the state [q; v] if one is given."""
     plant, scene_graph = testbed.plant, testbed.scene_graph
     assert plant is not None and scene_graph is not None
-    inspector, context = scene_graph.model_inspector(), testbed.default_context()
+    inspector = scene_graph.model_inspector()
     own = plant.GetMyMutableContextFromRoot(context)
     if state is not None:
         plant.SetPositionsAndVelocities(own, state)
