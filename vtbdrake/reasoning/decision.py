@@ -49,6 +49,11 @@ class Candidate:
         return float(np.std([rollout.value for rollout in self.rollouts])) if self.rollouts else nan
 
     @property
+    def has_trajectory(self) -> bool:
+        """Return whether its quality over time is known, from the first sample of the belief at least."""
+        return bool(self.rollouts) and self.rollouts[0].quality.size > 0
+
+    @property
     def text(self) -> str:
         """Return its values as text."""
         return ", ".join(f"{address} = {_short(value)}" for address, value in self.values.items())
@@ -194,7 +199,7 @@ class Decision:
         from vtbdrake.visualization.plots import summary_html
 
         rows = {c.text or "none": f"{_number(c)} ({c.status})" for c in self.ranked[:_SHOWN]}
-        drawn = any(_drawable(candidate) for candidate in self.candidates)
+        drawn = any(candidate.has_trajectory for candidate in self.candidates)
         return summary_html(repr(self), {**rows, **self._facts()}, self.plot() if drawn else None)
 
     def plot(self) -> Figure:
@@ -210,10 +215,6 @@ class Decision:
 
 # So many candidates are shown at most.
 _SHOWN = 10
-
-
-def _drawable(candidate: Candidate) -> bool:
-    return bool(candidate.rollouts) and candidate.rollouts[0].quality.size > 0
 
 
 def _number(candidate: Candidate) -> str:

@@ -35,7 +35,7 @@ def plot_decision(decision: Decision) -> Figure:
     Raises:
         ValueError: No rollout has a quality.
     """
-    drawn = [candidate for candidate in decision.candidates if _drawable(candidate)]
+    drawn = [candidate for candidate in decision.candidates if candidate.has_trajectory]
     if not drawn:
         raise ValueError("no rollout of the decision has a quality that could be drawn")
     figure = Picture(10.5, 4.2)
@@ -117,7 +117,3 @@ def _colors(decision: Decision) -> dict[int, str]:
 def _rank(decision: Decision, candidate: Candidate) -> tuple[bool, bool]:
     """Return a key that draws the plan in use above the others, and the chosen candidate above all."""
     return candidate.number == decision.chosen, candidate.number == 0
-
-
-def _drawable(candidate: Candidate) -> bool:
-    return bool(candidate.rollouts) and candidate.rollouts[0].quality.size > 0
