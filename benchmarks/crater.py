@@ -1,4 +1,4 @@
-"""How long the robot in the crater thinks about its heading, and what its fast integrator costs in accuracy."""
+"""Benchmark of the decision in the crater: its wall time, and the error of its fast integrator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a decision costs beside its rollouts."""
+"""Benchmark of the time that a decision takes beyond its rollouts."""
 
 from __future__ import annotations
 

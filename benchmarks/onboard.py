@@ -1,4 +1,4 @@
-"""What a reasoner on board does to the punctuality of the loop."""
+"""Benchmark of the loop's punctuality beside a reasoner that thinks on the same machine."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def compiled_planner(step: casadi.Function) -> Planner:
 
 
 def mujoco_planners() -> dict[str, Planner]:
-    """By the number of threads, as text."""
+    """Return one planner per number of threads, which the key tells as text."""
     return {"1 thread": mujoco_planner(1), "2 threads": mujoco_planner(2)}
 
 
@@ -207,7 +207,7 @@ def _state_costs(x: np.ndarray) -> np.ndarray:
 
 
 def _difference(a: Planner, b: Planner) -> float:
-    """Of the costs, relative."""
+    """Return the largest relative difference between the costs of two planners."""
     z = SPREAD * np.random.default_rng(0).standard_normal((CANDIDATES, PLAN.knots))
     ours, theirs = a(HANGING, z), b(HANGING, z)
     return float(np.max(np.abs(ours - theirs) / np.abs(theirs)))

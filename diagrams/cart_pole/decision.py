@@ -1,4 +1,4 @@
-"""What is decided about the cart-pole, and how: by predictive sampling over a plan of forces."""
+"""The decision about the cart-pole: its cost, and the settings of the reasoner that searches a plan of forces."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from vtbdrake.spline import Spline
 
 JOINTS = 2
 PERCEIVED = "dps.env.discrete_state_0"
-"""Where the DPS keeps what it perceives: positions of cart (m) and pole (rad), then their derivatives, shape (4,)."""
+"""The address of the perceived state: positions of cart (m) and pole (rad), then their derivatives, shape (4,)."""
 
 
 def make_dps(plan: Spline, *, period: float, force_limit: float, planner: System | None = None) -> Diagram:

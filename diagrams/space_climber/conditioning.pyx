@@ -1,4 +1,4 @@
-"""What the DPS does to sensor values before it uses them, and to joint commands before they leave it, compiled."""
+"""Compiled calibration and filters of sensor values, and limits of joint commands."""
 
 from libc.math cimport exp
 
