@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from vtbdrake.child_process import ChildProcess, StartError, ending_signals, report_ready
+from vtbdrake.child_process import ChildProcess, ProcessStartError, ending_signals, report_ready
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -25,7 +25,7 @@ def echo(connection, *parts):
 
 
 def refuse(connection):
-    raise StartError("no robot\nis connected")
+    raise ProcessStartError("no robot\nis connected")
 
 
 def fail(connection):
@@ -119,7 +119,7 @@ def test_sockets_are_handed_over():
 )
 def test_child_that_does_not_start_says_why(function, arguments, message, capfd):
     child = ChildProcess(function, *arguments, name="the child")
-    with pytest.raises(StartError, match=message):
+    with pytest.raises(ProcessStartError, match=message):
         child.wait_until_ready()
     assert child.close() == (arguments or (1,))[0]
     assert (function is fail) == ("ArithmeticError: a failure of the test" in capfd.readouterr().err)
@@ -128,7 +128,7 @@ def test_child_that_does_not_start_says_why(function, arguments, message, capfd)
 def test_child_that_is_not_ready_in_time_is_an_error():
     child = ChildProcess(echo, name="the child")
     os.kill(child.pid, signal.SIGSTOP)
-    with pytest.raises(StartError, match=rf"the child \(process {child.pid}\) was not ready within 0.1 s"):
+    with pytest.raises(ProcessStartError, match=rf"the child \(process {child.pid}\) was not ready within 0.1 s"):
         child.wait_until_ready(0.1)
     child.kill()
     child.close()

@@ -44,7 +44,7 @@ def _current_directory() -> str:
 _FIRST_DIRECTORY = _current_directory()
 
 
-class StartError(RuntimeError):
+class ProcessStartError(RuntimeError):
     """A child process that cannot do its work; raised in the child, and in its parent by `wait_until_ready`."""
 
 
@@ -114,7 +114,7 @@ class ChildProcess:
             timeout: Time in seconds; None to wait forever.
 
         Raises:
-            StartError: The child has ended, with the reason if it raised a `StartError`, or it is not ready in time.
+            ProcessStartError: The child has ended, with the reason if it raised this error; or it is late.
         """
         try:
             reason = self._read_line(timeout, 1).decode().strip()  # Byte by byte: the rest is left to other readers.
@@ -122,15 +122,17 @@ class ChildProcess:
             self.kill()
             self.connection.close()
             if isinstance(error, TimeoutError):
-                raise StartError(f"{self.name} (process {self.pid}) was not ready within {timeout:g} s") from error
+                raise ProcessStartError(
+                    f"{self.name} (process {self.pid}) was not ready within {timeout:g} s"
+                ) from error
             if isinstance(error, OSError):
-                raise StartError(
+                raise ProcessStartError(
                     f"{self.name} did not start (exit code {self.exit_code}): see its output above"
                 ) from error
             raise
         if reason:
             self.close()
-            raise StartError(reason)
+            raise ProcessStartError(reason)
 
     def request(self, line: bytes, *, timeout: float) -> bytes:
         """Send a line to the child, and return the line that it answers.
@@ -203,7 +205,7 @@ class ChildService:
         child = ChildProcess(function, *arguments, name=self.name, **options)
         try:
             child.wait_until_ready()
-        except StartError as error:
+        except ProcessStartError as error:
             raise self.error(str(error)) from error
         self._child = child
 
@@ -279,7 +281,7 @@ def _run(files: Sequence[int], grace: float) -> None:
             with open(call, "rb") as file:
                 function, arguments = pickle.load(file)
             function(parent, *arguments, *(socket.socket(fileno=descriptor) for descriptor in sockets))
-        except StartError as error:
+        except ProcessStartError as error:
             with contextlib.suppress(OSError):
                 parent.sendall(" ".join(str(error).split()).encode() + b"\n")
             raise SystemExit(1) from error

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.child_process import ChildService, StartError, report_ready
+from vtbdrake.child_process import ChildService, ProcessStartError, report_ready
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.machine.injected_faults import InjectedFault
@@ -207,5 +207,5 @@ def _serve_child(
         machine = Machine(scenario, config, epoch=epoch(lock_step=options["lock_step"]))
         loop = MachineLoop(machine, url, control=connection)
     except (ValueError, BridgeError) as error:
-        raise StartError(str(error)) from error
+        raise ProcessStartError(str(error)) from error
     serve(loop, ready=lambda: report_ready(connection), **options)

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from vtbdrake.argument_checks import as_number
-from vtbdrake.child_process import ChildProcess, StartError, report_ready
+from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
@@ -198,10 +198,10 @@ class ProcessExecutor(Executor):
         waiting.popleft()
         try:
             worker.give(task, start, index, message)
-        except (OSError, StartError) as error:
+        except (OSError, ProcessStartError) as error:
             worker.jobs.pop()
             waiting.appendleft(index)
-            if isinstance(error, StartError):
+            if isinstance(error, ProcessStartError):
                 self._starts_lost += 1
                 # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
                 if (worker.child.exit_code or 0) >= 0 or self._starts_lost > self._count:
