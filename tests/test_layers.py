@@ -30,10 +30,12 @@ BELOW: dict[str, set[str]] = {
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
 # Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
-# travel to them, when the names of a package are imported, and splines.
+# travel to them, when the names of a package are imported, splines and
+# laser scans.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "child_process", "lazy", "pickling", "spline"})
+    _layers.update({"argument_checks", "child_process", "lazy", "pickling", "scan", "spline"})
 BELOW["spline"] = {"argument_checks"}
+BELOW["scan"] = set()
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
 BELOW["argument_checks"] = set()
