@@ -2,11 +2,15 @@
 
 from vtbdrake.components.compiled_plant.dynamics import FrameMotion, PlantDynamics, plant_dynamics, plant_step
 from vtbdrake.components.compiled_plant.links import UnsupportedPlantError
+from vtbdrake.components.compiled_plant.momentum import BaseMotion, BaseReaction, MomentumModel
 from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBatch
 from vtbdrake.components.compiled_plant.world import compiled_world
 
 __all__ = [
+    "BaseMotion",
+    "BaseReaction",
     "FrameMotion",
+    "MomentumModel",
     "PlantDynamics",
     "PlantRollouts",
     "RolloutBatch",
