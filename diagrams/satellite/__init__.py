@@ -1,0 +1,1 @@
+"""A service satellite whose arm captures a tumbling target, seen by a docking camera and a laser scanner."""
