@@ -1,4 +1,4 @@
-"""Images and point clouds arrive as Drake's own systems send them."""
+"""Images and point clouds travel as Drake's own systems send them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, System
 from pydrake.systems.lcm import LcmPublisherSystem
 from pydrake.systems.primitives import ConstantValueSource
-from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U, ImageToLcmImageArrayT
+from pydrake.systems.sensors import (
+    ImageBgr8U,
+    ImageDepth16U,
+    ImageDepth32F,
+    ImageGrey8U,
+    ImageLabel16I,
+    ImageRgb8U,
+    ImageRgba8U,
+    ImageToLcmImageArrayT,
+)
 
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.bridge import ChannelReader
@@ -73,6 +82,34 @@ def test_images_of_drake_arrive_exactly() -> None:
         camera = received[f"camera_{name}"]
         np.testing.assert_array_equal(camera.value.data, image.data)
         assert (camera.count, camera.sent) == (1, 0.5)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_images_are_sent_as_drake_sends_them(compress: bool) -> None:
+    types = {"color": ImageRgba8U, "depth": ImageDepth32F, "label": ImageLabel16I}
+    images = {name: noise(image_type) for name, image_type in types.items()}
+    drakes = sent_by_drake(ImageToLcmImageArrayT(*types, compress), list(images.values()), lcmt_image_array)
+    map = image_array_map(CHANNEL, {name: name for name in types}, compress=compress)
+    signals = [Signal(name, model_value=image_type(WIDTH, HEIGHT)) for name, image_type in types.items()]
+    assert map.encoder(signals)(images, 500_000) == drakes
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("image_type", [ImageBgr8U, ImageDepth16U, ImageGrey8U, ImageRgb8U])
+def test_sent_image_arrives_exactly(image_type: Any, compress: bool) -> None:
+    image, signal = noise(image_type), Signal("camera", model_value=image_type(WIDTH, HEIGHT))
+    map = image_map(CHANNEL, "camera", compress=compress)
+    received = take(map, [signal], map.encoder([signal])({"camera": image}, 7_000_000))["camera"]
+    np.testing.assert_array_equal(received.value.data, image.data)
+    assert received.sent == 7.0
+
+
+def test_image_of_another_size_is_not_sent() -> None:
+    encode = image_map(CHANNEL, "camera").encoder([camera()])
+    with pytest.raises(
+        ValueError, match=r"camera on channel PICTURES has images of shape \(4, 6, 4\), not \(6, 4, 4\)"
+    ):
+        encode({"camera": ImageRgba8U(HEIGHT, WIDTH)}, 1)
 
 
 def message_of(image: ImageRgba8U) -> lcmt_image:
@@ -178,12 +215,23 @@ def test_point_cloud_of_drake_arrives_exactly(points: int) -> None:
         np.testing.assert_array_equal(getattr(received.value, name)(), getattr(sent, name)())
 
 
-def test_infinite_points_are_accepted() -> None:
+@pytest.mark.parametrize("points", [0, 1, 50])
+def test_point_cloud_is_sent_as_drake_sends_it(points: int) -> None:
+    cloud_sent = cloud(points)
+    drakes = lcmt_point_cloud.decode(sent_by_drake(PointCloudToLcm("lidar"), [cloud_sent], lcmt_point_cloud))
+    encode = point_cloud_map(CHANNEL, "lidar").encoder([Signal("lidar", model_value=cloud(0))])
+    ours = lcmt_point_cloud.decode(encode({"lidar": cloud_sent}, 500_000))
+    drakes.filler_size, drakes.filler = 0, b""  # Drake aligns the data in the message.
+    assert ours.encode() == drakes.encode()
+
+
+def test_infinite_points_are_sent_and_received() -> None:
     sent = PointCloud(2)
-    sent.mutable_xyzs()[:] = np.inf
-    data = sent_by_drake(PointCloudToLcm("lidar"), [sent], lcmt_point_cloud)
-    received = take(point_cloud_map(CHANNEL, "lidar"), [Signal("lidar", model_value=PointCloud(0))], data)["lidar"]
-    assert np.isinf(received.value.xyzs()).all()
+    sent.mutable_xyzs()[:] = [[np.inf, 1.0], [0.0, np.nan], [1.0, 2.0]]
+    lidar, map = Signal("lidar", model_value=PointCloud(0)), point_cloud_map(CHANNEL, "lidar")
+    data = map.encoder([lidar])({"lidar": sent}, 1)
+    assert not lcmt_point_cloud.decode(data).flags & lcmt_point_cloud.IS_STRICTLY_FINITE
+    np.testing.assert_array_equal(take(map, [lidar], data)["lidar"].value.xyzs(), sent.xyzs())
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from drake import (
     lcmt_point_cloud_field,
 )
 
-from vtbdrake.lcm.maps import Decoder, LcmMap, VectorMap, decode, vector_map
+from vtbdrake.lcm.maps import Decoder, Encoder, LcmMap, VectorMap, decode, vector_map
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Signal
 
@@ -83,15 +83,54 @@ def _pixels() -> dict[type, tuple[int, int]]:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMap(LcmMap):
-    """An `LcmMap` that receives images; `image_map` and `image_array_map` make one. It sends none.
+    """An `LcmMap` of images; `image_map` and `image_array_map` make one.
 
     A signal's ``model_value`` gives pixel type, width and height. Rejected are an image of another size (``size``), of
     another pixel type (``type``), and one that is compressed by anything but zlib (``compression``).
+
+    Attributes:
+        frames: By signal, the ``frame_name`` of its image.
+        compress: Whether the images that are sent are compressed by zlib, as fast as it can.
     """
 
-    select: Callable[[Any], Mapping[str, Any]]  # returns the `lcmt_image` of each signal from a message
+    frames: Mapping[str, str]
+    compress: bool = False
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        models = self._models(signals)
+        array = self.type is lcmt_image_array
+
+        def decode_images(data: bytes) -> tuple[float, Mapping[str, Any]]:
+            message = decode(self.type, data)
+            found = {image.header.frame_name: image for image in message.images} if array else {}
+            images = {name: found.get(frame) if array else message for name, frame in self.frames.items()}
+            values = {name: _to_image(image, models[name]) for name, image in images.items() if image is not None}
+            return message.header.utime * 1e-6, values
+
+        return decode_images
+
+    def encoder(self, signals: Sequence[Signal]) -> Encoder:
+        models = self._models(signals)
+
+        def encode_images(values: Mapping[str, Any], utime: int) -> bytes:
+            images = []
+            for name, value in values.items():
+                if value.shape != models[name].shape:
+                    raise ValueError(
+                        f"signal {name} on channel {self.channel} has images of shape {models[name].shape}, not "
+                        f"{value.shape}"
+                    )
+                images.append(_to_message(value, self.frames[name], utime, compress=self.compress))
+            if self.type is lcmt_image:
+                return bytes(images[0].encode())
+            message = lcmt_image_array()
+            message.header.utime = utime
+            message.num_images, message.images = len(images), images
+            return bytes(message.encode())
+
+        return encode_images
+
+    def _models(self, signals: Sequence[Signal]) -> dict[str, Any]:
         models = {signal.name: signal.model_value for signal in signals}
         for name, model in models.items():
             if type(model) not in _pixels() or not model.width() * model.height():
@@ -99,35 +138,27 @@ class ImageMap(LcmMap):
                     f"signal {name} on channel {self.channel} needs an image of its size as model_value, such as "
                     f"ImageRgba8U(640, 480), not {model!r}"
                 )
-
-        def decode_images(data: bytes) -> tuple[float, Mapping[str, Any]]:
-            message = decode(self.type, data)
-            images = self.select(message)
-            values = {name: _to_image(images[name], model) for name, model in models.items() if name in images}
-            return message.header.utime * 1e-6, values
-
-        return decode_images
+        return models
 
 
-def image_map(channel: str, signal: str) -> ImageMap:
-    """Return a map for one camera that sends `lcmt_image` messages."""
-    return ImageMap(channel=channel, type=lcmt_image, signals=[signal], select=lambda message: {signal: message})
+def image_map(channel: str, signal: str, *, compress: bool = False) -> ImageMap:
+    """Return a map for one camera by `lcmt_image` messages.
+
+    The name of the signal is the ``frame_name`` of the images that are sent; that of received ones does not matter.
+    """
+    return ImageMap(channel=channel, type=lcmt_image, signals=[signal], frames={signal: signal}, compress=compress)
 
 
-def image_array_map(channel: str, frames: Mapping[str, str]) -> ImageMap:
+def image_array_map(channel: str, frames: Mapping[str, str], *, compress: bool = False) -> ImageMap:
     """Return a map for `lcmt_image_array` messages, as Drake's `ImageToLcmImageArrayT` makes them.
 
     Args:
         channel: Name of the channel.
         frames: By signal, the ``frame_name`` of its image. A message need not have all of them: a signal whose image is
             not in it counts it as ``missing``.
+        compress: Whether the images that are sent are compressed by zlib.
     """
-
-    def select(message: Any) -> dict[str, Any]:
-        found = {image.header.frame_name: image for image in message.images}
-        return {signal: found[frame] for signal, frame in frames.items() if frame in found}
-
-    return ImageMap(channel=channel, type=lcmt_image_array, signals=tuple(frames), select=select)
+    return ImageMap(channel=channel, type=lcmt_image_array, signals=tuple(frames), frames=frames, compress=compress)
 
 
 def _to_image(message: Any, model: Any) -> Any:
@@ -154,6 +185,21 @@ def _to_image(message: Any, model: Any) -> Any:
     return image
 
 
+def _to_message(image: Any, frame: str, utime: int, *, compress: bool) -> lcmt_image:
+    """Return an image as an `lcmt_image`."""
+    message = lcmt_image()
+    message.header.utime, message.header.frame_name = utime, frame
+    message.pixel_format, message.channel_type = _pixels()[type(image)]
+    message.height, message.width = image.height(), image.width()
+    message.row_stride = image.data[0].nbytes
+    message.data = image.data.tobytes()
+    if compress:
+        message.compression_method = lcmt_image.COMPRESSION_METHOD_ZLIB
+        message.data = zlib.compress(message.data, zlib.Z_BEST_SPEED)
+    message.size = len(message.data)
+    return message
+
+
 _NUMBERS = {
     lcmt_point_cloud_field.INT8: "i1",
     lcmt_point_cloud_field.UINT8: "u1",
@@ -167,14 +213,27 @@ _NUMBERS = {
 
 
 class PointCloudMap(LcmMap):
-    """An `LcmMap` that receives point clouds; `point_cloud_map` makes one. It sends none.
+    """An `LcmMap` of point clouds; `point_cloud_map` makes one.
 
     The signal's ``model_value`` tells which properties its clouds have: positions, normals, colours. Rejected are a
     message that lacks one of them (``missing``), and one whose data are not as long as it says (``size``). Points may
-    be infinite or NaN: so a sensor says that it saw nothing there.
+    be infinite or NaN: so a sensor says that it saw nothing there. (Drake's `PointCloudToLcm` leaves such points out.)
     """
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        signal = self._checked(signals)
+
+        def decode_cloud(data: bytes) -> tuple[float, Mapping[str, Any]]:
+            message = decode(self.type, data)
+            return message.utime * 1e-6, {signal.name: _to_cloud(message, signal.model_value)}
+
+        return decode_cloud
+
+    def encoder(self, signals: Sequence[Signal]) -> Encoder:
+        signal = self._checked(signals)
+        return lambda values, utime: _cloud_message(_cloud_points(values[signal.name]), signal.name, utime)
+
+    def _checked(self, signals: Sequence[Signal]) -> Signal:
         from pydrake.perception import PointCloud
 
         (signal,) = signals
@@ -183,16 +242,14 @@ class PointCloudMap(LcmMap):
                 f"signal {signal.name} on channel {self.channel} needs a PointCloud as model_value, not "
                 f"{signal.model_value!r}"
             )
-
-        def decode_cloud(data: bytes) -> tuple[float, Mapping[str, Any]]:
-            message = decode(self.type, data)
-            return message.utime * 1e-6, {signal.name: _to_cloud(message, signal.model_value)}
-
-        return decode_cloud
+        return signal
 
 
 def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
-    """Return a map for `lcmt_point_cloud` messages, as Drake's `PointCloudToLcm` makes them."""
+    """Return a map for `lcmt_point_cloud` messages, as Drake's `PointCloudToLcm` makes them.
+
+    The name of the signal is the ``frame_name`` of the clouds that are sent.
+    """
     return PointCloudMap(channel=channel, type=lcmt_point_cloud, signals=[signal])
 
 
@@ -243,3 +300,41 @@ def _column(points: np.ndarray, name: str) -> np.ndarray:
     if points.dtype.names is None or name not in points.dtype.names:
         raise MalformedError("missing")
     return points[name]
+
+
+def _cloud_points(cloud: PointCloud) -> np.ndarray:
+    """Return a cloud as an array of records, in the order of Drake's `PointCloudToLcm`."""
+    columns: dict[str, np.ndarray] = {}
+    if cloud.has_xyzs():
+        columns |= dict(zip(("x", "y", "z"), cloud.xyzs(), strict=True))
+    if cloud.has_rgbs():
+        colours = np.zeros((cloud.size(), 4), np.uint8)
+        colours[:, :3] = cloud.rgbs().T
+        columns["rgb"] = colours.view("<u4")[:, 0]
+    if cloud.has_normals():
+        columns |= dict(zip(("normal_x", "normal_y", "normal_z"), cloud.normals(), strict=True))
+    points = np.empty(cloud.size(), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    for name, column in columns.items():
+        points[name] = column
+    return points
+
+
+def _cloud_message(points: np.ndarray, frame: str, utime: int) -> bytes:
+    """Return an `lcmt_point_cloud` of records with the fields of ``points``."""
+    message = lcmt_point_cloud()
+    message.utime, message.frame_name = utime, frame
+    message.width, message.height = len(points), 1
+    message.point_step, message.row_step = points.itemsize, points.nbytes
+    kinds = {code: datatype for datatype, code in _NUMBERS.items()}
+    fields: Mapping[str, Any] = points.dtype.fields or {}
+    for name, (type, offset, *_) in fields.items():
+        field = lcmt_point_cloud_field()
+        field.name, field.byte_offset, field.count = name, offset, 1
+        field.datatype = kinds[type.str[1:]]
+        message.fields.append(field)
+    message.num_fields = len(message.fields)
+    finite = all(np.isfinite(points[name]).all() for name in ("x", "y", "z") if name in fields)
+    message.flags = lcmt_point_cloud.IS_STRICTLY_FINITE if finite else 0
+    message.data = points.tobytes()
+    message.data_size = len(message.data)
+    return bytes(message.encode())
