@@ -1,0 +1,138 @@
+"""How the servicer knows its own motion: an inertial navigation in a frame I that it sets up itself."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.state import discrete_state
+from vtbdrake.state.declarations import NO_DICT
+
+Array = NDArray[np.float64]
+
+BASE = 14
+"""Size of the estimate of the base: [time (s), q_IB (wxyz), p_IoBo (m), w_IB (rad/s), v_IBo (m/s)], in I."""
+HISTORY = 50
+"""Number of past poses of the base that are kept."""
+POSE = 8
+"""Size of an entry of that history: [time (s), q_IB (wxyz), p_IoBo (m)]."""
+
+
+class BaseEstimator(LeafSystem):
+    r"""An inertial navigation: pose and velocity of the base B from its gyros and accelerometers.
+
+    .. pydrake_system::
+
+        name: BaseEstimator
+        input_ports:
+        - imu
+        output_ports:
+        - base
+        - history
+
+    ``imu`` is [angular velocity (rad/s); specific force (m/s^2)] in B, means over the sample interval T that ended one
+    period ago. The estimate therefore holds for that time, its first entry. In free fall the specific force f is the
+    acceleration against a frame in free fall, so that
+
+        R <- R exp([w T]x),   v <- v + T R_mid f,   p <- p + T (v_before + v_after) / 2,
+
+    with R_mid halfway. The inertial frame I is where B is at the start, and moves on as B moves then: p = 0, v = 0 at
+    first, whatever the orbit. ``base`` is laid out as `BASE` says; ``history`` holds the last `HISTORY` poses (newest
+    first), each laid out as `POSE` says, see `pose_at`.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float) -> None:
+        super().__init__()
+        self._period = period
+        self._kernel = _navigation(period)
+        self._imu = self.DeclareVectorInputPort("imu", 6)
+        start = np.zeros(BASE)
+        start[0], start[1] = -period, 1.0
+        # Poses of the time before the start are those at the start: the base is where it is.
+        past = np.tile(start[:POSE], (HISTORY, 1))
+        past[:, 0] -= period * np.arange(HISTORY)
+        base, history = self.DeclareDiscreteState(start), self.DeclareDiscreteState(past.ravel())
+        self.DeclareStateOutputPort("base", base)
+        self.DeclareStateOutputPort("history", history)
+        self._base, self._history = int(base), int(history)
+        self.variables = (
+            discrete_state("time", self._base, unit="s"),
+            discrete_state("orientation", self._base, start=1, shape=(4,)),
+            discrete_state("position", self._base, start=5, shape=(3,), unit="m"),
+            discrete_state("angular_velocity", self._base, start=8, shape=(3,), unit="rad/s"),
+            discrete_state("velocity", self._base, start=11, shape=(3,), unit="m/s"),
+            discrete_state("history", self._history, shape=(HISTORY, POSE), unit="s, 1, m"),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        base = context.get_discrete_state(self._base).value()
+        following = self._kernel.value((base, self._imu.Eval(context)))
+        # The samples before the first interval are over at t = 0 and are about no motion.
+        following[0] = context.get_time() - self._period
+        past = context.get_discrete_state(self._history).value()
+        state.set_value(self._base, following)
+        state.set_value(self._history, np.concatenate((following[:POSE], past[:-POSE])))
+
+
+def pose_at(history: ArrayLike, time: float) -> RigidTransform:
+    """Return X_IB at ``time``, interpolated between the poses of a `BaseEstimator`.
+
+    Args:
+        history: Its port ``history``, shape (`HISTORY` * `POSE`,) or (`HISTORY`, `POSE`).
+        time: The time in s. Outside the history, its newest or its oldest pose is returned.
+    """
+    poses = np.reshape(np.asarray(history, dtype=float), (-1, POSE))
+    times = poses[:, 0]
+    if time >= times[0]:
+        return _pose(poses[0, 1:])
+    if time <= times[-1]:
+        return _pose(poses[-1, 1:])
+    newer = int(np.searchsorted(-times, -time)) - 1
+    after, before = poses[newer], poses[newer + 1]
+    share = (time - before[0]) / (after[0] - before[0])
+    q_before = before[1:5] * np.sign(before[1:5] @ after[1:5] or 1.0)
+    # So close together that the mean of the quaternions is the orientation between them.
+    return _pose((1.0 - share) * np.concatenate((q_before, before[5:])) + share * after[1:])
+
+
+def _pose(numbers: Array) -> RigidTransform:
+    q = numbers[:4] / np.linalg.norm(numbers[:4])
+    return RigidTransform(RotationMatrix(Quaternion(q)), numbers[4:7])
+
+
+@lru_cache
+def _navigation(period: float) -> Kernel:
+    """Return the step of the navigation as a kernel of (base, imu)."""
+    base, imu = casadi.SX.sym("base", BASE), casadi.SX.sym("imu", 6)
+    _, q, p, _, v = casadi.vertsplit(base, [0, 1, 5, 8, 11, BASE])
+    w, f = imu[:3], imu[3:]
+    q_mid, q_next = _turned(q, w * period / 2), _turned(q, w * period)
+    v_next = v + period * _rotated(q_mid, f)
+    p_next = p + period * (v + v_next) / 2
+    following = casadi.vertcat(0, q_next, p_next, _rotated(q_next, w), v_next)
+    return Kernel("navigation", [base, imu], casadi.densify(following), compile=False)
+
+
+def _turned(q: casadi.SX, theta: casadi.SX) -> casadi.SX:
+    """Return the quaternion of R exp([theta]x), for a small angle: to the fourth order."""
+    square = casadi.sumsqr(theta) / 4
+    a, b = 1 - square / 2 + square**2 / 24, (0.5 - square / 12 + square**2 / 240) * theta
+    w, x = q[0], q[1:]
+    turned = casadi.vertcat(w * a - casadi.dot(x, b), w * b + a * x + casadi.cross(x, b))
+    return turned / casadi.norm_2(turned)
+
+
+def _rotated(q: casadi.SX, u: casadi.SX) -> casadi.SX:
+    """Return R u."""
+    t = 2 * casadi.cross(q[1:], u)
+    return u + q[0] * t + casadi.cross(q[1:], t)
