@@ -1,0 +1,172 @@
+"""Markers in rendered images, and the poses that follow from their corners."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+
+from vtbdrake.components.perception.markers import (
+    Detections,
+    MarkerBoard,
+    MarkerDetector,
+    add_markers,
+    check_marker_size,
+    detect_markers,
+    pose_from_markers,
+    project,
+)
+
+INTRINSICS = np.array([400.0, 410.0, 150.0, 125.0])  # Not in the middle, and not square.
+
+
+def board(size: float = 0.16) -> MarkerBoard:
+    """Four markers that face along -z of T, in two planes, one of them turned."""
+    away = RotationMatrix.MakeXRotation(np.pi)
+    places = {3: (-0.3, -0.2, 0.0), 7: (0.3, -0.2, 0.1), 11: (-0.25, 0.2, 0.1), 580: (0.2, 0.25, 0.0)}
+    poses = {k: RigidTransform(away, p) for k, p in places.items()}
+    poses[7] = RigidTransform(away @ RotationMatrix.MakeZRotation(0.7), places[7])
+    return MarkerBoard.of(poses, size=size)
+
+
+@pytest.fixture(scope="module")
+def world() -> Diagram:
+    """A plant with the board on its only body."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
+    body = plant.AddRigidBody("target", SpatialInertia.SolidBoxWithMass(1.0, 1.0, 1.0, 1.0))
+    add_markers(plant, body, board())
+    plant.Finalize()
+    scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
+    return builder.Build()
+
+
+def photograph(world: Diagram, X_CT: RigidTransform) -> ImageRgba8U:
+    plant, scene_graph = world.GetSubsystemByName("plant"), world.GetSubsystemByName("scene_graph")
+    context = world.CreateDefaultContext()
+    body = plant.GetBodyByName("target")
+    plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(context), body, X_CT)
+    info = CameraInfo(320, 240, *INTRINSICS)
+    core = RenderCameraCore("vtk", info, ClippingRange(0.05, 20.0), RigidTransform())
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    return query.RenderColorImage(ColorRenderCamera(core), scene_graph.world_frame_id(), RigidTransform())
+
+
+OBLIQUE = RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.05, -0.1, 1.9])
+
+
+def test_rendered_corners_are_where_the_pinhole_equations_say(world: Diagram) -> None:
+    found = detect_markers(photograph(world, OBLIQUE))
+    assert sorted(found.ids) == [3, 7, 11, 580]
+    p_CQ = board().corners[board().find(found.ids)] @ OBLIQUE.rotation().matrix().T + OBLIQUE.translation()
+    expected = INTRINSICS[:2] * p_CQ[..., :2] / p_CQ[..., 2:] + INTRINSICS[2:]
+    error = found.corners - expected
+    assert np.sqrt(np.mean(error**2)) < 0.2
+    assert np.abs(error.mean(axis=(0, 1))).max() < 0.1  # Half a pixel of shift would show here.
+
+
+@pytest.mark.parametrize(("refinement", "limit"), [("lines", 0.2), ("none", 1.0)])
+def test_refinement_decides_the_accuracy(world: Diagram, refinement: str, limit: float) -> None:
+    found = detect_markers(photograph(world, OBLIQUE), MarkerDetector(refinement=refinement))
+    expected = project(board().corners[board().find(found.ids)].reshape(-1, 3), OBLIQUE, INTRINSICS)
+    rms = np.sqrt(np.mean((found.corners.reshape(-1, 2) - expected) ** 2))
+    assert limit / 5.0 < rms < limit
+
+
+def test_pose_from_an_image_is_within_its_covariance(world: Diagram) -> None:
+    distances = []
+    for turn in np.linspace(-0.4, 0.4, 8):
+        X_CT = RigidTransform(RollPitchYaw(turn, -0.2 * turn, 2.0 * turn), [0.05, 0.0, 2.0])
+        estimate = pose_from_markers(detect_markers(photograph(world, X_CT)), board(), INTRINSICS, time=1.5)
+        assert estimate.valid
+        assert estimate.time == 1.5
+        error = estimate.error_to(X_CT)
+        assert np.linalg.norm(error[3:]) < 0.006
+        distances.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert np.mean(distances) < 12.0  # 6 are expected of independent errors of the corners.
+
+
+def errors_and_covariance(distance: float, *, count: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of poses from noisy corners (count, 6), and the covariance that they are told to have."""
+    X_CT = RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.0, 0.0, distance])
+    exact = project(board().corners.reshape(-1, 3), X_CT, INTRINSICS).reshape(-1, 4, 2)
+    generator = np.random.default_rng(1)
+    errors = []
+    for _ in range(count):
+        noisy = Detections(board().ids, exact + noise * generator.standard_normal(exact.shape))
+        estimate = pose_from_markers(
+            noisy, board(), INTRINSICS, time=0.0, prediction=X_CT, corner_noise=noise, residual_limit=5.0 * noise
+        )
+        errors.append(estimate.error_to(X_CT))
+    exactly = pose_from_markers(Detections(board().ids, exact), board(), INTRINSICS, time=0.0, corner_noise=noise)
+    return np.array(errors), exactly.covariance
+
+
+def test_covariance_is_that_of_many_noisy_poses() -> None:
+    errors, covariance = errors_and_covariance(3.0, count=400, noise=0.05)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), errors.T)
+    assert np.cov(whitened) == pytest.approx(np.eye(6), abs=0.3)
+
+
+def test_depth_error_grows_with_the_square_of_distance() -> None:
+    near, far = (errors_and_covariance(z, count=150, noise=0.02)[0][:, 5].std() for z in (4.0, 12.0))
+    assert far / near == pytest.approx(9.0, rel=0.25)
+
+
+def test_no_marker_is_no_estimate() -> None:
+    found = detect_markers(np.full((240, 320), 128, dtype=np.uint8))
+    assert len(found.ids) == 0
+    assert not pose_from_markers(found, board(), INTRINSICS, time=0.0).valid
+
+
+def test_single_marker_needs_a_prediction() -> None:
+    exact = project(board().corners.reshape(-1, 3), OBLIQUE, INTRINSICS).reshape(-1, 4, 2)
+    one = Detections(board().ids[:1], exact[:1])
+    assert not pose_from_markers(one, board(), INTRINSICS, time=0.0).valid
+    nearby = OBLIQUE @ RigidTransform(RollPitchYaw(0.05, 0.05, 0.0), [0.02, 0.0, 0.1])
+    estimate = pose_from_markers(one, board(), INTRINSICS, time=0.0, prediction=nearby)
+    assert estimate.error_to(OBLIQUE) == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+def test_corners_that_do_not_fit_the_board_are_no_estimate() -> None:
+    exact = project(board().corners.reshape(-1, 3), OBLIQUE, INTRINSICS).reshape(-1, 4, 2)
+    assert pose_from_markers(Detections(board().ids, exact), board(), INTRINSICS, time=0.0).valid
+    exchanged = Detections(board().ids[[1, 0, 2, 3]], exact)
+    assert not pose_from_markers(exchanged, board(), INTRINSICS, time=0.0).valid
+
+
+def test_marker_that_the_board_lacks_is_ignored() -> None:
+    found = Detections(np.array([5, 3, 3]), np.zeros((3, 4, 2)))
+    assert found.on(board()).ids.tolist() == [3]
+
+
+def test_marker_size_other_than_the_models_is_an_error(world: Diagram) -> None:
+    inspector = world.GetSubsystemByName("scene_graph").model_inspector()
+    check_marker_size(board(), inspector)
+    with pytest.raises(ValueError, match=r"edges of 0.16 m, but the board of the detector says 0.1 m"):
+        check_marker_size(board(0.1), inspector)
+
+
+@pytest.mark.parametrize(
+    ("ids", "size", "message"),
+    [([1, 1], 0.1, "differ"), ([600, 1], 0.1, "586"), ([1, 2], 0.0, "positive length")],
+)
+def test_impossible_board_is_rejected(ids: list[int], size: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MarkerBoard(np.array(ids), np.zeros((2, 3, 4)), size)
+
+
+def test_impossible_detector_is_rejected() -> None:
+    with pytest.raises(ValueError, match="refinement is one of lines, subpixel, none, not 'apriltag'"):
+        MarkerDetector(refinement="apriltag")

@@ -1,0 +1,453 @@
+"""Fiducial markers: on a body of a plant, in an image, and the pose that follows from them.
+
+The markers are AprilTags of the family 36h11 (Olson, "AprilTag: A robust and flexible visual fiducial system", ICRA
+2011; Wang and Olson, "AprilTag 2", IROS 2016), found by OpenCV's module aruco.
+
+Pixels count as in Drake's `CameraInfo`: (0, 0) is the corner of the first pixel, and its centre is (0.5, 0.5). OpenCV
+counts from that centre instead; all that it returns is corrected here.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.components.perception.estimate import Array, PoseEstimate, cross_matrix, rotation_matrix
+
+if TYPE_CHECKING:
+    from pydrake.geometry import SceneGraphInspector
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import RigidBody
+    from pydrake.systems.sensors import ImageRgba8U
+
+FAMILY_SIZE = 587  # The number of markers in 36h11.
+# The black square of a marker has 8 × 8 cells; it stands in a white frame one cell wide.
+_CELLS, _FRAMED = 8, 10
+_CELL_PIXELS = 8  # In the texture.
+_PROPERTY = ("markers", "size")
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerBoard:
+    """Where the markers of a rigid body T are.
+
+    A marker's frame M has its origin in the marker's centre, x to the right and y upwards in the picture, and z
+    towards who reads it.
+
+    Attributes:
+        ids: The numbers of the markers in the family 36h11, (n,).
+        poses: X_TM of each, (n, 3, 4), translation in m.
+        size: The edge length of the black square of every marker, in m.
+        corners: The corners of the black squares in T, (n, 4, 3) in m: upper left, upper right, lower right, lower left.
+    """
+
+    ids: NDArray[np.int64]
+    poses: Array
+    size: float
+    corners: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        ids, poses = np.array(self.ids, dtype=np.int64), np.array(self.poses, dtype=float)
+        if ids.ndim != 1 or not len(ids) or poses.shape != (len(ids), 3, 4):
+            raise ValueError(f"a MarkerBoard has ids (n,) and poses (n, 3, 4), not {ids.shape} and {poses.shape}")
+        if len(set(ids.tolist())) < len(ids) or ids.min() < 0 or ids.max() >= FAMILY_SIZE:
+            raise ValueError(f"the ids of markers differ and lie in 0 to {FAMILY_SIZE - 1}; found {ids.tolist()}")
+        if not 0.0 < self.size < np.inf:
+            raise ValueError(f"the size of markers is a positive length in m, not {self.size}")
+        corners = _on(poses, self.size)
+        for name, array in (("ids", ids), ("poses", poses), ("corners", corners)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @staticmethod
+    def of(poses: Mapping[int, RigidTransform], *, size: float) -> MarkerBoard:
+        """Return the board of markers of one ``size`` (m) with the poses X_TM by id."""
+        return MarkerBoard(
+            np.array(list(poses)), np.array([X_TM.GetAsMatrix34() for X_TM in poses.values()]), float(size)
+        )
+
+    def find(self, ids: ArrayLike) -> NDArray[np.int64]:
+        """Return the place of each id on this board, -1 for those that it does not have."""
+        match = np.asarray(ids)[:, None] == self.ids
+        return np.where(match.any(axis=1), match.argmax(axis=1), -1)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> MarkerBoard:
+        return self
+
+
+def _on(poses: Array, size: float) -> Array:
+    """Return the corners (n, 4, 3) of squares of this edge length on the frames M, in the order of the detector."""
+    square = 0.5 * size * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    corners: Array = square @ np.swapaxes(poses[:, :, :3], 1, 2) + poses[:, None, :, 3]
+    return corners
+
+
+# -- in a plant
+
+
+def add_markers(plant: MultibodyPlant, body: RigidBody, board: MarkerBoard, *, name: str = "markers") -> None:
+    """Show the markers of a board on a body of a plant that is not finalized, in images and in Meshcat.
+
+    They are one visual geometry, a textured mesh in memory, because every visual costs time in every image. A marker
+    occupies a square of 1.25 sizes with its white frame; leave a millimetre between it and the surface behind it.
+
+    Args:
+        plant: The plant, registered with a SceneGraph.
+        body: The body that is the frame T of the board.
+        board: The markers.
+        name: Name of the geometry.
+    """
+    from pydrake.common import MemoryFile
+    from pydrake.geometry import (
+        GeometryInstance,
+        IllustrationProperties,
+        InMemoryMesh,
+        Mesh,
+        PerceptionProperties,
+        RenderLabel,
+    )
+
+    files = {
+        "markers.mtl": MemoryFile(_MATERIAL.encode(), ".mtl", "markers.mtl"),
+        "markers.png": MemoryFile(_png(_texture(board.ids)), ".png", "markers.png"),
+    }
+    shape = Mesh(
+        InMemoryMesh(mesh_file=MemoryFile(_mesh(board).encode(), ".obj", "markers.obj"), supporting_files=files)
+    )
+    geometry = GeometryInstance(RigidTransform(), shape, name)
+    geometry.set_illustration_properties(IllustrationProperties())
+    properties = PerceptionProperties()
+    properties.AddProperty(*_PROPERTY, board.size)
+    properties.AddProperty("label", "id", RenderLabel(int(body.index())))  # As a plant labels its own geometry.
+    geometry.set_perception_properties(properties)
+    plant.RegisterVisualGeometry(body, geometry)
+
+
+def check_marker_size(board: MarkerBoard, inspector: SceneGraphInspector) -> None:
+    """Check that the markers which `add_markers` put into a model are as large as a detector's board says.
+
+    Raises:
+        ValueError: They are not.
+    """
+    for geometry in inspector.GetAllGeometryIds():
+        properties = inspector.GetPerceptionProperties(geometry)
+        if properties is None or not properties.HasProperty(*_PROPERTY):
+            continue
+        size = properties.GetProperty(*_PROPERTY)
+        if abs(size - board.size) > 1e-9:
+            raise ValueError(
+                f"the markers of the model ({inspector.GetName(geometry)}) have edges of {size:g} m, but the board of "
+                f"the detector says {board.size:g} m: use the same MarkerBoard for both"
+            )
+
+
+_MATERIAL = "newmtl markers\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd markers.png\n"
+
+
+def _mesh(board: MarkerBoard) -> str:
+    """Return the markers as an OBJ file: one quad each, with its strip of the texture."""
+    count = len(board.ids)
+    lines = ["mtllib markers.mtl", "usemtl markers"]
+    for k, corners in enumerate(_on(board.poses, board.size * _FRAMED / _CELLS)):
+        left, right = k / count, (k + 1) / count
+        lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in corners]
+        lines += [f"vt {u:.9f} {v}" for u, v in ((left, 1), (right, 1), (right, 0), (left, 0))]
+        lines.append("vn {:.9f} {:.9f} {:.9f}".format(*board.poses[k, :, 2]))
+        lines.append("f " + " ".join(f"{4 * k + j}/{4 * k + j}/{k + 1}" for j in (4, 3, 2, 1)))
+    return "\n".join(lines) + "\n"
+
+
+def _texture(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the markers side by side, in their white frames, as a grey image."""
+    aruco = _aruco()
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
+    tiles = [aruco.generateImageMarker(dictionary, int(k), _CELLS * _CELL_PIXELS) for k in ids]
+    return np.hstack([np.pad(tile, _CELL_PIXELS, constant_values=255) for tile in tiles])
+
+
+def _png(grey: NDArray[np.uint8]) -> bytes:
+    """Return a grey image as a PNG file in colours, as every renderer reads it."""
+    height, width = grey.shape
+    rows = b"".join(b"\0" + np.repeat(row, 3).tobytes() for row in grey)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+# -- in an image
+
+
+def _aruco() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError("markers need OpenCV: pip install vtbdrake[perception]") from error
+    return cv2.aruco
+
+
+REFINEMENTS = ("lines", "subpixel", "none")
+
+
+@dataclass(frozen=True)
+class MarkerDetector:
+    """How markers are found in an image.
+
+    Attributes:
+        window: The edge of the largest window of the adaptive threshold, in pixels; the smallest has 3.
+        windows: The number of windows that are tried.
+        threshold: What the adaptive threshold subtracts from the mean, in 8-bit counts: less sees markers in the dark.
+        min_perimeter: The perimeter of the smallest marker, as a share of the image's longer side.
+        refinement: ``lines`` fits lines to the edges of a marker, ``subpixel`` is OpenCV's search at the corners,
+            ``none`` gives whole pixels.
+        error_correction: The share of the family's capacity for the correction of bits that is used, in [0, 1].
+    """
+
+    window: int = 23
+    windows: int = 3
+    threshold: float = 7.0
+    min_perimeter: float = 0.12
+    refinement: str = "lines"
+    error_correction: float = 0.6
+
+    def __post_init__(self) -> None:
+        if self.window < 3 or self.windows < 1:
+            raise ValueError(
+                f"the adaptive threshold needs a window of at least 3 pixels, and at least one, not {self.window} and "
+                f"{self.windows}"
+            )
+        if not 0.0 < self.min_perimeter < 4.0:
+            raise ValueError(f"min_perimeter is a share of the image between 0 and 4, not {self.min_perimeter}")
+        if self.refinement not in REFINEMENTS:
+            raise ValueError(f"refinement is one of {', '.join(REFINEMENTS)}, not {self.refinement!r}")
+        if not 0.0 <= self.error_correction <= 1.0:
+            raise ValueError(f"error_correction lies in 0 to 1, not at {self.error_correction}")
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The markers found in one image.
+
+    Attributes:
+        ids: Their numbers, (n,).
+        corners: Their corners in pixels, in the order of `MarkerBoard`, (n, 4, 2).
+    """
+
+    ids: NDArray[np.int64]
+    corners: Array
+
+    def on(self, board: MarkerBoard) -> Detections:
+        """Return those that the board has, each once."""
+        first = np.unique(self.ids, return_index=True)[1]
+        known = first[board.find(self.ids[first]) >= 0]
+        return Detections(self.ids[known], self.corners[known])
+
+
+def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetector | None = None) -> Detections:
+    """Find the markers of the family 36h11 in an image; there may be none.
+
+    Args:
+        image: A colour image, or an array (height, width) of grey values.
+        detector: How they are searched for.
+
+    Raises:
+        ImportError: OpenCV is missing.
+    """
+    aruco, detector = _aruco(), detector or MarkerDetector()
+    grey = _grey(image)
+    parameters = aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = 3
+    parameters.adaptiveThreshWinSizeMax = detector.window
+    parameters.adaptiveThreshWinSizeStep = max(1, (detector.window - 3) // max(1, detector.windows - 1))
+    parameters.adaptiveThreshConstant = detector.threshold
+    parameters.minMarkerPerimeterRate = detector.min_perimeter
+    parameters.errorCorrectionRate = detector.error_correction
+    if detector.refinement == "subpixel":
+        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
+    found, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
+    if ids is None or not len(ids):
+        return Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
+    corners = np.array(found, dtype=float).reshape(-1, 4, 2)
+    if detector.refinement == "lines":
+        corners = fit_edges(grey, fit_edges(grey, corners))
+    return Detections(np.array(ids, dtype=np.int64).ravel(), corners + 0.5)
+
+
+def _grey(image: ImageRgba8U | NDArray[np.uint8]) -> NDArray[np.uint8]:
+    import cv2
+
+    data = image if isinstance(image, np.ndarray) else image.data
+    if data.ndim == 2:
+        return np.ascontiguousarray(data)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(data[:, :, :3]), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+_ALONG = np.linspace(0.08, 0.92, 13)  # Where an edge is searched for, as a share of its length.
+_ACROSS = np.linspace(-1.0, 1.0, 13)  # And across, as a share of the reach.
+
+
+def fit_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
+    """Return the corners of markers as the intersections of lines that are fitted to their edges.
+
+    Across an edge, from the black square to its white frame, the place of the edge is the centre of the brightness
+    gradient. Weighted with the gradients, the places along one edge give its line.
+
+    Args:
+        grey: The image.
+        corners: The corners (n, 4, 2), in pixels from the centre of the first pixel, within about one pixel.
+    """
+    import cv2
+
+    following = np.roll(corners, -1, axis=1)
+    length = np.linalg.norm(following - corners, axis=2, keepdims=True)
+    t = (following - corners) / np.maximum(length, 1e-9)
+    # The corners run clockwise in the image, in which y points down.
+    n = np.stack([t[..., 1], -t[..., 0]], axis=-1)
+    reach = np.clip(0.9 * length / _CELLS, 1.0, 3.0)
+    along, across = _ALONG * length, _ACROSS * reach
+    points = (
+        corners[:, :, None, None]
+        + along[..., None, None] * t[:, :, None, None]
+        + across[:, :, None, :, None] * n[:, :, None, None]
+    ).astype(np.float32)
+    flat = points.reshape(-1, len(_ACROSS), 2)
+    values = cv2.remap(
+        grey.astype(np.float32), flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
+    )
+    rise = np.maximum(np.diff(values.reshape(points.shape[:-1]), axis=-1), 0.0)
+    weight = rise.sum(axis=-1)
+    middle = 0.5 * (across[..., 1:] + across[..., :-1])
+    offset = (rise @ middle[..., None])[..., 0] / np.maximum(weight, 1e-9)
+    # The line: offset = a + b along.
+    total = np.maximum(weight.sum(axis=-1), 1e-9)
+    mean_along, mean_offset = (weight * along).sum(axis=-1) / total, (weight * offset).sum(axis=-1) / total
+    from_mean = along - mean_along[..., None]
+    slope = (weight * from_mean * offset).sum(axis=-1) / np.maximum((weight * from_mean**2).sum(axis=-1), 1e-9)
+    through = corners + mean_along[..., None] * t + mean_offset[..., None] * n
+    direction = t + slope[..., None] * n
+    fitted = _intersections(np.roll(through, 1, axis=1), np.roll(direction, 1, axis=1), through, direction)
+    moved = np.linalg.norm(fitted - corners, axis=2, keepdims=True)
+    return np.where(moved < 2.0 * reach, fitted, corners)
+
+
+def _intersections(p: Array, u: Array, q: Array, v: Array) -> Array:
+    """Return where the lines p + s u and q + t v meet, (..., 2)."""
+    across = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    d = q - p
+    s = (d[..., 0] * v[..., 1] - d[..., 1] * v[..., 0]) / np.where(np.abs(across) < 1e-9, 1e-9, across)
+    return p + s[..., None] * u
+
+
+# -- the pose
+
+
+def project(points: Array, X_CT: RigidTransform, intrinsics: ArrayLike) -> Array:
+    """Return the pixels (n, 2) of points of T (n, 3) in m, by the pinhole equations.
+
+    Args:
+        points: In T, (n, 3) in m.
+        X_CT: The pose of T in the camera frame C: x right, y down, z forward.
+        intrinsics: [fx, fy, cx, cy] in pixels.
+    """
+    fx, fy, cx, cy = np.asarray(intrinsics, dtype=float)
+    x, y, z = X_CT.rotation().matrix() @ points.T + X_CT.translation()[:, None]
+    return np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
+
+
+def pose_from_markers(
+    detections: Detections,
+    board: MarkerBoard,
+    intrinsics: ArrayLike,
+    *,
+    time: float,
+    prediction: RigidTransform | None = None,
+    corner_noise: float = 0.15,
+    residual_limit: float = 1.5,
+    fewest: int = 3,
+) -> PoseEstimate:
+    r"""Estimate the pose X_CT of a body from its markers, by the least squares of the reprojection error.
+
+    With the corners p_i of all markers in T, minimize Σ \|u_i - π(R_CT p_i + p_CT)\|² by Gauss-Newton steps. The
+    covariance is σ² (JᵀJ)⁻¹ with the Jacobian J of the projection and σ the larger one of ``corner_noise`` and the
+    root mean square of the residuals. The start is the prediction, or OpenCV's SQPNP.
+
+    A few small markers in one plane have two poses that fit almost equally well. So fewer than ``fewest`` markers are
+    used only with a prediction, which decides.
+
+    Args:
+        detections: The markers in the image.
+        board: Where they are on the body.
+        intrinsics: [fx, fy, cx, cy] of the camera in pixels, as in Drake's CameraInfo.
+        time: When the image was taken, in s.
+        prediction: X_CT as it is expected.
+        corner_noise: The standard deviation of a corner's coordinates, in pixels; assumed, not derived.
+        residual_limit: The largest root mean square of the residuals of a valid estimate, in pixels.
+        fewest: How many markers suffice without a prediction.
+
+    Returns:
+        An estimate of X_CT; a missing one if there are too few markers, or if they do not fit.
+    """
+    found = detections.on(board)
+    if not len(found.ids) or (prediction is None and len(found.ids) < fewest):
+        return PoseEstimate.missing(time=time)
+    points = board.corners[board.find(found.ids)].reshape(-1, 3)
+    pixels = found.corners.reshape(-1, 2)
+    intrinsics = np.asarray(intrinsics, dtype=float)
+    start = prediction or _start(points, pixels, intrinsics)
+    fit = None if start is None else _refine(points, pixels, intrinsics, start)
+    if fit is None:
+        return PoseEstimate.missing(time=time)
+    X_CT, J, rms = fit
+    if not rms <= residual_limit:
+        return PoseEstimate.missing(time=time)
+    covariance = max(corner_noise, rms) ** 2 * np.linalg.inv(J.T @ J)
+    return PoseEstimate.of(X_CT, 0.5 * (covariance + covariance.T), time=time)
+
+
+def _start(points: Array, pixels: Array, intrinsics: Array) -> RigidTransform | None:
+    import cv2
+
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    solved, rotation, translation = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    if not solved or not np.isfinite(rotation).all():
+        return None
+    return RigidTransform(RotationMatrix(rotation_matrix(rotation.ravel())), translation.ravel())
+
+
+_MOST_STEPS = 15
+
+
+def _refine(
+    points: Array, pixels: Array, intrinsics: Array, start: RigidTransform
+) -> tuple[RigidTransform, Array, float] | None:
+    """Return the best pose near ``start``, the Jacobian (2 n, 6) of the pixels, and the residuals' root mean square."""
+    fx, fy, cx, cy = intrinsics
+    R, p = start.rotation().matrix(), start.translation()
+    for _ in range(_MOST_STEPS):
+        turned = points @ R.T
+        x, y, z = (turned + p).T
+        if z.min() < 1e-3:
+            return None  # Behind the camera.
+        residual = pixels - np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
+        J_p = np.zeros((len(points), 2, 3))
+        J_p[:, 0, 0], J_p[:, 0, 2] = fx / z, -fx * x / z**2
+        J_p[:, 1, 1], J_p[:, 1, 2] = fy / z, -fy * y / z**2
+        J = np.concatenate([-J_p @ cross_matrix(turned), J_p], axis=2).reshape(-1, 6)
+        step, *_ = np.linalg.lstsq(J, residual.ravel(), rcond=None)
+        step *= min(1.0, 0.5 / max(float(np.linalg.norm(step[:3])), 1e-12))
+        R, p = rotation_matrix(step[:3]) @ R, p + step[3:]
+        if np.abs(step).max() < 1e-8:
+            X_CT = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
+            return X_CT, J, float(np.sqrt(np.mean(residual**2)))
+    return None
