@@ -1,0 +1,58 @@
+import numpy as np
+from numpy.typing import NDArray
+
+Doubles = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+def to_world(directions_L: Doubles, times: Doubles, motion_WL: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the origins (m) and directions in W of rays from the origin of L, shapes (n, 3).
+
+    Args:
+        directions_L: Unit vectors, expressed in L at their firing times, shape (n, 3).
+        times: Firing times of the rays in s, shape (n,).
+        motion_WL: The motion of L in W, shape (18,): R by rows, p (m), w (rad/s) and v (m/s) at the time 0.
+    """
+
+def to_body(
+    origins_W: Doubles,
+    directions_W: Doubles,
+    times: Doubles,
+    motion_WB: Doubles,
+    sphere_B: Doubles,
+    nearest: Doubles,
+) -> tuple[Singles, Singles, Singles, Indices]:
+    """Return origins, directions, largest distances and numbers of the rays that may hit what moves with B, in B.
+
+    Args:
+        origins_W: Where the rays begin, in m, shape (n, 3).
+        directions_W: Their unit vectors, shape (n, 3).
+        times: Firing times in s, shape (n,).
+        motion_WB: The motion of B in W, as in `to_world`.
+        sphere_B: Center and radius of a sphere around all that moves with B, in m, shape (4,).
+        nearest: How far the rays reach, in m, shape (n,).
+    """
+
+def keep_nearest(
+    distances: Singles,
+    normals: Singles,
+    directions: Singles,
+    rays: Indices,
+    body: int,
+    *,
+    nearest: Doubles,
+    cosines: Doubles,
+    bodies: NDArray[np.int32],
+) -> None:
+    """Write the hits of ``body`` that are nearer than ``nearest`` to the last three arrays.
+
+    Args:
+        distances: Distances to the hits in m, shape (m,).
+        normals: Normals of the surface at the hits, of any length, shape (m, 3).
+        directions: Unit vectors of the rays, shape (m, 3).
+        rays: Numbers of the rays, shape (m,).
+        body: What is hit.
+        nearest: Distances of all rays in m, shape (n,).
+        cosines: Cosines of their angles of incidence, shape (n,).
+        bodies: What they hit, shape (n,).
+    """

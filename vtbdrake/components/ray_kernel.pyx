@@ -1,0 +1,116 @@
+"""Rays between moving frames, compiled.
+
+The motion of a frame B in W is an array of 18 numbers: R_WB by rows, p_WB, w_WB and v_WB at the time 0. Both velocities
+are constant: R_WB(t) = exp(t [w_WB]) R_WB and p_WB(t) = p_WB + t v_WB.
+"""
+
+from libc.math cimport cos, sin, sqrt
+
+import numpy as np
+
+
+def to_world(const double[:, ::1] directions_L, const double[::1] times, const double[::1] motion_WL):
+    cdef Py_ssize_t n = directions_L.shape[0], i, k
+    origins, directions = np.empty((n, 3)), np.empty((n, 3))
+    cdef double[:, ::1] p_W = origins
+    cdef double[:, ::1] d_W = directions
+    cdef const double* X = &motion_WL[0]
+    cdef const double* d_L
+    cdef double d[3]
+    for i in range(n):
+        d_L = &directions_L[i, 0]
+        for k in range(3):
+            p_W[i, k] = X[9 + k] + times[i] * X[15 + k]
+            d[k] = X[3 * k] * d_L[0] + X[3 * k + 1] * d_L[1] + X[3 * k + 2] * d_L[2]
+        turn(X + 12, times[i], d)
+        for k in range(3):
+            d_W[i, k] = d[k]
+    return origins, directions
+
+
+def to_body(
+    const double[:, ::1] origins_W,
+    const double[:, ::1] directions_W,
+    const double[::1] times,
+    const double[::1] motion_WB,
+    const double[::1] sphere_B,
+    const double[::1] nearest,
+):
+    cdef Py_ssize_t n = origins_W.shape[0], m = 0, i, k
+    origins, directions = np.empty((n, 3), dtype=np.float32), np.empty((n, 3), dtype=np.float32)
+    limits, rays = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.intp)
+    cdef float[:, ::1] p_B = origins
+    cdef float[:, ::1] d_B = directions
+    cdef float[::1] limit = limits
+    cdef Py_ssize_t[::1] ray = rays
+    cdef const double* X = &motion_WB[0]
+    cdef double radius = sphere_B[3], ahead, square
+    cdef double p_W[3]
+    cdef double d_W[3]
+    cdef double p[3]
+    cdef double d[3]
+    for i in range(n):
+        for k in range(3):
+            p_W[k] = origins_W[i, k] - X[9 + k] - times[i] * X[15 + k]
+            d_W[k] = directions_W[i, k]
+        turn(X + 12, -times[i], p_W)
+        turn(X + 12, -times[i], d_W)
+        ahead = square = 0.0
+        for k in range(3):
+            p[k] = X[k] * p_W[0] + X[3 + k] * p_W[1] + X[6 + k] * p_W[2]
+            d[k] = X[k] * d_W[0] + X[3 + k] * d_W[1] + X[6 + k] * d_W[2]
+            ahead += (sphere_B[k] - p[k]) * d[k]
+            square += (sphere_B[k] - p[k]) ** 2
+        # Leave out what passes the bounding sphere, ends before it, or begins behind it.
+        if square - ahead * ahead > radius * radius or ahead - radius > nearest[i] or ahead + radius < 0.0:
+            continue
+        for k in range(3):
+            p_B[m, k] = <float>p[k]
+            d_B[m, k] = <float>d[k]
+        limit[m] = <float>nearest[i]
+        ray[m] = i
+        m += 1
+    return origins[:m], directions[:m], limits[:m], rays[:m]
+
+
+def keep_nearest(
+    const float[::1] distances,
+    const float[:, ::1] normals,
+    const float[:, ::1] directions,
+    const Py_ssize_t[::1] rays,
+    int body,
+    *,
+    double[::1] nearest,
+    double[::1] cosines,
+    int[::1] bodies,
+):
+    cdef Py_ssize_t k, i
+    cdef double x, y, z
+    for k in range(rays.shape[0]):
+        i = rays[k]
+        if distances[k] >= nearest[i]:
+            continue
+        x, y, z = normals[k, 0], normals[k, 1], normals[k, 2]
+        nearest[i] = distances[k]
+        cosines[i] = abs(x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]) / sqrt(x * x + y * y + z * z)
+        bodies[i] = body
+
+
+cdef inline void turn(const double* w, double t, double* v) noexcept:
+    """Turn v by exp(t [w]), by the formula of Rodrigues."""
+    cdef double square = t * t * (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]), a, b, angle
+    cdef double x, y, z
+    if square == 0.0:
+        return
+    if square < 0.01:
+        # To 1e-12, and several times faster.
+        a = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        b = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    else:
+        angle = sqrt(square)
+        a, b = sin(angle) / angle, (1.0 - cos(angle)) / square
+    a, b = a * t, b * t * t
+    x, y, z = w[1] * v[2] - w[2] * v[1], w[2] * v[0] - w[0] * v[2], w[0] * v[1] - w[1] * v[0]
+    v[0] += a * x + b * (w[1] * z - w[2] * y)
+    v[1] += a * y + b * (w[2] * x - w[0] * z)
+    v[2] += a * z + b * (w[0] * y - w[1] * x)
