@@ -23,6 +23,7 @@ from vtbdrake.recording.replay import replay as replay
 from vtbdrake.rollout import Constraint as Constraint
 from vtbdrake.rollout import Pruning as Pruning
 from vtbdrake.rollout import Quality as Quality
+from vtbdrake.rollout import RecordedMotion as RecordedMotion
 from vtbdrake.state import Snapshot as Snapshot
 from vtbdrake.testbed import DpsAlone as DpsAlone
 from vtbdrake.testbed import Interface as Interface

@@ -47,6 +47,8 @@ def describe(problem: Problem) -> dict[str, Any]:
         "start": _start(problem),
         "code": _classes(problem),
     }
+    if task.motion is not None:
+        described["memory"] = float(task.motion.memory)
     plain: dict[str, Any] = json.loads(json.dumps(described))
     return plain
 

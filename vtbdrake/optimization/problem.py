@@ -16,9 +16,19 @@ from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, borrowed, grid, make_sweep, numeric, roll_out
-from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, RolloutRunner, RolloutTask
+from vtbdrake.rollout import (
+    Constraint,
+    Executor,
+    MotionError,
+    Quality,
+    RecordedMotion,
+    RolloutResult,
+    RolloutRunner,
+    RolloutTask,
+)
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
+from vtbdrake.rollout.recorded_motion import MotionPlayer
 from vtbdrake.rollout.runner import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, VirtualTestbed
@@ -95,11 +105,14 @@ class Problem:
         start: s0 from a snapshot instead of the defaults. Take that of a running simulation with error control by
             ``testbed.fork(simulator)``: a plain ``testbed.snapshot(context)`` lacks the integrator's memory of its last
             step, so that the forecast differs a little from what follows.
+        motion: The motion of the testbed does not depend on the parameters (the pose of a camera that looks on, say):
+            it is simulated once for each condition, and candidates are judged along it, with the same result, see
+            `RecordedMotion`.
 
     Raises:
         ValueError: An address does not exist, a range exceeds its variable's bounds, a condition sets a parameter, the
-            horizon, threshold or sample period is invalid, the start is of another scenario or of a DPS alone, or an
-            argument is of another type.
+            horizon, threshold or sample period is invalid, the start is of another scenario or of a DPS alone, the
+            motion depends on a parameter (`MotionError`), or an argument is of another type.
     """
 
     def __init__(
@@ -115,6 +128,7 @@ class Problem:
         risk: str | Risk = "worst",
         constraints: Sequence[Constraint] = (),
         start: Snapshot | None = None,
+        motion: RecordedMotion | None = None,
     ) -> None:
         self.parameters: tuple[Dimension, ...] = all_of(
             Dimension, parameters, name="parameters", form="[Parameter(address, lower, upper), ...]"
@@ -137,6 +151,7 @@ class Problem:
             threshold=threshold,
             sample_period=sample_period,
             start=start,
+            motion=self._along(motion),
         )
         if self.task.threshold is not None and len(self.objectives) > 1:
             raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
@@ -166,6 +181,16 @@ class Problem:
         rows |= {"conditions": f"{len(self.conditions)} ({self.risk!r})"} if len(self.conditions) > 1 else {}
         return summary_html(f"Problem of {type(self.scenario).__name__}", rows)
 
+    def _along(self, motion: RecordedMotion | None) -> RecordedMotion | None:
+        if motion is None:
+            return None
+        for parameter in self.parameters:
+            if parameter.is_field:
+                raise MotionError(
+                    f"{parameter.address} takes another testbed for each value, with another motion: leave out motion="
+                )
+        return replace(motion, varied=[parameter.address for parameter in self.parameters])
+
     def _check(self) -> None:
         if not self.conditions:
             raise ValueError("a problem has at least one condition; {} is the scenario as it is")
@@ -189,6 +214,8 @@ class Problem:
         for measure in (*self.objectives, *self.constraints):
             for address in measure.of:
                 self.testbed.reader(address)
+        if self.task.motion is not None:
+            MotionPlayer(self.task.motion, self.testbed)
 
     def _scenario(self, values: Mapping[str, Any]) -> Scenario:
         fields, _ = split(values)
@@ -271,7 +298,8 @@ class Problem:
         """Find obstacles to parallel rollouts: memory outside the Context, values that cannot be sent to workers.
 
         It takes about a second: the first part of a rollout is simulated four times, with equal results: twice in a
-        row, beside another rollout on the same Diagram, and in another process. Print what it returns.
+        row, beside another rollout on the same Diagram, and in another process. Print what it returns. With ``motion``,
+        whole rollouts at the ends of the ranges are compared with those along the motion, too.
 
         Raises:
             QualityError: f raises, is negative or NaN.
@@ -288,7 +316,23 @@ class Problem:
                 pack(values)
             except WorkerError as error:
                 travelling.append(str(error))
+        if self.task.motion is not None:
+            travelling += self._forgetting()
         return replace(found, findings=(*found.findings, *travelling))
+
+    def _forgetting(self) -> list[str]:
+        """Return a sentence if rollouts along the motion differ from whole ones at the ends of the ranges."""
+        assert self.task.motion is not None
+        for k in (0, -1):
+            point = self.values([p.ends[k] for p in self.parameters], condition=k % len(self.conditions))
+            tasks = (self.task, replace(self.task, motion=None))
+            along, whole = (self._runner(task, point).run(split(point)[1]) for task in tasks)
+            if not along.identical(whole):
+                return [
+                    f"a rollout along the recorded motion ends with {along}, and the whole one with {whole}: what "
+                    f"follows the parameters remembers more than memory={self.task.motion.memory:g} s"
+                ]
+        return []
 
     def sweep(
         self,

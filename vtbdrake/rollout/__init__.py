@@ -11,6 +11,7 @@ from vtbdrake.rollout.executor import (
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.pruning import Cutoff, Pruning
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
+from vtbdrake.rollout.recorded_motion import MotionError, RecordedMotion
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.start import Start, StartError
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
@@ -22,10 +23,12 @@ __all__ = [
     "Executor",
     "FuturesExecutor",
     "Measure",
+    "MotionError",
     "ProcessExecutor",
     "Pruning",
     "Quality",
     "QualityError",
+    "RecordedMotion",
     "RolloutResult",
     "RolloutRunner",
     "RolloutTask",

@@ -7,6 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
+from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording, fixed
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
@@ -39,7 +41,8 @@ class RolloutRunner:
         testbed: built from the task's scenario; several runners may share one. Left out, it is built.
 
     Raises:
-        ValueError: the testbed draws, or the task asks for an address that the testbed does not have.
+        ValueError: the testbed draws, or the task asks for an address that the testbed does not have, or (a
+            `MotionError`) for a motion that depends on what is varied along it.
     """
 
     def __init__(self, task: RolloutTask, testbed: VirtualTestbed | None = None) -> None:
@@ -68,6 +71,8 @@ class RolloutRunner:
         self._context = self._simulator.get_mutable_context()
         self._copier = self.testbed.copier_from(self.testbed)
         self._beginning = Beginning(self.testbed, self._s0, self._copier)
+        self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
+        self._recordings: dict[Hashable, Recording] = {}
         self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
@@ -92,20 +97,29 @@ class RolloutRunner:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
             StartError: ``start`` does not fit the testbed.
             CancelledError: ``cancel`` was set, or the deadline of ``cutoff`` has passed.
+            MotionError: the motion along which the task's rollouts go depends on what is varied.
         """
         begin = time.perf_counter()
         self._begin(start)
         cutoff = cutoff or Cutoff()
+
+        def check() -> None:
+            if cutoff.is_over or (cancel is not None and cancel.is_set()):
+                raise CancelledError
+            interruptible.check()
+
         samples = _Samples(self, cutoff.to_beat)
         end, message = HORIZON, ""
         with Interruptible() as interruptible:
             try:
+                recording = self._recording(parameters, check)
                 self._reset(parameters)
-                for t, instant in zip(self._times, self._instants, strict=True):
-                    if cutoff.is_over or (cancel is not None and cancel.is_set()):
-                        raise CancelledError
-                    interruptible.check()
+                for index, (t, instant) in enumerate(zip(self._times, self._instants, strict=True)):
+                    check()
+                    self._jump(recording, index)
                     status = self._advance(t, instant)
+                    if self._player is not None and index < len(recording.worlds):
+                        self._player.check(self._context, recording.worlds[index])
                     terminated = _terminated(status)
                     reached = self._context.get_time() - self._t0 if terminated else float(t)
                     if samples.take(reached) and not self.task.run_on:
@@ -189,6 +203,48 @@ class RolloutRunner:
     def _set_times(self) -> None:
         self._t0 = self._beginning.context.get_time()
         self._instants = self.task.instants(self._t0, self._timings)
+        self._recordings.clear()
+        self._windows: list[float | None] = [None] * len(self._times)
+        if self._player is not None:
+            self._windows = self._player.begins(self._instants)
+
+    def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
+        """Return the motion with the varied variables as they are in s0, recorded when it is first asked for.
+
+        What fails or ends it early does the same to the rollouts along it, which go on by themselves from there.
+        """
+        if self._player is None:
+            return Recording()
+        others = fixed(self._player.motion, parameters)
+        key = _key(others)
+        if key not in self._recordings:
+            recording = Recording()
+            with suppress(SimulationError):
+                self._reset(others)
+                for t, instant, window in zip(self._times, self._instants, self._windows, strict=True):
+                    check()
+                    if window is not None and _terminated(self._advance(window, window)):
+                        break
+                    start = self._player.take(self._context) if window is not None else None
+                    status = self._advance(t, instant)
+                    recording.starts.append(start)
+                    recording.worlds.append(self._player.world(self._context))
+                    if _terminated(status):
+                        break
+            self._recordings[key] = recording
+        return self._recordings[key]
+
+    def _jump(self, recording: Recording, index: int) -> None:
+        """Go to the beginning of the window of a sample, if it has one and it was recorded."""
+        window = self._windows[index]
+        start = recording.starts[index] if index < len(recording.starts) else None
+        if self._player is None or window is None or start is None:
+            return
+        apply_simulator_config(self.testbed.simulator_config, self._simulator)
+        self._simulator.set_target_realtime_rate(0.0)
+        self._player.put(self._context, window, start)
+        with _FailuresAsOutcomes():
+            self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
         # A new integrator: the step size of a used one would change the trajectory.
@@ -336,8 +392,9 @@ class _Samples:
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
         runner = self._runner
-        # A rollout that failed after t* has gone on since: simulate it again up to t*.
-        at_end = t_star == self._times[-1] and runner.context.get_time() == self._clock
+        # A rollout that failed after t* has gone on since: simulate it again up to t*. Along a motion, what follows
+        # knows only what f needs.
+        at_end = runner.task.motion is None and t_star == self._times[-1] and runner.context.get_time() == self._clock
         if at_end:
             return runner.testbed.snapshot(runner.context)
         return runner.state(parameters, t_star, start=runner._beginning.start)

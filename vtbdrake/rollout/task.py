@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform
 from vtbdrake.argument_checks import as_addresses, as_number
 from vtbdrake.rollout.pruning import Pruning
 from vtbdrake.rollout.quality import Measure, Quality
+from vtbdrake.rollout.recorded_motion import RecordedMotion
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
@@ -135,6 +136,7 @@ class RolloutTask:
         catch: what f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
             diverges. Otherwise it is raised, and ends the others.
         pruning: when a rollout that is of no more use ends; None: never.
+        motion: the rollouts go along recorded motions, see `RecordedMotion`; None: each is simulated as a whole.
     """
 
     scenario: Scenario
@@ -149,6 +151,7 @@ class RolloutTask:
     measures: tuple[Measure, ...] = ()
     catch: bool = False
     pruning: Pruning | None = None
+    motion: RecordedMotion | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.scenario, Scenario):
@@ -176,6 +179,8 @@ class RolloutTask:
                 f"a horizon of {self.horizon:g} s has {self.horizon / self.sample_period:.3g} samples, one every "
                 f"{self.sample_period:g} s, but at most {_MOST_SAMPLES:g} fit into memory: take a longer sample period"
             )
+        if not isinstance(self.motion, RecordedMotion | None):
+            raise ValueError(f"rollouts go along a RecordedMotion(memory=seconds), or None, not {self.motion!r}")
         self._check_threshold()
         self._check_pruning()
 

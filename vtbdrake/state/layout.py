@@ -83,6 +83,10 @@ class StateLayout:
         places = [whole._slices[name] for name in self._slices]
         return np.concatenate([np.arange(place.start, place.stop) for place in places] or [np.arange(0)])
 
+    def name_at(self, index: int) -> str:
+        """Return the name of the group in which the number ``index`` lies."""
+        return next(name for name, place in self._slices.items() if place.start <= index < place.stop)
+
     def slice_of(self, variable: Variable) -> slice | None:
         """Return where in the numbers the value of a variable lies, in C order; None if it does not lie there."""
         place = variable.place

@@ -1,0 +1,179 @@
+"""Rollouts along a recorded motion: the world is simulated once for all candidates that do not move it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import inf
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.state.layout import FlatState, StateLayout
+from vtbdrake.state.systems import is_plant, leaves
+from vtbdrake.state.variables import A
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.dependencies import chain, followers
+from vtbdrake.testbed.switch import BOARD, T_ACT
+
+# Windows begin this part of the shortest period after an event: not at an event, where rounding would matter.
+_BETWEEN = 0.382
+
+
+class MotionError(ValueError):
+    """A motion that cannot be recorded, or that depends on what is varied along it."""
+
+
+@dataclass(frozen=True)
+class RecordedMotion:
+    """The motion of the testbed does not depend on what is varied: it is simulated once, and recorded.
+
+    A camera that looks on, say, and what perceives its images. Each candidate is then simulated only in a window of
+    ``memory`` seconds before each sample of f, from the recorded state. If what depends on the varied variables, the
+    followers, has forgotten after ``memory`` seconds what was before, then the result equals that of the whole
+    rollout, to the last bit. So images that nothing reads are not rendered, and the world between the samples is not
+    simulated. The gain is about the sample period over the memory.
+
+    What follows is found from the connections of the Diagram. If the plant or an actuator follows, the motion is
+    refused. At each sample, the state of all systems that do not follow is compared with the recorded one.
+    `Problem.check` compares whole rollouts with those along the motion, and finds a memory that is too short. The
+    testbed must have no continuous state: a discrete plant continues exactly from a recorded state, an integrator with
+    error control does not.
+
+    Attributes:
+        memory: In seconds. Of a camera of period T and latency L, and a detector of latency D that samples at an offset
+            above L, it is T + D at most. A filter never forgets: let it not follow, or read f before it.
+        varied: Addresses of the variables that are varied, parameters of systems that are no part of the motion; a
+            `Problem` sets them to those of its parameters.
+
+    Raises:
+        ValueError: The memory is not a positive time.
+    """
+
+    memory: float
+    varied: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "memory", as_number("the memory of a recorded motion", self.memory))
+        object.__setattr__(self, "varied", as_addresses("what is varied along a recorded motion", self.varied))
+        if not 0.0 < self.memory < inf:
+            raise ValueError(f"the memory of a recorded motion is a positive, finite time in s, not {self.memory}")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recorded motion, at the sample times.
+
+    Attributes:
+        starts: The state at the beginning of the window of each sample; None where the rollout goes on from the sample
+            before, which is not longer ago.
+        worlds: The numbers of all that does not follow, at each sample.
+    """
+
+    starts: list[FlatState | None] = field(default_factory=list)
+    worlds: list[np.ndarray] = field(default_factory=list)
+
+
+class MotionPlayer:
+    """Sets contexts of a testbed to recorded states, and compares them with these.
+
+    Args:
+        motion: What is varied, and for how long it is remembered.
+        testbed: The testbed of the rollouts.
+
+    Raises:
+        MotionError: The motion depends on what is varied, or cannot be continued exactly from a recorded state.
+    """
+
+    def __init__(self, motion: RecordedMotion, testbed: VirtualTestbed) -> None:
+        self.motion = motion
+        self._testbed = testbed
+        if testbed.default_context().num_continuous_states():
+            raise MotionError(
+                "a motion is recorded of a testbed without continuous state, from which rollouts continue exactly: "
+                "use a discrete plant (a positive time_step), and discrete systems"
+            )
+        following = self._followers()
+        self._state = StateLayout(testbed.diagram, state=lambda path: path != BOARD, parameters=lambda path: False)
+        self._world = StateLayout(
+            testbed.diagram, state=lambda path: path != BOARD and path not in following, parameters=lambda path: False
+        )
+
+    def _followers(self) -> dict[str, str]:
+        systems = dict(leaves(self._testbed.diagram))
+        variables = self._testbed.variables()
+        sources = {}
+        for address in self.motion.varied:
+            owners = [path for path in systems if address.startswith(f"{path}.")]
+            if not owners or is_plant(systems[owners[0]]):
+                raise MotionError(
+                    f"{address} belongs to the plant, to the scene or to the switches, on which the motion depends: "
+                    "vary it without motion="
+                )
+            if variables[address].kind != A:
+                raise MotionError(
+                    f"{address} changes while time runs, so that it is forgotten: along a recorded motion, vary "
+                    "parameters (of kind 'a')"
+                )
+            sources[owners[0]] = address
+        found = followers(self._testbed.diagram, sources)
+        for path in found:
+            if is_plant(systems[path]) or path.startswith(T_ACT):
+                way = chain(found, path)
+                raise MotionError(
+                    f"the motion depends on {sources[way[0]]}, by way of {' -> '.join(way)}: let the DPS move by "
+                    "sensors that do not depend on it, or leave out motion="
+                )
+        return found
+
+    def begins(self, instants: np.ndarray) -> list[float | None]:
+        """Return when the window of each sample begins, in seconds; None if the rollout goes on from the one before.
+
+        Args:
+            instants: The simulator's time at each sample, shape (n,).
+        """
+        periods = [period for period, _ in self._testbed.event_timings()]
+        found: list[float | None] = [None]
+        for before, instant in pairwise(instants):
+            begin = float(instant) - self.motion.memory
+            if periods:
+                step = min(periods)
+                begin = (np.floor(begin / step) - 1.0 + _BETWEEN) * step
+            found.append(float(begin) if begin > before else None)
+        return found
+
+    def take(self, context: Context) -> FlatState:
+        """Return the state from which a window begins."""
+        return self._state.take(context)
+
+    def world(self, context: Context) -> np.ndarray:
+        """Return the numbers of all that does not follow, shape (n,)."""
+        return self._world.take(context).numbers
+
+    def put(self, context: Context, time: float, start: FlatState) -> None:
+        """Set time and state of ``context`` to a recorded one; its parameters stay."""
+        context.SetTime(time)
+        self._state.put(context, start)
+
+    def check(self, context: Context, recorded: np.ndarray) -> None:
+        """Compare what does not follow with the recorded numbers.
+
+        Raises:
+            MotionError: They differ.
+        """
+        here = self._world.take(context).numbers
+        if np.array_equal(here, recorded, equal_nan=True):
+            return
+        index = int(np.flatnonzero((here != recorded) & ~(np.isnan(here) & np.isnan(recorded)))[0])
+        raise MotionError(
+            f"the motion depends on {', '.join(self.motion.varied)}, though no connection shows how: at "
+            f"t = {context.get_time():g} s, {self._world.name_at(index)} is not as recorded. A system has memory "
+            "outside the Context, see Problem.check"
+        )
+
+
+def fixed(motion: RecordedMotion, parameters: Mapping[str, object]) -> dict[str, object]:
+    """Return what is set in s0 beside the varied variables: each such choice has a motion of its own."""
+    return {address: value for address, value in parameters.items() if address not in motion.varied}
