@@ -31,8 +31,9 @@ from pydrake.systems.sensors import (
 
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.lcm.bridge import ChannelReader
-from vtbdrake.lcm.drake_messages import image_array_map, image_map, point_cloud_map
+from vtbdrake.lcm.drake_messages import image_array_map, image_map, point_cloud_map, scan_map
 from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.scan import Scan
 from vtbdrake.testbed import Signal
 
 WIDTH, HEIGHT = 6, 4
@@ -262,7 +263,55 @@ def test_point_cloud_signal_needs_a_point_cloud() -> None:
         point_cloud_map(CHANNEL, "lidar").decoder([camera()])
 
 
-@pytest.mark.parametrize("kind", ["images", "cloud"])
+def scan(*, stamp: float = 3.0) -> Scan:
+    chance = np.random.default_rng(4)
+    directions = chance.normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return Scan(directions, chance.uniform(0.5, 30.0, 40), chance.uniform(-0.1, 0.0, 40), stamp)
+
+
+LASER, LASER_MAP = Signal("laser", model_value=Scan.empty()), scan_map(CHANNEL, "laser")
+
+
+def test_scan_arrives_in_single_precision() -> None:
+    sent = scan()
+    received = take(LASER_MAP, [LASER], LASER_MAP.encoder([LASER])({"laser": sent}, 3_000_000))["laser"]
+    assert (received.count, received.sent, received.value.stamp) == (1, 3.0, 3.0)
+    np.testing.assert_allclose(received.value.points(), sent.points(), rtol=1e-6)
+    np.testing.assert_allclose(received.value.times, sent.times, rtol=1e-6)
+
+
+def test_empty_scan_arrives() -> None:
+    data = LASER_MAP.encoder([LASER])({"laser": Scan.empty()}, 1)
+    assert take(LASER_MAP, [LASER], data)["laser"].value.ranges.shape == (0,)
+
+
+def test_points_without_a_return_are_left_out() -> None:
+    message = lcmt_point_cloud.decode(LASER_MAP.encoder([LASER])({"laser": scan()}, 1))
+    points = np.frombuffer(message.data, np.float32).reshape(-1, 4).copy()
+    points[3, 0], points[7, 2], points[9, :3] = np.nan, -np.inf, 0.0
+    message.data = points.tobytes()
+    received = take(LASER_MAP, [LASER], message.encode())["laser"]
+    np.testing.assert_allclose(received.value.points(), np.delete(scan().points(), [3, 7, 9], axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("time", [1e-3, np.nan])
+def test_ray_after_the_stamp_is_rejected(time: float) -> None:
+    message = lcmt_point_cloud.decode(LASER_MAP.encoder([LASER])({"laser": scan()}, 1))
+    points = np.frombuffer(message.data, np.float32).reshape(-1, 4).copy()
+    points[3, 3] = time
+    message.data = points.tobytes()
+    assert take(LASER_MAP, [LASER], message.encode())["laser"].rejected == {"time": 1}
+
+
+def test_point_cloud_is_no_scan() -> None:
+    data = point_cloud_map(CHANNEL, "lidar").encoder([Signal("lidar", model_value=cloud(0))])({"lidar": cloud(5)}, 1)
+    assert take(LASER_MAP, [LASER], data)["laser"].rejected == {"missing": 1}
+    with pytest.raises(ValueError, match="needs a Scan as model_value"):
+        LASER_MAP.encoder([Signal("laser", model_value=cloud(0))])
+
+
+@pytest.mark.parametrize("kind", ["images", "cloud", "scan"])
 def test_broken_pictures_are_only_counted(kind: str) -> None:
     chance = random.Random(3)
     map: LcmMap
@@ -271,6 +320,9 @@ def test_broken_pictures_are_only_counted(kind: str) -> None:
         images = [noise(image_type) for image_type in types.values()]
         good = sent_by_drake(ImageToLcmImageArrayT(*types), images, lcmt_image_array)
         map, signal = image_array_map(CHANNEL, {"camera": "color"}), camera()
+    elif kind == "scan":
+        good = LASER_MAP.encoder([LASER])({"laser": scan()}, 1)
+        map, signal = scan_map(CHANNEL, "camera"), Signal("camera", model_value=Scan.empty())
     else:
         good = sent_by_drake(PointCloudToLcm("lidar"), [cloud(3)], lcmt_point_cloud)
         map, signal = point_cloud_map(CHANNEL, "camera"), Signal("camera", model_value=cloud(0))

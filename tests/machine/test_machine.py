@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drake import lcmt_iiwa_status
+from drake import lcmt_iiwa_status, lcmt_point_cloud
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, LeafSystem, State
 
 from tests.machine.robot import COMMAND, ELBOW, PERIOD, STATUS, RobotScenario, state, torque
 from tests.testbeds import AcrobotScenario
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status, scan_map
 from vtbdrake.lcm.protocol import Protocol, ProtocolError, protocol_of
 from vtbdrake.machine import (
     PERTURBED,
@@ -25,7 +27,8 @@ from vtbdrake.machine import (
     NoBrake,
     perturbed_values,
 )
-from vtbdrake.testbed import WorldAlone
+from vtbdrake.scan import Scan
+from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder, WorldAlone
 
 SHOULDER_RATE, ELBOW_RATE = "sim.sys.Acrobot.shoulder.velocity", "sim.sys.Acrobot.elbow.velocity"
 PUSHED = {ELBOW: 0.3, ELBOW_RATE: 1.0}
@@ -85,27 +88,84 @@ def test_newest_command_acts() -> None:
     assert run(twice, 3) == run(once, 3)
 
 
-def test_channel_with_a_period_of_its_own() -> None:
-    @dataclass
-    class Slow(RobotScenario):
-        def deployment(self) -> Deployment:
-            protocol = Protocol(
-                sense=[
-                    iiwa_status({"position": "joint_position_measured"}, channel="FAST"),
-                    iiwa_status({"velocity": "joint_velocity_estimated"}, channel="SLOW"),
-                ],
-                act=[iiwa_command({"torque": "joint_torque"})],
-                periods={"SLOW": 0.005},
-            )
-            return Deployment(protocol=protocol)
+@dataclass
+class SlowScenario(RobotScenario):
+    def deployment(self) -> Deployment:
+        protocol = Protocol(
+            sense=[
+                iiwa_status({"position": "joint_position_measured"}, channel="FAST"),
+                iiwa_status({"velocity": "joint_velocity_estimated"}, channel="SLOW"),
+            ],
+            act=[iiwa_command({"torque": "joint_torque"})],
+            periods={"SLOW": 0.005},
+        )
+        return Deployment(protocol=protocol)
 
-    robot = Machine(Slow())
+
+def test_channel_with_a_period_of_its_own() -> None:
+    robot = Machine(SlowScenario())
     told = {}
     for _ in range(11):
         told[robot.cycle] = [channel for channel, _ in robot.messages()]
         robot.advance()
-    assert [cycle for cycle, channels in told.items() if "SLOW" in channels] == [0, 5, 10]
+    assert [cycle for cycle, channels in told.items() if "SLOW" in channels] == [0, 1, 6]
     assert all("FAST" in channels for channels in told.values())
+
+
+def test_slow_message_follows_when_its_cycle_is_skipped() -> None:
+    robot = Machine(SlowScenario())
+    robot.messages()
+    for _ in range(8):
+        robot.advance()
+    assert [channel for channel, _ in robot.messages()] == ["FAST", "SLOW"]
+    robot.advance()
+    assert [channel for channel, _ in robot.messages()] == ["FAST"]
+
+
+class Laser(LeafSystem):
+    """Every 10 ms, a scan that was complete 4 ms before.
+
+    .. pydrake_system::
+
+        name: Laser
+        output_ports:
+        - scan
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._scan = self.DeclareAbstractState(Value(Scan.empty()))
+        self.DeclareStateOutputPort("scan", self._scan)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(0.01, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        scan = Scan(np.eye(3), np.ones(3), np.array([-0.002, -0.001, 0.0]), context.get_time() - 0.004)
+        state.get_mutable_abstract_state(self._scan).set_value(scan)
+
+
+@dataclass
+class LaserScenario(RobotScenario):
+    def interface(self) -> Interface:
+        known = super().interface()
+        return replace(known, sense=[*known.sense, Signal("scan", model_value=Scan.empty())])
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        builder.sim_sensor("scan", builder.add("sense", "laser", Laser()).get_output_port())
+
+    def deployment(self) -> Deployment:
+        sense = [*PROTOCOL.sense, scan_map("SCAN", "scan")]
+        return Deployment(protocol=replace(PROTOCOL, sense=sense, periods={"SCAN": 0.01}))
+
+
+def test_message_of_a_scan_has_the_time_of_the_scan() -> None:
+    robot = Machine(LaserScenario(), epoch=5_000_000)
+    sent = []
+    for cycle in range(32):
+        scans = [data for name, data in robot.messages() if name == "SCAN"]
+        sent += [(cycle, lcmt_point_cloud.decode(data).utime) for data in scans]
+        robot.advance()
+    assert sent == [(0, 5_000_000), (1, 4_996_000), (11, 5_006_000), (21, 5_016_000), (31, 5_026_000)]
 
 
 def test_epoch_is_the_time_of_cycle_0() -> None:

@@ -6,6 +6,7 @@ from vtbdrake.lcm.drake_messages import iiwa_status as iiwa_status
 from vtbdrake.lcm.drake_messages import image_array_map as image_array_map
 from vtbdrake.lcm.drake_messages import image_map as image_map
 from vtbdrake.lcm.drake_messages import point_cloud_map as point_cloud_map
+from vtbdrake.lcm.drake_messages import scan_map as scan_map
 from vtbdrake.lcm.hub import Hub as Hub
 from vtbdrake.lcm.hub import HubConfig as HubConfig
 from vtbdrake.lcm.maps import LcmMap as LcmMap

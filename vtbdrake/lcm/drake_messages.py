@@ -1,4 +1,4 @@
-"""Ready-made maps for Drake's message types: iiwa arms, camera images and point clouds."""
+"""Ready-made maps for Drake's message types: iiwa arms, camera images, point clouds and laser scans."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from drake import (
 
 from vtbdrake.lcm.maps import Decoder, Encoder, LcmMap, VectorMap, decode, vector_map
 from vtbdrake.lcm.messages import MalformedError
+from vtbdrake.scan import Scan
 from vtbdrake.testbed import Signal
 
 if TYPE_CHECKING:
@@ -251,6 +252,73 @@ def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
     The name of the signal is the ``frame_name`` of the clouds that are sent.
     """
     return PointCloudMap(channel=channel, type=lcmt_point_cloud, signals=[signal])
+
+
+class ScanMap(LcmMap):
+    """An `LcmMap` of laser scans; `scan_map` makes one.
+
+    Rejected are a message that lacks one of the fields (``missing``), one whose data are not as long as it says
+    (``size``), and one with a ray that is fired after the stamp (``time``).
+    """
+
+    def decoder(self, signals: Sequence[Signal]) -> Decoder:
+        signal = self._checked(signals)
+
+        def decode_scan(data: bytes) -> tuple[float, Mapping[str, Any]]:
+            message = decode(self.type, data)
+            stamp = message.utime * 1e-6
+            return stamp, {signal.name: _to_scan(message, stamp)}
+
+        return decode_scan
+
+    def encoder(self, signals: Sequence[Signal]) -> Encoder:
+        signal = self._checked(signals)
+
+        def encode_scan(values: Mapping[str, Any], utime: int) -> bytes:
+            scan = values[signal.name]
+            points = np.empty(len(scan.ranges), [(name, "<f4") for name in ("x", "y", "z", "t")])
+            points["x"], points["y"], points["z"] = scan.points().T
+            points["t"] = scan.times
+            return _cloud_message(points, signal.name, utime)
+
+        return encode_scan
+
+    def age(self, values: Mapping[str, Any], time: float) -> float:
+        (scan,) = values.values()
+        return float(time - scan.stamp)
+
+    def _checked(self, signals: Sequence[Signal]) -> Signal:
+        (signal,) = signals
+        if not isinstance(signal.model_value, Scan):
+            raise ValueError(
+                f"signal {signal.name} on channel {self.channel} needs a Scan as model_value, such as Scan.empty(), "
+                f"not {signal.model_value!r}"
+            )
+        return signal
+
+
+def scan_map(channel: str, signal: str) -> ScanMap:
+    """Return a map for laser scans by `lcmt_point_cloud` messages.
+
+    The points have the fields ``x``, ``y`` and ``z`` in m, and ``t``: when the ray was fired, in s relative to the
+    message's time, at which the scan was complete. Their numbers have 32 bits. Points that are not finite, or at the
+    origin, stand for rays without a return, and are left out of the received scan. Its stamp is in the sender's time.
+    """
+    return ScanMap(channel=channel, type=lcmt_point_cloud, signals=[signal])
+
+
+def _to_scan(message: Any, stamp: float) -> Scan:
+    """Return the scan in an `lcmt_point_cloud`."""
+    points = _points(message)
+    with np.errstate(over="ignore", invalid="ignore"):
+        columns = [_column(points, name).astype(float) for name in ("x", "y", "z", "t")]
+        ranges = np.sqrt(columns[0] ** 2 + columns[1] ** 2 + columns[2] ** 2)
+    returned = np.isfinite(ranges) & (ranges > 0.0)
+    ranges, times = ranges[returned], columns[3][returned]
+    if not (times <= 0.0).all() or not np.isfinite(times).all():
+        raise MalformedError("time")
+    directions = np.stack([column[returned] for column in columns[:3]], axis=1) / ranges[:, np.newaxis]
+    return Scan(directions, ranges, times, stamp)
 
 
 def _to_cloud(message: Any, model: PointCloud) -> PointCloud:

@@ -146,6 +146,17 @@ class LcmMap:
             raise ValueError(f"the map of channel {self.channel} has no encode=: it cannot send")
         return lambda values, utime: bytes(to_message(values, utime).encode())
 
+    def age(self, values: Mapping[str, Any], time: float) -> float:
+        """Return how old values are, in seconds, by which their message is stamped earlier than it is sent.
+
+        It is 0 by default: most values do not tell.
+
+        Args:
+            values: The values by signal, which are about to be sent by a simulated machine.
+            time: Time in that machine's world in seconds.
+        """
+        return 0.0
+
 
 class Field(NamedTuple):
     """A field of a message type."""

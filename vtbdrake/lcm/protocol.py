@@ -34,7 +34,9 @@ class Protocol:
         commands: Commands u that reach the controller over LCM; the machine has no part in them.
         reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
             machine says it executed in the cycle that has just ended.
-        periods: By channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named.
+        periods: By channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named. The
+            first message leaves in cycle 0, the others one cycle after the multiples of the period: a sensor that
+            samples at these has its new value then.
     """
 
     sense: Sequence[LcmMap]

@@ -358,6 +358,7 @@ class _Sensors:
             map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
             for map in protocol.sense
         }
+        self._due = dict.fromkeys(self._cycles, 0)  # The cycle of the next message: it may be skipped, and sent later.
         self._ports = {name: world.diagram.GetOutputPort(f"sense.{name}") for name in vectors}
         self._readers = {name: world.reader(f"sense.{name}") for name in signals if name not in vectors}
         self.channels = list(self._cycles)
@@ -370,16 +371,15 @@ class _Sensors:
             cycle: The number of the cycle.
             time: The time of a message in microseconds, as a function of its channel.
         """
-        return [
-            Packet(
-                map.channel,
-                map.type,
-                encode({name: self._measure(name, context) for name in map.signals}, time(map.channel)),
-                cycle,
-            )
-            for map, encode in self._maps
-            if cycle % self._cycles[map.channel] == 0
-        ]
+        packets = []
+        for map, encode in self._maps:
+            if cycle >= self._due[map.channel]:
+                period = self._cycles[map.channel]
+                self._due[map.channel] = cycle + period - (cycle - 1) % period
+                values = {name: self._measure(name, context) for name in map.signals}
+                age = round(map.age(values, context.get_time()) * _MICROSECONDS)
+                packets.append(Packet(map.channel, map.type, encode(values, time(map.channel) - age), cycle))
+        return packets
 
     def _measure(self, name: str, context: Context) -> Any:
         if name in self._reported:
