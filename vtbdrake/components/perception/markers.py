@@ -45,7 +45,7 @@ class MarkerBoard:
         ids: The numbers of the markers in the family 36h11, (n,).
         poses: X_TM of each, (n, 3, 4), translation in m.
         size: The edge length of the black square of every marker, in m.
-        corners: The corners of the black squares in T, (n, 4, 3) in m: upper left, upper right, lower right, lower left.
+        corners: The corners of the black squares in T, (n, 4, 3) in m, clockwise from the upper left one.
     """
 
     ids: NDArray[np.int64]

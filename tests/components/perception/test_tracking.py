@@ -1,0 +1,165 @@
+"""The filter of a tumbling body, against bodies whose motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from scipy.stats import chi2
+
+from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix, rotation_vector
+from vtbdrake.components.perception.tracking import MotionModel, TargetTracker, Track, pose_of_state
+from vtbdrake.state.declarations import NO_DICT
+
+COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.01, 0.01, 0.03]) ** 2
+COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-5
+
+
+def moved(X: RigidTransform, w: np.ndarray, v: np.ndarray, dt: float) -> RigidTransform:
+    return RigidTransform(RotationMatrix(rotation_matrix(w * dt)) @ X.rotation(), X.translation() + v * dt)
+
+
+def measured(X: RigidTransform, time: float, generator: np.random.Generator, *, scale: float = 1.0) -> PoseEstimate:
+    """Return X with an error of the covariance."""
+    error = scale * np.linalg.cholesky(COVARIANCE) @ generator.standard_normal(6)
+    R = RotationMatrix(rotation_matrix(-error[:3])) @ X.rotation()
+    return PoseEstimate.of(RigidTransform(R, X.translation() - error[3:]), scale**2 * COVARIANCE, time=time)
+
+
+def distance(track: Track, X: RigidTransform, w: np.ndarray, v: np.ndarray) -> float:
+    """Return the normalized estimation error squared, with 12 degrees of freedom."""
+    R = X.rotation().matrix()
+    e = np.concatenate([rotation_vector(R @ track.R.T), X.translation() - track.p, w - track.w, v - track.v])
+    return float(e @ np.linalg.solve(track.P, e))
+
+
+def run(seed: int, *, late: bool) -> float:
+    """Track a body whose velocities do a random walk over 4 s; return the distance at the end."""
+    generator, model = np.random.default_rng(seed), MotionModel(rate_noise=5e-3, velocity_noise=5e-3)
+    X = RigidTransform(RollPitchYaw(generator.uniform(-2, 2, 3) / [1, 2, 1]), generator.uniform(-2, 2, 3))
+    w, v = 0.1 * generator.standard_normal(3), 0.1 * generator.standard_normal(3)
+    estimates, dt = [], 0.01
+    for k in range(401):
+        if k % 20 == 0:
+            estimates.append(measured(X, k * dt, generator))
+        w_now, v_now = w, v
+        if k < 400:
+            X = moved(X, w, v, dt)
+            w = w_now + model.rate_noise * np.sqrt(dt) * generator.standard_normal(3)
+            v = v_now + model.velocity_noise * np.sqrt(dt) * generator.standard_normal(3)
+    if late:  # Every other one comes after its successor.
+        estimates[1:] = [estimates[k] for pair in zip(range(2, 21, 2), range(1, 21, 2), strict=True) for k in pair]
+    track = model.begin(estimates[0])
+    for estimate in estimates[1:]:
+        track, _ = model.fuse(track, estimate)
+    return distance(model.predict(track, 4.0), X, w, v)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_errors_agree_with_the_covariance_over_many_runs(late: bool) -> None:
+    runs = 60
+    mean = np.mean([run(seed, late=late) for seed in range(runs)])
+    low, high = chi2.ppf([0.025, 0.975], 12 * runs) / runs
+    assert low < mean < high
+
+
+def test_late_estimate_counts_as_if_it_had_been_in_time() -> None:
+    generator, model = np.random.default_rng(0), MotionModel(rate_noise=0.0, velocity_noise=0.0)
+    w, v = np.array([0.02, -0.05, 0.03]), np.array([0.01, 0.02, -0.03])
+    poses = {t: moved(RigidTransform([1.0, 2.0, 3.0]), w, v, t) for t in (0.0, 0.3, 0.5, 0.8)}
+    first, *others = (measured(X, t, generator, scale=1e-2) for t, X in poses.items())
+    tracks = []
+    for order in ((0, 1, 2), (2, 0, 1)):
+        track = model.begin(first)
+        for k in order:
+            track, _ = model.fuse(track, others[k])
+        tracks.append(track)
+    one, other = tracks
+    assert one.time == other.time == 0.8
+    np.testing.assert_allclose(other.P, one.P, rtol=2e-2, atol=1e-9)
+    assert np.concatenate([other.w, other.v]) == pytest.approx(np.concatenate([one.w, one.v]), abs=2e-5)
+
+
+class Source(LeafSystem):
+    """Poses of a body that turns about z, measured every 0.2 s and told 0.15 s later; none after ``until``."""
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, until: float = np.inf, offset: float = 0.0, flipped: float = np.inf) -> None:
+        super().__init__()
+        self._until, self._offset, self._flipped = until, offset, flipped
+        self.DeclareAbstractOutputPort("estimate", lambda: Value(PoseEstimate.missing()), self._calc)
+
+    def _calc(self, context: Context, output: Value) -> None:
+        time = 0.2 * np.floor((context.get_time() - 0.15 - self._offset) / 0.2 + 1e-9) + self._offset
+        X = truth(time)
+        if time >= self._flipped:
+            X = RigidTransform(X.rotation() @ RotationMatrix.MakeXRotation(2.0), X.translation())
+        told = PoseEstimate.of(X, COVARIANCE, time=time) if 0.0 <= time < self._until else PoseEstimate.missing()
+        output.set_value(told)
+
+
+def truth(time: float) -> RigidTransform:
+    return moved(RigidTransform([2.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.05]), np.array([0.02, 0.0, 0.0]), time)
+
+
+def angle_between(X: RigidTransform, Y: RigidTransform) -> float:
+    return float(np.linalg.norm(rotation_vector((X.rotation().inverse() @ Y.rotation()).matrix())))
+
+
+def tracking(**sources: Source) -> tuple[Simulator, TargetTracker, Context]:
+    """Return the simulation of a tracker that can begin with its first source only."""
+    builder = DiagramBuilder()
+    tracker = builder.AddSystem(TargetTracker(list(sources), starting=[next(iter(sources))], period=0.02))
+    for name, source in sources.items():
+        builder.Connect(builder.AddSystem(source).get_output_port(), tracker.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    return simulator, tracker, tracker.GetMyContextFromRoot(simulator.get_context())
+
+
+def test_state_is_the_target_at_the_present() -> None:
+    simulator, tracker, context = tracking(markers=Source(), scan=Source(offset=0.07))
+    simulator.AdvanceTo(4.01)
+    state = tracker.GetOutputPort("state").Eval(context)
+    X_IT = truth(4.0)
+    assert pose_of_state(state).translation() == pytest.approx(X_IT.translation(), abs=1e-3)
+    assert angle_between(pose_of_state(state), X_IT) < 1e-3
+    assert state[7:] == pytest.approx([0.0, 0.0, 0.05, 0.02, 0.0, 0.0], abs=2e-3)
+    valid, age, attitude, position = tracker.GetOutputPort("status").Eval(context)
+    assert valid == 1.0
+    assert age == pytest.approx(0.13)  # The last one held at 3.87 s.
+    assert 0.0 < attitude < 0.01
+    assert 0.0 < position < 0.02
+
+
+def test_track_is_lost_without_estimates() -> None:
+    simulator, tracker, context = tracking(markers=Source(until=1.1))
+    simulator.AdvanceTo(3.9)
+    assert tracker.GetOutputPort("status").Eval(context)[0] == 1.0
+    before = tracker.GetOutputPort("status").Eval(context)[3]
+    simulator.AdvanceTo(4.1)
+    assert tracker.GetOutputPort("status").Eval(context)[0] == 0.0
+    assert tracker.GetOutputPort("status").Eval(context)[3] > before
+
+
+def test_track_begins_with_a_source_that_needs_no_prediction() -> None:
+    simulator, tracker, context = tracking(markers=Source(until=0.0), scan=Source())
+    simulator.AdvanceTo(2.0)
+    assert tracker.GetOutputPort("status").Eval(context).tolist() == [0.0, np.inf, np.inf, np.inf]
+
+
+def test_pose_that_is_far_off_is_left_out_until_it_persists() -> None:
+    simulator, tracker, context = tracking(markers=Source(flipped=2.0))
+    simulator.AdvanceTo(2.3)
+    assert angle_between(pose_of_state(tracker.GetOutputPort("state").Eval(context)), truth(2.3)) < 0.01
+    simulator.AdvanceTo(4.0)
+    flipped = truth(4.0) @ RigidTransform(RotationMatrix.MakeXRotation(2.0), [0.0, 0.0, 0.0])
+    assert angle_between(pose_of_state(tracker.GetOutputPort("state").Eval(context)), flipped) < 0.05
+
+
+def test_source_to_begin_with_must_exist() -> None:
+    with pytest.raises(ValueError, match="begins with an estimate of one of the sources scan, not of \\['markers'\\]"):
+        TargetTracker(["scan"], starting=["markers"], period=0.02)

@@ -1,0 +1,246 @@
+"""The pose of a known body from laser points: registration to the faces of its model, and de-skewing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """The surface of a rigid body T as m rectangles.
+
+    Attributes:
+        poses: The pose X_TF of each rectangle, (m, 3, 4), translation in m: the origin of F is its centre, x and y run
+            along its edges, and z points out of the body.
+        half_sizes: Half of its edge lengths along x and y, (m, 2) in m.
+    """
+
+    poses: Array
+    half_sizes: Array
+
+    def __post_init__(self) -> None:
+        poses, half_sizes = np.array(self.poses, dtype=float), np.array(self.half_sizes, dtype=float)
+        if poses.ndim != 3 or poses.shape[1:] != (3, 4) or half_sizes.shape != (len(poses), 2) or not len(poses):
+            raise ValueError(f"Faces have poses (m, 3, 4) and half_sizes (m, 2), not {poses.shape}, {half_sizes.shape}")
+        if not (half_sizes > 0.0).all():
+            raise ValueError(f"the edges of faces have positive lengths, not {half_sizes.min()}")
+        for name, array in (("poses", poses), ("half_sizes", half_sizes)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @staticmethod
+    def of_boxes(boxes: Iterable[tuple[RigidTransform, ArrayLike]]) -> Faces:
+        """Return the six faces of each box, given as its pose X_TG and its edge lengths (3,) in m."""
+        poses, half_sizes = [], []
+        for X_TG, size in boxes:
+            half = 0.5 * np.asarray(size, dtype=float)
+            for axis in range(3):
+                x, y = (axis + 1) % 3, (axis + 2) % 3
+                for sign in (1.0, -1.0):
+                    R = np.zeros((3, 3))
+                    R[x, 0], R[y, 1], R[axis, 2] = 1.0, sign, sign
+                    p = np.zeros(3)
+                    p[axis] = sign * half[axis]
+                    poses.append((X_TG @ RigidTransform(RotationMatrix(R), p)).GetAsMatrix34())
+                    half_sizes.append([half[x], half[y]])
+        return Faces(np.array(poses), np.array(half_sizes))
+
+    def nearest(self, points: Array, *, eye: Array) -> tuple[Array, Array, Array]:
+        """Find the nearest point on the faces that are turned towards an eye.
+
+        Args:
+            points: In T, (n, 3) in m.
+            eye: Where they were seen from, in T, (3,) in m.
+
+        Returns:
+            The nearest points (n, 3), the outward normals of their faces (n, 3), and whether each point lies above its
+            face rather than beyond an edge of it, (n,).
+        """
+        R, p = self.poses[:, :, :3], self.poses[:, :, 3]
+        facing = np.einsum("mi,mi->m", R[:, :, 2], eye - p) > 0.0
+        R, p, half = R[facing], p[facing], self.half_sizes[facing]
+        if not len(p):
+            return np.full_like(points, np.inf), np.zeros_like(points), np.zeros(len(points), dtype=bool)
+        local = (points @ R.transpose(1, 0, 2).reshape(3, -1)).reshape(len(points), -1, 3)
+        local -= np.einsum("mij,mi->mj", R, p)
+        clamped = np.clip(local[..., :2], -half, half)
+        beyond = local[..., :2] - clamped
+        best = np.argmin(beyond[..., 0] ** 2 + beyond[..., 1] ** 2 + local[..., 2] ** 2, axis=1)
+        rows = np.arange(len(points))
+        on_face = clamped[rows, best]
+        nearest = p[best] + R[best, :, 0] * on_face[:, :1] + R[best, :, 1] * on_face[:, 1:]
+        return nearest, R[best, :, 2], ~beyond[rows, best].any(axis=1)
+
+    def edge_directions(self, points: Array, *, eye: Array) -> tuple[Array, Array, Array]:
+        """Find the directions in which points cover a face from one edge to the other, so that both edges were seen.
+
+        Points with a mean distance s from each other end within s of both edges; where exactly, is unknown by s / 2.
+
+        Args:
+            points: On the faces, in T, (n, 3) in m.
+            eye: Where they were seen from, in T, (3,) in m.
+
+        Returns:
+            The centres of these faces (k, 3), the directions (k, 3), both in T, and s (k,) in m.
+        """
+        centres, directions, distances = [], [], []
+        for pose, half in zip(self.poses, self.half_sizes, strict=True):
+            if pose[:, 2] @ (eye - pose[:, 3]) <= 0.0:
+                continue
+            local = (points - pose[:, 3]) @ pose[:, :3]
+            on = local[(np.abs(local[:, 2]) < 1e-6) & (np.abs(local[:, :2]) < half).all(axis=1), :2]
+            if len(on) < 10:
+                continue
+            low, high = on.min(axis=0), on.max(axis=0)
+            s = float(np.sqrt(np.prod(high - low) / len(on)))
+            for k in range(2):
+                if high[k] > half[k] - 1.5 * s and low[k] < 1.5 * s - half[k]:
+                    centres.append(pose[:, 3])
+                    directions.append(pose[:, k])
+                    distances.append(s)
+        return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(distances)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Faces:
+        return self
+
+
+def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: ArrayLike, rate: ArrayLike) -> Array:
+    """Return the points of a moving rigid body as they would be if all had been measured at time 0.
+
+    With a constant twist, a point of the body that is at q at the time t is at o + exp(-[ω]× t) (q - o - v t) at 0.
+
+    Args:
+        points: In a fixed frame, (n, 3) in m.
+        times: When each was measured, (n,) in s.
+        origin: A point o of the body at time 0, (3,) in m.
+        velocity: The velocity v of that point, (3,) in m/s.
+        rate: The angular velocity ω of the body, (3,) in rad/s.
+    """
+    t = np.asarray(times, dtype=float)[:, None]
+    o = np.asarray(origin, dtype=float)
+    arms = np.asarray(points, dtype=float) - o - t * np.asarray(velocity)
+    fixed: Array = o + np.einsum("nij,nj->ni", rotation_matrix(-t * np.asarray(rate)), arms)
+    return fixed
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How laser points are registered.
+
+    Attributes:
+        range_noise: The standard deviation of the distance of a point from its face, in m.
+        systematic: The standard deviation of errors that more points do not reduce, in m; assumed, not derived. As an
+            angle it counts per metre.
+        basin: Up to which distance points belong to the body at first, in m. It is halved in every step, down to four
+            times the noise.
+        most_points: At most so many points are used, evenly chosen.
+        fewest_points: So many points must lie on the faces in the end.
+        share: And this share of those that lie within ``basin`` of the body.
+        steps: The number of steps at most.
+    """
+
+    range_noise: float = 0.01
+    systematic: float = 0.003
+    basin: float = 0.3
+    most_points: int = 800
+    fewest_points: int = 30
+    share: float = 0.6
+    steps: int = 25
+
+    def __post_init__(self) -> None:
+        if not (self.range_noise > 0.0 and self.basin > 4.0 * self.range_noise and self.systematic >= 0.0):
+            raise ValueError(
+                "a Registration needs a positive range_noise and a basin of more than 4 times that, not "
+                f"{self.range_noise} and {self.basin}; systematic is not negative"
+            )
+
+
+# The start counts as a measurement with these standard deviations, so that what the points leave open (the motion
+# along a plane, if only one is seen) stays as predicted, with a covariance that tells so.
+_PRIOR = np.concatenate([np.full(3, 0.3**-2), np.full(3, 0.3**-2)])
+
+
+def register_points(
+    points: ArrayLike,
+    faces: Faces,
+    start: RigidTransform,
+    *,
+    eye: ArrayLike,
+    time: float,
+    registration: Registration | None = None,
+) -> PoseEstimate:
+    r"""Estimate the pose X_AT of a body from points on its surface, by the iterated closest point algorithm.
+
+    In each step, every point p is assigned the nearest point q of the faces that are turned to the eye, and
+    Σ w(r) r², r = n·(p - q), is minimized over small motions of T (Chen and Medioni, "Object modelling by registration
+    of multiple range images", 1992). n is the face's normal, and for points beyond an edge the direction from q to p.
+    Points farther from the body than a limit, which shrinks from step to step, are left out; the others have Tukey's
+    weights w. The covariance is the inverse normal matrix of the points above the faces,
+    and of the directions in which both edges of a face were seen (`Faces.edge_directions`).
+
+    Args:
+        points: In A, (n, 3) in m, measured at one instant, or de-skewed.
+        faces: The model.
+        start: X_AT to start from: a prediction, or the pose from markers.
+        eye: Where the points were seen from, in A, (3,) in m.
+        time: The instant that the points belong to, in s.
+        registration: Noise and limits.
+
+    Returns:
+        An estimate of X_AT; a missing one if too few points lie on the body.
+    """
+    settings = registration or Registration()
+    points, eye = np.asarray(points, dtype=float).reshape(-1, 3), np.asarray(eye, dtype=float)
+    R, p = start.rotation().matrix(), start.translation()
+    near = _within(points, p, faces, settings.basin)
+    if len(near) > settings.most_points:
+        near = near[np.linspace(0, len(near) - 1, settings.most_points).astype(int)]
+    limit, least = settings.basin, 4.0 * settings.range_noise
+    prior, offset = np.diag(_PRIOR) * settings.range_noise**2, np.zeros(6)
+    for _ in range(settings.steps):
+        if len(near) < settings.fewest_points:
+            return PoseEstimate.missing(time=time)
+        in_T = (near - p) @ R
+        nearest, normals, above = faces.nearest(in_T, eye=(eye - p) @ R)
+        gap = in_T - nearest
+        distance = np.linalg.norm(gap, axis=1)
+        n_T = np.where(above[:, None] | (distance < 1e-9)[:, None], normals, gap / np.maximum(distance, 1e-9)[:, None])
+        r = np.einsum("ni,ni->n", n_T, gap)
+        weight = np.where(distance < limit, (1.0 - np.minimum(distance / limit, 1.0) ** 2) ** 2, 0.0)
+        n = n_T @ R.T
+        # A motion [θ; d] of T changes r by -n·(θ × (p - p_AT) + d).
+        J = np.concatenate([np.cross(near - p, n), n], axis=1)
+        H = (weight[:, None] * J).T @ J + prior
+        step = np.linalg.solve(H, J.T @ (weight * r) - prior @ offset)
+        step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-12))
+        R, p, offset = rotation_matrix(step[:3]) @ R, p + step[3:], offset + step
+        if limit == least and np.abs(step).max() < 1e-5:
+            break
+        limit = max(least, 0.5 * limit)
+    on_body = above & (distance < least)
+    count, close = int(on_body.sum()), int((distance < settings.basin).sum())
+    if count < settings.fewest_points or count < settings.share * close:
+        return PoseEstimate.missing(time=time)
+    variance = max(settings.range_noise**2, float(np.mean(r[on_body] ** 2)))
+    information = J[on_body].T @ J[on_body] / variance + np.diag(_PRIOR)
+    centres, directions, spacing = faces.edge_directions(nearest[on_body], eye=(eye - p) @ R)
+    along = directions @ R.T
+    edges = np.concatenate([np.cross(centres @ R.T, along), along], axis=1)
+    information += (edges / (0.5 * spacing[:, None]) ** 2).T @ edges
+    covariance = np.linalg.inv(information) + settings.systematic**2 * np.eye(6)
+    X_AT = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
+    return PoseEstimate.of(X_AT, 0.5 * (covariance + covariance.T), time=time)
+
+
+def _within(points: Array, centre: Array, faces: Faces, distance: float) -> Array:
+    """Return the points that are not farther from the body than ``distance``, whatever its attitude."""
+    reach = np.linalg.norm(faces.poses[:, :, 3], axis=1) + np.linalg.norm(faces.half_sizes, axis=1)
+    return points[np.linalg.norm(points - centre, axis=1) < reach.max() + distance]

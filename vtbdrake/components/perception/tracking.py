@@ -1,0 +1,311 @@
+"""A filter that follows a freely moving, tumbling rigid body through pose estimates from several sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+
+from vtbdrake.components.perception.estimate import (
+    Array,
+    PoseEstimate,
+    cross_matrix,
+    rotation_matrix,
+    rotation_vector,
+)
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT, weakly
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What is known of a moving body T in an inertial frame I at one instant.
+
+    The error is [θ; d; δω; δv]: θ and d as in `PoseEstimate`, all expressed in I.
+
+    Attributes:
+        time: The instant, in s.
+        R: R_IT, (3, 3).
+        p: p_IoTo_I, (3,) in m; To is the body's centre of mass.
+        w: The angular velocity ω in I, (3,) in rad/s.
+        v: The velocity of To in I, (3,) in m/s.
+        P: The covariance of the error, (12, 12).
+    """
+
+    time: float
+    R: Array
+    p: Array
+    w: Array
+    v: Array
+    P: Array
+
+    @property
+    def X(self) -> RigidTransform:
+        """The pose X_IT."""
+        return RigidTransform(RotationMatrix.ProjectToRotationMatrix(self.R), self.p)
+
+    def numbers(self) -> Array:
+        """Return the track as one vector, (`TRACK_SIZE`,)."""
+        return np.concatenate([[self.time], self.R.ravel(), self.p, self.w, self.v, self.P.ravel()])
+
+    @staticmethod
+    def of(numbers: ArrayLike) -> Track:
+        """Return the track that `numbers` made a vector of."""
+        x = np.asarray(numbers, dtype=float)
+        return Track(float(x[0]), x[1:10].reshape(3, 3), x[10:13], x[13:16], x[16:19], x[19:].reshape(12, 12))
+
+
+TRACK_SIZE = 1 + 9 + 9 + 144
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """How a body in free fall is assumed to move: with constant velocity and angular velocity, but for white noise.
+
+    The angular velocity of a torque-free body is constant only about a principal axis. Otherwise it changes by up to
+    (I_max - I_min) / I ω², which ``rate_noise`` must cover: 0.001 rad/s² at 3 deg/s and a ratio of 0.4.
+
+    Attributes:
+        rate_noise: Of the angular acceleration, the square root of the spectral density, in rad/s^1.5.
+        velocity_noise: Of the acceleration, in m/s^1.5.
+        first_rate: The standard deviation of the angular velocity before anything is known, in rad/s.
+        first_velocity: Of the velocity, in m/s.
+    """
+
+    rate_noise: float = 1e-3
+    velocity_noise: float = 1e-3
+    first_rate: float = 0.1
+    first_velocity: float = 0.1
+
+    def begin(self, estimate: PoseEstimate) -> Track:
+        """Return the track that begins with one pose."""
+        P = np.zeros((12, 12))
+        P[:6, :6] = estimate.covariance
+        P[6:, 6:] = np.diag(np.repeat([self.first_rate**2, self.first_velocity**2], 3))
+        return Track(estimate.time, estimate.matrix[:, :3], estimate.matrix[:, 3], np.zeros(3), np.zeros(3), P)
+
+    def predict(self, track: Track, time: float) -> Track:
+        """Return the track at a later (or the same) time."""
+        dt = time - track.time
+        F = _transition(track, dt)
+        R, p = _moved(track, dt)
+        return replace(track, time=time, R=R, p=p, P=F @ track.P @ F.T + self._noise(dt))
+
+    def _noise(self, dt: float) -> Array:
+        Q = np.zeros((12, 12))
+        for place, density in ((0, self.rate_noise**2), (3, self.velocity_noise**2)):
+            a, b = slice(place, place + 3), slice(place + 6, place + 9)
+            Q[a, a], Q[b, b] = np.eye(3) * density * dt**3 / 3.0, np.eye(3) * density * dt
+            Q[a, b] = Q[b, a] = np.eye(3) * density * dt**2 / 2.0
+        return Q
+
+    def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
+        r"""Return the track with a measured pose, and the normalized innovation squared (six degrees of freedom).
+
+        A measurement newer than the track moves it to its own time. One older by Δt corrects the track where it is:
+        it measures F(-Δt) x, with the process noise of Δt added to its own. This neglects the correlation of that noise
+        with the track; the exact solution is in Bar-Shalom, "Update with out-of-sequence measurements in tracking",
+        2002.
+        """
+        if estimate.time > track.time:
+            track = self.predict(track, estimate.time)
+        dt = estimate.time - track.time
+        H = _transition(track, dt)[:6]
+        R, p = _moved(track, dt)
+        innovation = np.concatenate(
+            [rotation_vector(estimate.matrix[:, :3] @ R.T), estimate.matrix[:, 3] - p],
+        )
+        PHt = track.P @ H.T
+        S = H @ PHt + estimate.covariance + self._noise(-dt)[:6, :6]
+        solved = np.linalg.solve(S, np.column_stack([innovation, PHt.T]))
+        step, gain = PHt @ solved[:, 0], solved[:, 1:].T
+        A = np.eye(12) - gain @ H
+        P = A @ track.P @ A.T + gain @ (S - H @ PHt) @ gain.T
+        return (
+            replace(
+                track,
+                R=rotation_matrix(step[:3]) @ track.R,
+                p=track.p + step[3:6],
+                w=track.w + step[6:9],
+                v=track.v + step[9:],
+                P=0.5 * (P + P.T),
+            ),
+            float(innovation @ solved[:, 0]),
+        )
+
+
+def _moved(track: Track, dt: float) -> tuple[Array, Array]:
+    """Return R_IT and p_IoTo_I ``dt`` seconds later (or earlier)."""
+    return rotation_matrix(track.w * dt) @ track.R, track.p + dt * track.v
+
+
+def _transition(track: Track, dt: float) -> Array:
+    """Return F(dt), which carries the error of a track over ``dt``, (12, 12)."""
+    F = np.eye(12)
+    F[:3, :3] = rotation_matrix(track.w * dt)
+    half = 0.5 * dt * track.w
+    # The integral of exp([ω]× s) ds over dt, to third order in ω dt.
+    F[:3, 6:9] = dt * (np.eye(3) + cross_matrix(half) + (2.0 / 3.0) * cross_matrix(half) @ cross_matrix(half))
+    F[3:6, 9:] = dt * np.eye(3)
+    return F
+
+
+STATE_SIZE = 13
+
+
+def body_state(X_IT: RigidTransform, w: ArrayLike, v: ArrayLike) -> Array:
+    """Return pose and velocities of a body as Drake orders them for a floating body.
+
+    Args:
+        X_IT: The pose.
+        w: The angular velocity in I, (3,) in rad/s.
+        v: The velocity of the body's origin in I, (3,) in m/s.
+
+    Returns:
+        The quaternion (w, x, y, z), the position, the angular velocity and the velocity, (13,).
+    """
+    return np.concatenate([X_IT.rotation().ToQuaternion().wxyz(), X_IT.translation(), w, v])
+
+
+def pose_of_state(state: ArrayLike) -> RigidTransform:
+    """Return the pose in a `body_state` (13,); its quaternion may be of any length but 0."""
+    from pydrake.common.eigen_geometry import Quaternion
+
+    x = np.asarray(state, dtype=float)
+    return RigidTransform(Quaternion(x[:4] / np.linalg.norm(x[:4])), x[4:7])
+
+
+class TargetTracker(LeafSystem):
+    """The filter of `MotionModel` as a system: the target in the perceived environment.
+
+    .. pydrake_system::
+
+        name: TargetTracker
+        input_ports:
+        - <source> (PoseEstimate of X_IT, one port each)
+        output_ports:
+        - state
+        - status
+
+    Every period it fuses what is new at its sources: each estimate once, at the time at which it held, which may be
+    earlier than what was fused before. Estimates that are too far from the expected pose (``gate``, on the normalized
+    innovation squared) are left out; after ``patience`` of them in succession, the track begins anew with the next
+    estimate of a source that needs no prediction.
+
+    ``state`` is the target at the present, as `body_state` orders it: (13,). Before the first estimate it is the
+    identity at rest. ``status`` is [valid, age, attitude, position]: valid is 1 if the track has had ``fewest``
+    estimates and is not older than ``lost_after``; age is the time in s since the last estimate held (at first
+    infinite); attitude (rad) and position (m) are the present standard deviations, the roots of the mean variances.
+
+    A track that is lost is kept, until a new one begins.
+
+    Args:
+        sources: The names of the input ports.
+        starting: Those that need no prediction.
+        period: In s.
+        motion: How the target is assumed to move.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self, sources: Sequence[str], *, starting: Sequence[str], period: float, motion: MotionModel | None = None
+    ) -> None:
+        super().__init__()
+        if not set(starting) <= set(sources) or not starting:
+            raise ValueError(
+                f"a track begins with an estimate of one of the sources {', '.join(sources)}, not of {list(starting)}"
+            )
+        self._starting = [name in starting for name in sources]
+        self._inputs = [self.DeclareAbstractInputPort(name, Value(PoseEstimate.missing())) for name in sources]
+        model = motion or MotionModel()
+        declared = {
+            "rate_noise": (model.rate_noise, "rad/s^1.5", (0.0, inf)),
+            "velocity_noise": (model.velocity_noise, "m/s^1.5", (0.0, inf)),
+            "first_rate": (model.first_rate, "rad/s", (0.0, inf)),
+            "first_velocity": (model.first_velocity, "m/s", (0.0, inf)),
+            "gate": (22.5, "", (0.0, inf)),
+            "patience": (5.0, "", (1.0, inf)),
+            "fewest": (4.0, "", (1.0, inf)),
+            "lost_after": (3.0, "s", (0.0, inf)),
+        }
+        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
+        self._pose = int(self.DeclareDiscreteState(6))
+        self._velocity = int(self.DeclareDiscreteState(6))
+        self._status = int(self.DeclareDiscreteState([0.0, inf, inf, inf]))
+        # Estimates fused, left out in succession, left out in all, and when the last one of each source held.
+        self._counts = int(self.DeclareDiscreteState([0.0, 0.0, 0.0, *(-inf for _ in sources)]))
+        self._track = int(self.DeclareDiscreteState(TRACK_SIZE))
+        self.variables = (
+            discrete_state("pose", self._pose, shape=(6,), unit="m, rad"),
+            discrete_state("velocity", self._velocity, shape=(6,), unit="rad/s, m/s"),
+            discrete_state("valid", self._status, bounds=(0.0, 1.0)),
+            discrete_state("age", self._status, start=1, unit="s"),
+            discrete_state("attitude_deviation", self._status, start=2, unit="rad"),
+            discrete_state("position_deviation", self._status, start=3, unit="m"),
+            discrete_state("fused", self._counts, bounds=(0.0, inf)),
+            discrete_state("left_out_now", self._counts, start=1, bounds=(0.0, inf)),
+            discrete_state("left_out", self._counts, start=2, bounds=(0.0, inf)),
+            discrete_state("last_times", self._counts, start=3, shape=(len(sources),), unit="s"),
+            discrete_state("track", self._track, shape=(TRACK_SIZE,)),
+            *(
+                parameter(name, 0, start=k, unit=unit, bounds=bounds)
+                for k, (name, (_, unit, bounds)) in enumerate(declared.items())
+            ),
+        )
+        self.DeclareVectorOutputPort(
+            "state",
+            STATE_SIZE,
+            weakly(self, TargetTracker._calc_state),
+            prerequisites_of_calc={
+                self.discrete_state_ticket(DiscreteStateIndex(group)) for group in (self._pose, self._velocity)
+            },
+        )
+        self.DeclareStateOutputPort("status", DiscreteStateIndex(self._status))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        pose, velocity = (context.get_discrete_state(group).value() for group in (self._pose, self._velocity))
+        X_IT = RigidTransform(RollPitchYaw(pose[3:]), pose[:3])
+        output.SetFromVector(body_state(X_IT, velocity[:3], velocity[3:]))
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        *noises, gate, patience, fewest, lost_after = context.get_numeric_parameter(0).value().tolist()
+        model = MotionModel(*noises)
+        fused, in_succession, left_out, *times = context.get_discrete_state(self._counts).value().tolist()
+        numbers = context.get_discrete_state(self._track).value()
+        track = Track.of(numbers) if fused else None
+        fresh: list[tuple[float, int, PoseEstimate]] = []
+        for k, port in enumerate(self._inputs):
+            estimate: PoseEstimate = port.Eval(context)
+            if estimate.valid and estimate.time > times[k]:
+                times[k] = estimate.time
+                fresh.append((estimate.time, k, estimate))
+        for _, k, estimate in sorted(fresh, key=lambda entry: entry[:2]):
+            if track is None or (in_succession >= patience and self._starting[k]):
+                if self._starting[k]:
+                    track, fused, in_succession = model.begin(estimate), 1.0, 0.0
+                continue
+            candidate, distance = model.fuse(track, estimate)
+            if distance <= gate:
+                track, fused, in_succession = candidate, fused + 1.0, 0.0
+            else:
+                in_succession, left_out = in_succession + 1.0, left_out + 1.0
+        state.set_value(self._counts, np.array([fused, in_succession, left_out, *times]))
+        if track is None:
+            return
+        if fresh:
+            state.set_value(self._track, track.numbers())
+        now = model.predict(track, max(context.get_time(), track.time))
+        age = context.get_time() - track.time
+        variances = now.P.diagonal()
+        status = [fused >= fewest and age <= lost_after, age, *np.sqrt([variances[:3].mean(), variances[3:6].mean()])]
+        state.set_value(self._pose, np.concatenate([now.p, RollPitchYaw(now.X.rotation()).vector()]))
+        state.set_value(self._velocity, np.concatenate([now.w, now.v]))
+        state.set_value(self._status, np.array(status, dtype=float))
