@@ -122,19 +122,19 @@ class Light(Conditions):
         super().__init__("light", values, variables)
 
 
-def light_sources(light: NDArray[np.float64]) -> list[LightParameter]:
+def light_sources(light: Sequence[float]) -> list[LightParameter]:
     """Return the sources of light for a renderer, from the value of the port ``light`` of a `Light`."""
     from pydrake.geometry import LightParameter, Rgba
 
     direction, earth_direction = _unit(light[0:3]), _unit(light[7:10])
     sun = LightParameter(
-        type="directional", frame="world", direction=direction, intensity=float(light[3]), color=Rgba(*light[4:7])
+        type="directional", frame="world", direction=direction, intensity=light[3], color=Rgba(*light[4:7])
     )
-    earth = LightParameter(type="point", frame="world", position=-_FAR * earth_direction, intensity=float(light[10]))
+    earth = LightParameter(type="point", frame="world", position=-_FAR * earth_direction, intensity=light[10])
     return [sun, earth] if earth.intensity > 0.0 else [sun]
 
 
-def _unit(vector: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vector: Sequence[float]) -> NDArray[np.float64]:
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise ValueError("Light: the direction of light is zero; give a vector of any other length")

@@ -34,6 +34,14 @@ def uniform_noise(*, seed: int, stream: int, tick: int, channel: int = 0) -> flo
     return _uniform(seed, stream, batch, channel)[place]
 
 
+def noise_generator(*, seed: int, stream: int, tick: int, channel: int) -> np.random.Generator:
+    """Return a generator for the many random numbers of one tick, such as those of an image.
+
+    The stream's ``channel`` is its own: `normal_noise` and `uniform_noise` use the same generator.
+    """
+    return _generator(seed, stream, tick, channel)
+
+
 def _ticks(size: int) -> int:
     return max(1, _BATCH // max(1, size))
 

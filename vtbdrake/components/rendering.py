@@ -1,0 +1,170 @@
+"""Rendering: whether this machine can, and scenes of a camera's own that are rendered under its own light.
+
+Drake keeps the renderers of a SceneGraph where a simulation cannot change them. So a camera renders a copy of the
+geometry with a perception role, whose light follows from numbers in the Context. It renders nothing between its images,
+and a Context without cameras has no renderer.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vtbdrake.components.environment.light import light_sources
+
+if TYPE_CHECKING:
+    from pydrake.geometry import GeometryVersion, QueryObject, RenderEngine, SceneGraphInspector
+
+# Set when rendering has been found to work, also for child processes.
+_CHECKED = "VTBDRAKE_RENDERING"
+_PROBE_TIMEOUT = 60.0  # s
+# Name of the renderer in the scene of a camera.
+RENDERER = "camera"
+# Pixels per side of a shadow map. Below 1024, edges of shadows have visible steps.
+_SHADOW_MAP_SIZE = 2048
+# Shapes with an inside, in which a camera sees nothing.
+_WITH_INSIDE = {"Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"}
+
+_PROBE = """
+from pydrake.geometry import (ClippingRange, ColorRenderCamera, MakeRenderEngineVtk, RenderCameraCore,
+                              RenderEngineVtkParams, SceneGraph)
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
+scene_graph = SceneGraph()
+scene_graph.AddRenderer("probe", MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
+core = RenderCameraCore("probe", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1.0), RigidTransform())
+query = scene_graph.get_query_output_port().Eval(scene_graph.CreateDefaultContext())
+query.RenderColorImage(ColorRenderCamera(core, False), scene_graph.world_frame_id(), RigidTransform())
+"""
+
+
+class RenderingError(RuntimeError):
+    """This machine cannot render images, or not those of a scene."""
+
+
+def check_rendering() -> None:
+    """Check that images can be rendered without a display, by EGL.
+
+    Without its drivers, libEGL crashes the process that renders. So another process renders an image first, once: its
+    success is remembered in the environment, for this process and its children.
+
+    Raises:
+        RenderingError: There is no working EGL; the message names the packages to install.
+    """
+    if os.environ.get(_CHECKED) == "EGL":
+        return
+    command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}{_PROBE}"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False)
+        reason = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        works = done.returncode == 0
+    except subprocess.TimeoutExpired:
+        works, reason = False, f"no image after {_PROBE_TIMEOUT:g} s"
+    if not works:
+        raise RenderingError(
+            "this machine cannot render images: install Mesa's EGL and its drivers (on Debian: apt-get install libegl1 "
+            f"libgl1-mesa-dri), or use a scenario without cameras ({reason})"
+        )
+    os.environ[_CHECKED] = "EGL"
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """The light in which a camera renders its scene."""
+
+    # The value of the port ``light`` of a `Light`; empty: a white light from the camera, before Drake's sky.
+    light: tuple[float, ...] = ()
+    # Factor of all brightness.
+    exposure: float = 1.0
+    # Brightness of a white surface in front of the camera's own lamp, at a distance of 1 m.
+    lamp: float = 0.0
+
+    def renderer(self) -> RenderEngine:
+        """Return Drake's VTK renderer in this light, without a display."""
+        from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams
+
+        params = RenderEngineVtkParams(backend="EGL")
+        if self.light:
+            params.lights = light_sources(self.light)
+            params.default_clear_color = self.light[11:14]
+            params.cast_shadows, params.shadow_map_size = self.light[14] >= 0.5, _SHADOW_MAP_SIZE
+        else:
+            params.lights = [LightParameter()]
+        if self.lamp > 0.0:
+            params.lights += [LightParameter(type="point", intensity=self.lamp, attenuation_values=[0.0, 0.0, 1.0])]
+        for light in params.lights:
+            light.intensity *= self.exposure
+        params.default_clear_color = np.minimum(self.exposure * np.asarray(params.default_clear_color), 1.0)
+        return MakeRenderEngineVtk(params)
+
+
+class RenderedScene:
+    """A copy of the perception geometry of a scene, with a renderer of its own.
+
+    It is a cache: what it shows depends on the arguments of `view` only.
+    """
+
+    def __init__(self) -> None:
+        self._version: GeometryVersion | None = None
+        self._illumination: Illumination | None = None
+
+    def __deepcopy__(self, memo: object) -> RenderedScene:
+        # Each Context has its own, made at its first image: a renderer belongs to one thread at a time.
+        return RenderedScene()
+
+    def view(self, query: QueryObject, illumination: Illumination) -> QueryObject:
+        """Return the scene of ``query`` for rendering with the renderer `RENDERER`, in its present poses.
+
+        The inside of primitive shapes can be found by ``ComputeSignedDistanceToPoint``.
+
+        Raises:
+            RenderingError: This machine cannot render, or a deformable geometry is to be rendered.
+        """
+        from pydrake.geometry import FramePoseVector, Role
+
+        inspector = query.inspector()
+        if self._version is None or not self._version.IsSameAs(inspector.geometry_version(), Role.kPerception):
+            self._build(inspector)
+        if illumination != self._illumination:
+            if self._illumination is not None:
+                self._scene_graph.RemoveRenderer(self._context, RENDERER)
+            self._scene_graph.AddRenderer(self._context, RENDERER, illumination.renderer())
+            self._illumination = illumination
+        poses = FramePoseVector()
+        for theirs, ours in self._frames:
+            poses.set_value(ours, query.GetPoseInWorld(theirs))
+        self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
+        return self._scene_graph.get_query_output_port().Eval(self._context)
+
+    def _build(self, inspector: SceneGraphInspector) -> None:
+        """Copy all geometry with a perception role; the ids are plain numbers, which keep nothing alive."""
+        from pydrake.geometry import GeometryFrame, GeometryInstance, ProximityProperties, Role, SceneGraph
+
+        check_rendering()
+        scene_graph = SceneGraph()
+        source = scene_graph.RegisterSource("copy")
+        world = inspector.world_frame_id()
+        frames = {world: scene_graph.world_frame_id()}
+        for geometry in inspector.GetAllGeometryIds(Role.kPerception):
+            name = inspector.GetName(geometry)
+            if inspector.IsDeformableGeometry(geometry):
+                raise RenderingError(f"{name} is deformable, which cameras cannot show: remove its perception role")
+            frame = inspector.GetFrameId(geometry)
+            if frame not in frames:
+                frames[frame] = scene_graph.RegisterFrame(source, GeometryFrame(f"{frame.get_value()}"))
+            shape = inspector.GetShape(geometry)
+            copied = GeometryInstance(inspector.GetPoseInFrame(geometry), shape, f"{geometry.get_value()} {name}")
+            copied.set_perception_properties(inspector.GetPerceptionProperties(geometry))
+            if type(shape).__name__ in _WITH_INSIDE:
+                copied.set_proximity_properties(ProximityProperties())
+            scene_graph.RegisterGeometry(source, frames[frame], copied)
+        del frames[world]
+        self._scene_graph, self._source, self._frames = scene_graph, source, tuple(frames.items())
+        self._context = scene_graph.CreateDefaultContext()
+        self._version, self._illumination = copy.copy(inspector.geometry_version()), None

@@ -1,0 +1,380 @@
+"""Cameras: sampled colour and depth images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    QueryObject,
+    RenderCameraCore,
+)
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import (
+    AbstractStateIndex,
+    BasicVector,
+    Context,
+    EventStatus,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+
+from vtbdrake.components.environment.haze import hazed
+from vtbdrake.components.environment.light import LIGHT_SIZE
+from vtbdrake.components.rendering import RENDERER, Illumination, RenderedScene, RenderingError
+from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.components.sensors.noise import noise_generator, uniform_noise
+from vtbdrake.state import parameter
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
+
+if TYPE_CHECKING:
+    from pydrake.geometry import SceneGraph
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Frame
+    from pydrake.systems.framework import DiagramBuilder
+
+    from vtbdrake.components.environment import Haze, Light
+
+# Channels of a camera's stream of random numbers.
+_PIXEL_CHANNEL, _DROPOUT_CHANNEL = 0, 2
+_FULL_SCALE = 255.0
+
+
+@dataclass(frozen=True, eq=False)
+class ImagesInTransit:
+    """The images that a camera has taken and not shown yet, newest first, read-only."""
+
+    color: NDArray[np.uint8]  # shape (n, h, w, 4)
+    depth: NDArray[np.float32]  # shape (n, h, w); without a depth image (n, 0, 0)
+
+    def __deepcopy__(self, memo: object) -> ImagesInTransit:
+        return self
+
+    def __post_init__(self) -> None:
+        self.color.flags.writeable = self.depth.flags.writeable = False
+
+
+class Camera(LeafSystem):
+    r"""Takes colour images, and depth images if asked, at t = 0, T, 2 T, ... and holds them in between.
+
+    .. pydrake_system::
+
+        name: Camera
+        input_ports:
+        - geometry_query
+        - light (optional: of a `Light`)
+        - haze (optional: of a `Haze`)
+        output_ports:
+        - color_image
+        - depth_image (only with ``depth``)
+
+    The images are state: ImageRgba8U, and ImageDepth32F with Drake's conventions (metres along z_C, 0 if too close, inf
+    if too far). Nothing is rendered for those who read them. Before the initialization they are black; it takes the
+    first image, so that readers at t = 0 see the scene. A reader that is updated at the same instant by an unrestricted
+    update (a `SlowPart`) sees the image before, one that has a discrete update the new one.
+
+    The camera frame C is that of Drake: x to the right, y down, z forward. It starts where ``frame`` is on its body P;
+    the parameter ``pose``, [x, y, z, roll, pitch, yaw] of C in P, moves it. P may move. Drake's principal point
+    (cx, cy) counts from the image's left upper corner, OpenCV's from the centre of its first pixel: half a pixel less.
+
+    The world is rendered by VTK in the light of the port ``light`` (without it, a white light from the camera, before
+    Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail, bright
+    ones saturate. Exposure times have no length: there is no motion blur. Haze is added to the 8-bit image, from a
+    depth image of its own. A surface within the distance ``near`` of the camera is not seen.
+
+    The count y of a pixel is that of the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
+    count m, n of N(0, 1), full scale S = 255, and g the gain:
+
+        y = round(m + sigma n),   sigma^2 = (g noise)^2 + g photon_noise^2 m / S
+
+    noise is the standard deviation of the read noise, and photon_noise that of the shot noise of a pixel at full scale,
+    both at gain 1, in counts. So gain brightens both, exposure only the image. Errors are otherwise those of the
+    `ErrorModel`: latency in periods, and drop-out, after which the last image stays; all a function of the seed.
+
+    The variables ``seed``, ``noise``, ``photon_noise``, ``exposure``, ``gain``, ``lamp`` (the brightness of a white
+    surface at 1 m before a lamp on the camera), ``pose``, ``intrinsics`` ([fx, fy, cx, cy] in pixels), ``latency`` and
+    ``dropout`` are parameters.
+
+    Each Context has its own copy of the scene, with its own renderer.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        frame: Frame,
+        *,
+        period: float,
+        info: CameraInfo | None = None,
+        depth: bool = False,
+        X_FC: RigidTransform | None = None,
+        near: float = 0.05,
+        far: float = 200.0,
+        photon_noise: float = 0.0,
+        stream: int = 6,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        """Declare the camera.
+
+        Args:
+            plant: A plant whose bodies are registered with a SceneGraph.
+            frame: A frame F of the plant, at which the camera begins.
+            period: Time between two images in seconds.
+            info: Size of the image and initial intrinsics; by default 320 x 240 pixels and a field of view of pi / 4
+                from top to bottom.
+            depth: Whether there is a depth image, too.
+            X_FC: Pose of the camera in F; by default the two are the same.
+            near: Distance along z_C in metres below which nothing is seen.
+            far: Distance along z_C in metres beyond which nothing is seen.
+            photon_noise: Standard deviation of the shot noise at full scale, in counts.
+            stream: Number of the random stream, which makes the noise of several cameras independent.
+            errors: Read noise (in counts), latency, drop-out and seed; None for an exact camera.
+
+        Raises:
+            ValueError: A value that no camera can have; an error that images do not have; a plant without a SceneGraph.
+        """
+        super().__init__()
+        errors = errors or ErrorModel()
+        errors.check("Camera")
+        for name in ("bias", "drift", "quantization"):
+            if getattr(errors, name):
+                raise ValueError(f"Camera: images have no {name}; leave it out of the errors")
+        if not 0.0 < period < inf:
+            raise ValueError(f"Camera: the period is positive, in s, not {period!r}")
+        if not 0.0 < near < far < inf:
+            raise ValueError(f"Camera: near and far are distances in m, 0 < near < far, not {near!r} and {far!r}")
+        if not (isfinite(photon_noise) and photon_noise >= 0.0):
+            raise ValueError(f"Camera: photon_noise is a standard deviation in counts, not {photon_noise!r}")
+        if not plant.geometry_source_is_registered():
+            raise ValueError("Camera: the plant has no geometry; register it with a SceneGraph")
+        info = info or CameraInfo(320, 240, np.pi / 4)
+        self._width, self._height = info.width(), info.height()
+        self._period, self._stream = float(period), int(stream)
+        self._near, self._far = float(near), float(far)
+        # The number of the frame, because the id of a plant keeps it alive.
+        self._frame_number = plant.GetBodyFrameIdOrThrow(frame.body().index()).get_value()
+        self._declare_parameters(
+            frame.GetFixedPoseInBodyFrame() @ (X_FC or RigidTransform()), info, errors, photon_noise
+        )
+        self._query_port = self.DeclareAbstractInputPort("geometry_query", Value[QueryObject]())
+        self._light_port = self.DeclareVectorInputPort("light", LIGHT_SIZE)
+        self._haze_port = self.DeclareVectorInputPort("haze", 5)
+        self._declare_state(depth, max(errors.latency, errors.max_latency))
+        scenes = ValueProducer(allocate=lambda: Value(object()), calc=_make_scene)
+        entry = self.DeclareCacheEntry("scene", scenes, {self.nothing_ticket()})
+        self._scene = entry.cache_index()
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, self._sample)
+
+    def _declare_parameters(
+        self, X_PC: RigidTransform, info: CameraInfo, errors: ErrorModel, photon_noise: float
+    ) -> None:
+        intrinsics = [info.focal_x(), info.focal_y(), info.center_x(), info.center_y()]
+        values = [*pose_to_array(X_PC), *intrinsics, 1.0, 1.0, 0.0]
+        values += [errors.noise, photon_noise, errors.latency, errors.dropout, errors.seed]
+        index = int(self.DeclareNumericParameter(BasicVector(values)))
+        largest = np.array([inf, inf, self._width, self._height])
+        longest = float(max(errors.latency, errors.max_latency))
+        self.variables = (
+            parameter("pose", index, shape=(6,), unit=POSE_UNIT),
+            parameter("intrinsics", index, start=6, shape=(4,), unit="pixel", bounds=([1.0, 1.0, 0.0, 0.0], largest)),
+            parameter("exposure", index, start=10, bounds=(0.0, inf)),
+            parameter("gain", index, start=11, bounds=(0.0, inf)),
+            parameter("lamp", index, start=12, bounds=(0.0, inf)),
+            parameter("noise", index, start=13, unit="count", bounds=(0.0, inf)),
+            parameter("photon_noise", index, start=14, unit="count", bounds=(0.0, inf)),
+            parameter("latency", index, start=15, unit="period", bounds=(0.0, longest)),
+            parameter("dropout", index, start=16, bounds=(0.0, 1.0)),
+            parameter("seed", index, start=17, bounds=(0.0, 2.0**53)),
+        )
+
+    def _declare_state(self, depth: bool, longest: int) -> None:
+        color_image = ImageRgba8U(self._width, self._height)
+        self._color: AbstractStateIndex = self.DeclareAbstractState(Value(color_image))
+        self.DeclareStateOutputPort("color_image", self._color)
+        self._depth: AbstractStateIndex | None = None
+        if depth:
+            depth_image = ImageDepth32F(self._width, self._height)
+            self._depth = self.DeclareAbstractState(Value(depth_image))
+            self.DeclareStateOutputPort("depth_image", self._depth)
+        self._transit: AbstractStateIndex | None = None
+        if longest:
+            black = np.zeros((longest, self._height, self._width, 4), np.uint8)
+            far = np.zeros((longest, self._height, self._width) if depth else (longest, 0, 0), np.float32)
+            self._transit = self.DeclareAbstractState(Value(ImagesInTransit(black, far)))
+
+    @property
+    def period(self) -> float:
+        """Return the time between two images (s)."""
+        return self._period
+
+    def render(self, context: Context) -> ImageRgba8U:
+        """Return what the camera sees at present, without noise; nothing in the context changes.
+
+        Args:
+            context: Context of the camera.
+
+        Raises:
+            RenderingError: This machine cannot render, or the camera is inside a body.
+        """
+        color, _ = self._see(context)
+        return _color_image(color)
+
+    def resume(self, context: Context, image: ImageRgba8U | ImageDepth32F) -> None:
+        """Go on where a camera stands that has shown ``image`` last, with all that is in transit alike."""
+        is_color = isinstance(image, ImageRgba8U)
+        if not is_color and self._depth is None:
+            raise ValueError("Camera: there is no depth image to go on with")
+        context.SetAbstractState(self._color if is_color else self._depth, image)
+        if self._transit is None:
+            return
+        transit = context.get_abstract_state(int(self._transit)).get_value()
+        color, depth = transit.color, transit.depth
+        if is_color:
+            color = np.repeat(image.data[np.newaxis], color.shape[0], axis=0)
+        else:
+            depth = np.repeat(image.data[np.newaxis, ..., 0], depth.shape[0], axis=0)
+        context.SetAbstractState(self._transit, ImagesInTransit(color, depth))
+
+    def _parameters(self, context: Context) -> NDArray[np.float64]:
+        values: NDArray[np.float64] = context.get_numeric_parameter(0).value()
+        return values
+
+    def _see(self, context: Context) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
+        """Return the colour image without noise, (h, w, 4), and the depth image, (h, w), if there is one."""
+        values = self._parameters(context)
+        X_PC = pose_from_array(values[:6])
+        light = tuple(self._light_port.Eval(context).tolist()) if self._light_port.HasValue(context) else ()
+        brightness = float(values[10] * values[11])
+        query = self._query_port.Eval(context)
+        scene: RenderedScene = self.get_cache_entry(self._scene).Eval(context)
+        view = scene.view(query, Illumination(light, brightness, float(values[12])))
+        X_WC = _pose_of(query, self._frame_number) @ X_PC
+        self._check_outside(view, X_WC.translation())
+        core = RenderCameraCore(
+            RENDERER,
+            CameraInfo(self._width, self._height, *values[6:10].tolist()),
+            ClippingRange(self._near, self._far),
+            RigidTransform(),
+        )
+        world = view.inspector().world_frame_id()
+        color = view.RenderColorImage(ColorRenderCamera(core, False), world, X_WC).data
+        haze = self._haze_port.Eval(context) if self._haze_port.HasValue(context) else np.zeros(5)
+        if self._depth is None and not haze[0]:
+            return color, None
+        depth_camera = DepthRenderCamera(core, DepthRange(self._near, self._far))
+        depth = view.RenderDepthImage(depth_camera, world, X_WC).data[..., 0]
+        if haze[0]:
+            distance = depth * _ray_lengths(self._width, self._height, values[6:10])
+            airlight = np.minimum(_FULL_SCALE * brightness * haze[2:], _FULL_SCALE)
+            mixed = hazed(color[..., :3], distance=distance, extinction=haze[0], airlight=airlight)
+            color = np.dstack((np.rint(mixed).astype(np.uint8), color[..., 3]))
+        return color, None if self._depth is None else depth
+
+    def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
+        for found in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
+            if found.distance < -self._near:
+                name = view.inspector().GetName(found.id_G).partition(" ")[2]
+                raise RenderingError(
+                    f"camera {self.get_name()} is {-found.distance:.3g} m inside {name}, where it sees nothing: change "
+                    "its pose, or the geometry"
+                )
+
+    def _take(self, context: Context, tick: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return the colour image of a tick with its noise, and the depth image."""
+        color, depth = self._see(context)
+        values = self._parameters(context)
+        gain, noise, photon_noise, seed = values[[11, 13, 14, 17]].tolist()
+        if noise or photon_noise:
+            expected = color[..., :3].astype(np.float32)
+            generator = noise_generator(seed=int(seed), stream=self._stream, tick=tick, channel=_PIXEL_CHANNEL)
+            sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / _FULL_SCALE * expected)
+            counts = expected + sigma * generator.standard_normal(expected.shape, np.float32)
+            color = np.array(color)
+            color[..., :3] = np.clip(np.rint(counts), 0.0, _FULL_SCALE)
+        return color, np.zeros((0, 0), np.float32) if depth is None else depth
+
+    def _tick(self, context: Context) -> int:
+        return round(context.get_time() / self._period)
+
+    def _begin(self, context: Context, state: State) -> EventStatus:
+        """Take the first image, which has been on its way for ever."""
+        color, depth = self._take(context, self._tick(context))
+        self._show(state, color, depth)
+        if self._transit is not None:
+            count = context.get_abstract_state(int(self._transit)).get_value().color.shape[0]
+            images = ImagesInTransit(np.stack([color] * count), np.stack([depth] * count))
+            state.get_mutable_abstract_state(int(self._transit)).set_value(images)
+        return EventStatus.Succeeded()
+
+    def _sample(self, context: Context, state: State) -> EventStatus:
+        tick = self._tick(context)
+        color, depth = self._take(context, tick)
+        latency, dropout, seed = self._parameters(context)[15:18].tolist()
+        if self._transit is not None:
+            transit = context.get_abstract_state(int(self._transit)).get_value()
+            colors = np.concatenate((color[np.newaxis], transit.color))
+            depths = np.concatenate((depth[np.newaxis], transit.depth))
+            color, depth = colors[round(latency)], depths[round(latency)]
+            images = ImagesInTransit(colors[:-1], depths[:-1])
+            state.get_mutable_abstract_state(int(self._transit)).set_value(images)
+        key = {"seed": int(seed), "stream": self._stream, "tick": tick}
+        if not dropout or uniform_noise(channel=_DROPOUT_CHANNEL, **key) >= dropout:
+            self._show(state, color, depth)
+        return EventStatus.Succeeded()
+
+    def _show(self, state: State, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
+        state.get_mutable_abstract_state(int(self._color)).get_mutable_value().mutable_data[:] = color
+        if self._depth is not None:
+            state.get_mutable_abstract_state(int(self._depth)).get_mutable_value().mutable_data[..., 0] = depth
+
+
+def connect_camera(
+    builder: DiagramBuilder,
+    camera: Camera,
+    scene_graph: SceneGraph,
+    *,
+    light: Light | None = None,
+    haze: Haze | None = None,
+) -> None:
+    """Connect a camera with the scene that it sees, and with the light and the haze in it."""
+    builder.Connect(scene_graph.get_query_output_port(), camera.GetInputPort("geometry_query"))
+    for name, system in (("light", light), ("haze", haze)):
+        if system is not None:
+            builder.Connect(system.GetOutputPort(name), camera.GetInputPort(name))
+
+
+def _make_scene(context: Context, value: Value) -> None:
+    value.set_value(RenderedScene())
+
+
+def _pose_of(query: QueryObject, frame_number: int) -> RigidTransform:
+    inspector = query.inspector()
+    frame = next(f for f in inspector.GetAllFrameIds() if f.get_value() == frame_number)
+    return query.GetPoseInWorld(frame)
+
+
+def _color_image(color: NDArray[np.uint8]) -> ImageRgba8U:
+    height, width = color.shape[:2]
+    image = ImageRgba8U(width, height)
+    image.mutable_data[:] = color
+    return image
+
+
+def _ray_lengths(width: int, height: int, intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the length of the ray of each pixel up to z_C = 1, shape (h, w)."""
+    fx, fy, cx, cy = intrinsics
+    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    return np.sqrt(1.0 + x**2 + y[:, np.newaxis] ** 2)
