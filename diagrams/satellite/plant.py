@@ -55,10 +55,10 @@ def add_servicer(
 
 
 def add_target(plant: MultibodyPlant, X_WT: RigidTransform | None = None) -> ModelInstanceIndex:
-    """Add the target, without markers, floating freely at ``X_WT``; by default 2.7 m in front of the servicer."""
+    """Add the target, without markers, floating freely at ``X_WT``; by default 2.5 m in front of the servicer."""
     (instance,) = Parser(plant).AddModels(str(TARGET_SDF))
     body = plant.GetBodyByName("body", instance)
-    plant.SetDefaultFloatingBaseBodyPose(body, X_WT or RigidTransform([2.7, 0.0, 0.0]))
+    plant.SetDefaultFloatingBaseBodyPose(body, X_WT or RigidTransform([2.5, 0.0, 0.0]))
     return instance
 
 

@@ -1,0 +1,168 @@
+"""The data processing system of the servicer: one function builds it for the testbed, its copies and the satellite."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
+
+from vtbdrake.components.perception.tracking import TargetTracker
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
+from vtbdrake_diagrams.satellite.control import ArmController
+from vtbdrake_diagrams.satellite.estimation import BASE, BaseEstimator
+from vtbdrake_diagrams.satellite.pose_sensor import PoseReader
+from vtbdrake_diagrams.satellite.relative_motion import RelativeMotion
+from vtbdrake_diagrams.satellite.supervisor import Supervisor
+
+PERIOD = 0.02
+"""The period of the DPS and of the sensors that it needs in every sample, in s."""
+POSE_PERIOD = 0.1
+"""The period of the pose sensor, in s."""
+
+
+def make_dps(*, period: float = PERIOD, wheels: bool = False, pose_latency: float = 0.0) -> Diagram:
+    """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` leads the capture, ``act`` limits.
+
+    Input ports: ``joint_position`` (9: the arm's joints in rad, the fingers in m), ``imu`` (6), ``target_pose`` (7, see
+    `PoseSensor`) and the command ``capture`` (1: go ahead, 0: wait, -1: abort). Output ports: ``joint_position`` (9)
+    and, with ``wheels``, ``wheel_torque`` (3, N m, on the base about its axes).
+
+    Every part is sampled with ``period`` (s) and shows its own state: no input feeds through.
+    """
+    builder = DiagramBuilder()
+    sense = builder.AddNamedSystem("sense", _make_sense())
+    env = builder.AddNamedSystem("env", _make_env(period=period, pose_latency=pose_latency))
+    impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
+    act = builder.AddNamedSystem("act", _make_act(wheels=wheels))
+    for signal in ("joint_position", "imu"):
+        builder.ExportInput(sense.GetInputPort(signal), signal)
+    builder.ExportInput(env.GetInputPort("target_pose"), "target_pose")
+    builder.ExportInput(impl.GetInputPort("capture"), "capture")
+    builder.Connect(sense.GetOutputPort("imu"), env.GetInputPort("imu"))
+    builder.Connect(sense.GetOutputPort("joint_position"), impl.GetInputPort("joints"))
+    for port in ("base", "target", "status"):
+        builder.Connect(env.GetOutputPort(port), impl.GetInputPort(port))
+    for port in ("joint_position", *(["wheel_torque"] if wheels else [])):
+        builder.Connect(impl.GetOutputPort(port), act.GetInputPort(port))
+        builder.ExportOutput(act.GetOutputPort(port), port)
+    dps = builder.Build()
+    dps.set_name("dps")
+    return dps
+
+
+def _make_sense() -> Diagram:
+    """Return the system that adds the parameter ``offset`` to the raw values of encoders and IMU."""
+    builder = DiagramBuilder()
+    sizes = [len(JOINT_NAMES), 6]
+    raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
+    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
+    measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
+    split = builder.AddNamedSystem("split", Demultiplexer(sizes))
+    builder.Connect(raw.get_output_port(), measured.get_input_port(0))
+    builder.Connect(offset.get_output_port(), measured.get_input_port(1))
+    builder.Connect(measured.get_output_port(), split.get_input_port())
+    for k, signal in enumerate(("joint_position", "imu")):
+        builder.ExportInput(raw.get_input_port(k), signal)
+        builder.ExportOutput(split.get_output_port(k), signal)
+    return builder.Build()
+
+
+def _make_env(*, period: float, pose_latency: float) -> Diagram:
+    """Return the perceived environment: where the base is in its inertial frame I, and how the target moves there."""
+    builder = DiagramBuilder()
+    base = builder.AddNamedSystem("base", BaseEstimator(period=period))
+    reader = PoseReader(period=POSE_PERIOD, delay=period, latency=pose_latency)
+    builder.AddNamedSystem("pose_reader", reader)
+    target = builder.AddNamedSystem("target", TargetTracker(["pose"], starting=["pose"], period=period))
+    builder.Connect(base.GetOutputPort("history"), reader.GetInputPort("history"))
+    builder.Connect(reader.get_output_port(), target.GetInputPort("pose"))
+    builder.ExportInput(base.GetInputPort("imu"), "imu")
+    builder.ExportInput(reader.GetInputPort("target_pose"), "target_pose")
+    builder.ExportOutput(base.GetOutputPort("base"), "base")
+    builder.ExportOutput(target.GetOutputPort("state"), "target")
+    builder.ExportOutput(target.GetOutputPort("status"), "status")
+    return builder.Build()
+
+
+def _make_impl(*, period: float, wheels: bool) -> Diagram:
+    """Return the supervisor and the controllers that it leads."""
+    builder = DiagramBuilder()
+    relative = builder.AddNamedSystem("relative", RelativeMotion(period=period))
+    supervisor = builder.AddNamedSystem("supervisor", Supervisor(period=period))
+    controller = builder.AddNamedSystem("controller", ArmController(period=period))
+    for port in ("base", "target", "status"):
+        builder.ExportInput(relative.GetInputPort(port), port)
+    builder.ExportInput(supervisor.GetInputPort("capture"), "capture")
+    for k, system in enumerate((relative, supervisor, controller)):
+        port = system.GetInputPort("joint_position")
+        if k:
+            builder.ConnectInput("joints", port)
+            builder.Connect(relative.get_output_port(), system.GetInputPort("relative"))
+        else:
+            builder.ExportInput(port, "joints")
+    builder.Connect(supervisor.get_output_port(), controller.GetInputPort("guidance"))
+    builder.ExportOutput(controller.get_output_port(), "joint_position")
+    if wheels:
+        attitude = builder.AddNamedSystem("attitude", AttitudeController(period=period))
+        builder.ConnectInput("base", attitude.get_input_port())
+        builder.ExportOutput(attitude.get_output_port(), "wheel_torque")
+    return builder.Build()
+
+
+def _make_act(*, wheels: bool) -> Diagram:
+    """Return the system that keeps the commands within the limits of joints and wheels."""
+    builder = DiagramBuilder()
+    s = Servicer()
+    lower, upper = np.concatenate((s.lower, [0.0, 0.0])), np.concatenate((s.upper, [s.opening, s.opening]))
+    limits = {"joint_position": (lower, upper)}
+    if wheels:
+        limits["wheel_torque"] = (np.full(3, -s.wheel_torque), np.full(3, s.wheel_torque))
+    for name, (least, most) in limits.items():
+        limited = builder.AddNamedSystem(name, Saturation(least, most))
+        builder.ExportInput(limited.get_input_port(), name)
+        builder.ExportOutput(limited.get_output_port(), name)
+    return builder.Build()
+
+
+class AttitudeController(LeafSystem):
+    """Holds the base's attitude by reaction wheels.
+
+    .. pydrake_system::
+
+        name: AttitudeController
+        input_ports:
+        - base
+        output_ports:
+        - wheel_torque
+
+    ``base`` is that of a `BaseEstimator`. ``wheel_torque``, on the base about its axes (N m), is
+    -stiffness theta - damping w, with theta the rotation vector since the start, in B.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float) -> None:
+        super().__init__()
+        self._base = self.DeclareVectorInputPort("base", BASE)
+        torque = self.DeclareDiscreteState(3)
+        self.DeclareStateOutputPort("wheel_torque", torque)
+        self.DeclareNumericParameter(BasicVector([20.0, 80.0]))
+        self.variables = (
+            discrete_state("wheel_torque", int(torque), shape=(3,), unit="N m"),
+            parameter("stiffness", 0, unit="N m/rad", bounds=(0.0, inf)),
+            parameter("damping", 0, start=1, unit="N m s/rad", bounds=(0.0, inf)),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        stiffness, damping = context.get_numeric_parameter(0).value().tolist()
+        base = self._base.Eval(context)
+        w, x = base[1], base[2:5]
+        # The rotation vector of a small turn, whichever the sign of the quaternion; the same in B and in I.
+        theta = 2.0 * np.copysign(1.0, w) * x
+        # R_IB' w_IB: for the damping, too, the base's turn is small.
+        state.set_value(0, -stiffness * theta - damping * base[8:11])

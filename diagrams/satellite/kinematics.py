@@ -1,0 +1,54 @@
+"""The arm's kinematics, as its controller knows them: where the gripper is, and which joint rates move it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint
+
+from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.compiled_plant import PlantDynamics
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, LINK_NAMES, Servicer
+
+REST = (0.0, 0.9, 0.0, 1.8, 0.0, 0.9, 0.0)
+"""The arm's posture in the middle of its workspace (rad): the free motion of its elbow is drawn there."""
+
+
+@lru_cache
+def arm_kernels() -> tuple[Kernel, Kernel]:
+    """Return the gripper's pose [R_BG, p_BG] of q, and the joint rates of (q, V_BG, [posture gain, damping])."""
+    plant = _arm()
+    q = casadi.SX.sym("q", ARM_JOINTS)
+    model = PlantDynamics(plant, plant.CreateDefaultContext())
+    gripper = model.frame(plant.GetFrameByName("gripper"), q)
+    pose = casadi.vertcat(gripper.R.T.reshape((9, 1)), gripper.p)
+    V, gains = casadi.SX.sym("V", 6), casadi.SX.sym("gains", 2)
+    J = casadi.densify(gripper.J)
+    drawn = gains[0] * (casadi.DM(REST) - q)
+    solved = casadi.solve(J @ J.T + gains[1] ** 2 * casadi.SX.eye(6), V - J @ drawn)
+    rates = drawn + J.T @ solved
+    return (
+        Kernel("gripper", [q], casadi.densify(pose), compile=False),
+        Kernel("rates", [q, V, gains], casadi.densify(rates), compile=False),
+    )
+
+
+def _arm() -> MultibodyPlant:
+    """Return the arm alone, in B, with the frame ``gripper``."""
+    servicer = Servicer()
+    plant = MultibodyPlant(0.0)
+    parent = plant.world_frame()
+    X_PJ = servicer.X_BA
+    for k, name in enumerate(ARM_JOINT_NAMES):
+        link = plant.AddRigidBody(LINK_NAMES[k], servicer.link_inertia(k))
+        X_PJ = X_PJ @ RigidTransform([0.0, 0.0, servicer.offsets[k]])
+        mount = plant.AddFrame(FixedOffsetFrame(f"mount_{k}", parent, X_PJ))
+        plant.AddJoint(RevoluteJoint(name, mount, link.body_frame(), servicer.axes[k]))
+        parent, X_PJ = link.body_frame(), RigidTransform()
+    reach = RigidTransform([0.0, 0.0, servicer.lengths[-1] + servicer.tool])
+    plant.AddFrame(FixedOffsetFrame("gripper", parent, reach))
+    plant.Finalize()
+    return plant

@@ -1,0 +1,133 @@
+"""A simulated pose sensor, which stands for camera, scanner and their perception where those need not be simulated."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
+
+from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.components.sensors.sampled import SampledSensor
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, pose_at
+from vtbdrake_diagrams.satellite.relative_motion import moved
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import RigidBody
+
+
+class PoseSensor(SampledSensor):
+    """Measures the pose X_BT of a floating body T against a floating body B.
+
+    .. pydrake_system::
+
+        name: PoseSensor
+        input_ports:
+        - state
+        output_ports:
+        - target_pose
+
+    ``state`` is the plant's [q; v]; ``target_pose`` is [quaternion wxyz, of either sign; position (m)]. The white noise
+    of its `ErrorModel` is added to each of the seven numbers, so that a noise of s is one of s m in the position and,
+    as the quaternion's vector is half the angle, of 2 s rad in the orientation. The quaternion is then not of length 1.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        base: RigidBody,
+        target: RigidBody,
+        *,
+        period: float,
+        stream: int = 0,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        self._starts = base.floating_positions_start(), target.floating_positions_start()
+        q0 = plant.GetDefaultPositions()
+        super().__init__(
+            "target_pose",
+            default=self._relative(q0),
+            period=period,
+            unit="1, m",
+            noise={"orientation_noise": (4, "1"), "position_noise": (3, "m")},
+            stream=stream,
+            errors=errors,
+        )
+        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+
+    def _relative(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        X_WB, X_WT = (moved(x[start : start + 7], np.zeros(3), np.zeros(3), 0.0) for start in self._starts)
+        X_BT = X_WB.InvertAndCompose(X_WT)
+        return np.concatenate((X_BT.rotation().ToQuaternion().wxyz(), X_BT.translation()))
+
+    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
+        return self._relative(self._state_port.Eval(context))
+
+
+class PoseReader(LeafSystem):
+    """The data processing of a `PoseSensor`: it relates each pose to the inertial frame I of the base's navigation.
+
+    .. pydrake_system::
+
+        name: PoseReader
+        input_ports:
+        - target_pose
+        - history
+        output_ports:
+        - estimate
+
+    ``history`` is that of a `BaseEstimator`; ``estimate`` is a PoseEstimate of X_IT. A pose that arrives was measured
+    one period of the DPS before, plus the parameter ``latency`` (s). A pose that equals the last one in all digits is
+    taken for one that did not arrive: sensors have noise.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float, delay: float, latency: float = 0.0, deviation: float = 0.01) -> None:
+        """Declare the system.
+
+        Args:
+            period: The period of the sensor, in s.
+            delay: The period of the DPS, in s: so much later a sample is read.
+            latency: The age of the sensor's samples when they are shown, in s.
+            deviation: The standard deviation of its poses that is assumed, in m, and in rad twice as much.
+        """
+        super().__init__()
+        self._delay = delay
+        self._pose = self.DeclareVectorInputPort("target_pose", 7)
+        self._history = self.DeclareVectorInputPort("history", HISTORY * POSE)
+        estimate = self.DeclareAbstractState(Value(PoseEstimate.missing()))
+        self.DeclareStateOutputPort("estimate", estimate)
+        self._estimate = int(estimate)
+        self._last = int(self.DeclareDiscreteState(7))
+        self.DeclareNumericParameter(BasicVector([latency, deviation]))
+        self.variables = (
+            discrete_state("last_pose", self._last, shape=(7,), unit="1, m"),
+            parameter("latency", 0, unit="s", bounds=(0.0, 1.0)),
+            parameter("deviation", 0, start=1, unit="m", bounds=(0.0, inf)),
+        )
+        # Late enough for the base's history to reach the sample's time.
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 2 * delay, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        latency, deviation = context.get_numeric_parameter(0).value().tolist()
+        time = context.get_time() - 2 * self._delay - latency
+        pose = self._pose.Eval(context)
+        if time < 0.0 or (pose == context.get_discrete_state(self._last).value()).all():
+            return
+        state.get_mutable_discrete_state(self._last).SetFromVector(pose)
+        X_BT = moved(pose, np.zeros(3), np.zeros(3), 0.0)
+        X_IB: RigidTransform = pose_at(self._history.Eval(context), time)
+        covariance = np.diag(np.repeat([2.0 * deviation, deviation], 3) ** 2)
+        estimate = PoseEstimate.of(X_IB @ X_BT, covariance, time=time)
+        state.get_mutable_abstract_state(self._estimate).set_value(estimate)

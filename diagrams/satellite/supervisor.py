@@ -1,0 +1,273 @@
+"""The supervisor of a capture: which mode it is in, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from vtbdrake.components.perception.estimate import rotation_vector
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
+from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
+
+Array = NDArray[np.float64]
+
+MODES = ("wait", "approach", "track", "grip", "retreat", "hold", "abort")
+"""The modes by number: the value of the variable ``mode``."""
+WAIT, APPROACH, TRACK, GRIP, RETREAT, HOLD, ABORT = map(float, range(len(MODES)))
+
+REASONS = (
+    "start",
+    "the target is tracked and within reach",
+    "the gripper is before the bar",
+    "the bar is between the fingers",
+    "the fingers hold the bar",
+    "the relative motion has stopped",
+    "the fingers missed the bar, next attempt",
+    "abort commanded",
+    "the target is lost",
+    "the target is out of reach",
+    "the target moves too fast",
+    "out of time",
+    "the fingers missed the bar too often",
+    "the bar slipped out",
+)
+"""Why the mode was entered, by number: the value of the variable ``reason``."""
+(
+    _START,
+    _FIX,
+    _BEFORE,
+    _AT_BAR,
+    _HELD,
+    _STOPPED,
+    _MISSED,
+    COMMANDED,
+    LOST,
+    OUT_OF_REACH,
+    TOO_FAST,
+    TIMEOUT,
+    MISSED_ALL,
+    SLIPPED,
+) = map(float, range(len(REASONS)))
+
+GO, STAY, STOP = 1.0, 0.0, -1.0
+"""Values of the command ``capture``: go ahead, wait, abort."""
+
+_HALF_TURN = np.array([-1.0, -1.0, 1.0])
+
+GUIDANCE = 6
+"""Size of a `Guidance` as a vector."""
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """What the supervisor asks of the controller.
+
+    Attributes:
+        mode: One of the modes.
+        follows: Whether the gripper is to follow the fixture.
+        distance: From the gripper to the fixture, along its z axis, in m.
+        rate: The rate of that distance, in m/s.
+        opening: Position of each finger, in m.
+        flip: Whether to grip with the gripper turned by pi about its z axis.
+    """
+
+    mode: float
+    follows: bool
+    distance: float
+    rate: float
+    opening: float
+    flip: bool
+
+    def turned(self, R_BH: Array) -> Array:
+        """Return R_BD, the orientation that the gripper is to have at a fixture of the orientation R_BH."""
+        return R_BH * _HALF_TURN if self.flip else R_BH
+
+    @staticmethod
+    def of(vector: Array) -> Guidance:
+        """Return the guidance that is in a vector of shape (`GUIDANCE`,)."""
+        mode, follows, distance, rate, opening, flip = vector.tolist()
+        return Guidance(mode, follows > 0.5, distance, rate, opening, flip > 0.5)
+
+
+class Supervisor(LeafSystem):
+    """A state machine that leads a capture from sensor data alone.
+
+    .. pydrake_system::
+
+        name: Supervisor
+        input_ports:
+        - capture
+        - relative
+        - joint_position
+        output_ports:
+        - guidance
+
+    ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` is that of `RelativeMotion`.
+
+    ========= ============================================ =====================================================
+    mode      what happens                                 ends when
+    ========= ============================================ =====================================================
+    wait      nothing moves                                go, the track is valid, the fixture within reach: approach
+    approach  to ``standoff`` before the fixture           there, within the tolerances: track
+    track     in along its axis, at ``closing_speed``      at the fixture, within ``grip_tolerance``: grip
+    grip      the fingers close                            they hold the bar: retreat; they miss it: approach
+    retreat   the arm brakes the relative motion           it has stopped: hold
+    hold      nothing moves
+    abort     fingers open, the arm backs off
+    ========= ============================================ =====================================================
+
+    Approach, track and grip are aborted on command, when there has been no estimate for ``lost_after``, when the
+    fixture leaves the reach, when it moves against the base faster than ``largest_speed``, and after ``time_limit``;
+    retreat and hold when the bar slips out. While the newest estimate is older than ``hold_after``, all holds.
+
+    The variables ``mode`` and ``reason`` are numbers: positions in `MODES` and `REASONS`.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float) -> None:
+        super().__init__()
+        self._period = period
+        servicer, target = Servicer(), Target()
+        self._shoulder = servicer.X_BA @ np.array([0.0, 0.0, servicer.foot + servicer.lengths[0]])
+        self._wrist = sum(servicer.lengths[5:]) + servicer.tool
+        self._opening = servicer.opening
+        self._bar = 2.0 * target.bar_radius
+        self._capture = self.DeclareVectorInputPort("capture", 1)
+        self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
+        self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
+        start = [WAIT, 0.0, 0.0, 0.0, self._opening, 0.0]
+        guidance = self.DeclareDiscreteState(start)
+        self.DeclareStateOutputPort("guidance", guidance)
+        # reason, time in the mode, time since the start of the capture, steady for, attempts, fingers' last positions
+        memory = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, self._opening, self._opening]))
+        self._state, self._memory = int(guidance), int(memory)
+        declared = {
+            "standoff": (0.25, "m"),
+            "closing_speed": (0.06, "m/s"),
+            "position_tolerance": (0.03, "m"),
+            "orientation_tolerance": (0.12, "rad"),
+            "grip_tolerance": (0.012, "m"),
+            "grip_time": (0.2, "s"),
+            "hold_after": (1.0, "s"),
+            "lost_after": (3.0, "s"),
+            "reach": (1.46, "m"),
+            "largest_angle": (1.05, "rad"),
+            "largest_speed": (0.15, "m/s"),
+            "time_limit": (60.0, "s"),
+            "attempts": (3.0, "1"),
+            "retreat_time": (6.0, "s"),
+        }
+        self.DeclareNumericParameter(BasicVector([value for value, _ in declared.values()]))
+        self._names = tuple(declared)
+        self.variables = (
+            discrete_state("mode", self._state, bounds=(0.0, ABORT)),
+            discrete_state("follows", self._state, start=1, bounds=(0.0, 1.0)),
+            discrete_state("distance", self._state, start=2, unit="m"),
+            discrete_state("rate", self._state, start=3, unit="m/s"),
+            discrete_state("opening", self._state, start=4, unit="m"),
+            discrete_state("flip", self._state, start=5, bounds=(0.0, 1.0)),
+            discrete_state("reason", self._memory, bounds=(0.0, len(REASONS) - 1.0)),
+            discrete_state("time_in_mode", self._memory, start=1, unit="s"),
+            discrete_state("capture_time", self._memory, start=2, unit="s"),
+            discrete_state("steady_for", self._memory, start=3, unit="s"),
+            discrete_state("attempts_made", self._memory, start=4),
+            discrete_state("last_fingers", self._memory, start=5, shape=(2,), unit="m"),
+            *(
+                parameter(name, 0, start=k, unit=unit, bounds=(0.0, inf))
+                for k, (name, (_, unit)) in enumerate(declared.items())
+            ),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        T = self._period
+        p = dict(zip(self._names, context.get_numeric_parameter(0).value().tolist(), strict=True))
+        mode, _, distance, _, opening, flip = context.get_discrete_state(self._state).value().tolist()
+        memory = context.get_discrete_state(self._memory).value()
+        reason, in_mode, since, steady, attempts = memory[:5].tolist()
+        relative = Relative.of(self._relative.Eval(context))
+        fingers = self._joints.Eval(context)[ARM_JOINTS:]
+        go = float(self._capture.Eval(context)[0])
+        still = bool((np.abs(fingers - memory[5:]) < 5e-4 * T / 0.02).all())
+        gap = float(fingers.sum())
+        holds = 0.6 * self._bar < gap < 1.4 * self._bar
+        rate, entered = 0.0, mode
+        in_mode, since = in_mode + T, since + T if mode != WAIT else 0.0
+
+        trouble = self._trouble(mode, go, relative, since, p)
+        fresh = relative.age < p["hold_after"]
+        if trouble:
+            entered, reason = ABORT, trouble
+        elif mode == WAIT:
+            if go > 0.5 and relative.valid and fresh and not self._unreachable(relative, p):
+                entered, reason, distance = APPROACH, _FIX, p["standoff"]
+                flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
+        elif mode in (APPROACH, TRACK) and fresh:
+            error, angle = self._errors(relative, distance, flip)
+            close = error < p["position_tolerance"] and angle < p["orientation_tolerance"]
+            steady = steady + T if close else 0.0
+            if mode == APPROACH:
+                if steady > 0.5:
+                    entered, reason = TRACK, _BEFORE
+            elif distance > 0.0:
+                rate = -min(p["closing_speed"], distance / T) if close else 0.0
+                distance += rate * T
+            else:
+                steady = steady if error < p["grip_tolerance"] else 0.0
+                if steady > p["grip_time"]:
+                    entered, reason = GRIP, _AT_BAR
+        elif mode == GRIP:
+            opening = 0.0
+            steady = steady + T if still else 0.0
+            if steady > 0.3 and in_mode > 0.5:
+                if holds:
+                    entered, reason = RETREAT, _HELD
+                elif attempts + 1.0 >= p["attempts"]:
+                    entered, reason = ABORT, MISSED_ALL
+                else:
+                    entered, reason, attempts = APPROACH, _MISSED, attempts + 1.0
+                    distance, opening = p["standoff"], self._opening
+        elif mode == RETREAT and in_mode > p["retreat_time"]:
+            entered, reason = HOLD, _STOPPED
+        elif mode in (RETREAT, HOLD) and not holds and still:
+            entered, reason = ABORT, SLIPPED
+        if entered == ABORT:
+            opening = self._opening
+        if entered != mode:
+            in_mode = steady = 0.0
+        follows = entered in (APPROACH, TRACK, GRIP) and fresh
+        state.set_value(self._state, np.array([entered, follows, distance, rate, opening, flip]))
+        state.set_value(self._memory, np.array([reason, in_mode, since, steady, attempts, *fingers]))
+
+    def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: dict[str, float]) -> float:
+        """Return the reason for an abort, or 0."""
+        if mode not in (APPROACH, TRACK, GRIP):
+            return COMMANDED if go < -0.5 and mode == RETREAT else 0.0
+        checks = {
+            COMMANDED: go < -0.5,
+            LOST: relative.age > p["lost_after"] or not relative.valid,
+            OUT_OF_REACH: self._unreachable(relative, p),
+            TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p["largest_speed"],
+            TIMEOUT: since > p["time_limit"],
+        }
+        return next((reason for reason, found in checks.items() if found), 0.0)
+
+    def _unreachable(self, relative: Relative, p: dict[str, float]) -> bool:
+        """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""
+        wrist = relative.p_BH - self._wrist * relative.R_BH[:, 2]
+        far = float(np.linalg.norm(wrist - self._shoulder)) > p["reach"]
+        return far or relative.R_BH[0, 2] < np.cos(p["largest_angle"])
+
+    def _errors(self, relative: Relative, distance: float, flip: float) -> tuple[float, float]:
+        """Return by how far (m) and by which angle (rad) the gripper is off."""
+        R_BD = Guidance(0.0, True, distance, 0.0, 0.0, flip > 0.5).turned(relative.R_BH)
+        offset = relative.p_BH - distance * relative.R_BH[:, 2] - relative.p_BG
+        turn = rotation_vector(R_BD @ relative.R_BG.T)
+        return float(np.linalg.norm(offset)), float(np.linalg.norm(turn))

@@ -1,0 +1,100 @@
+"""Captures with the pose sensor, and the modes of the supervisor."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from vtbdrake.testbed import ScenarioError, VirtualTestbed
+from vtbdrake_diagrams.satellite import SatelliteScenario
+from vtbdrake_diagrams.satellite.supervisor import MODES, REASONS
+
+
+@cache
+def built() -> VirtualTestbed:
+    return SatelliteScenario(seed=1, tumble_deg=3.0).build()
+
+
+def mode(context: Context) -> str:
+    return MODES[int(built().read(context, "dps.impl.supervisor.mode"))]
+
+
+def reason(context: Context) -> str:
+    return REASONS[int(built().read(context, "dps.impl.supervisor.reason"))]
+
+
+def fixture_in_gripper(context: Context) -> RigidTransform:
+    plant = built().plant
+    own = plant.GetMyContextFromRoot(context)
+    X_WG, X_WH = (plant.GetFrameByName(name).CalcPoseInWorld(own) for name in ("gripper", "grapple"))
+    return X_WG.InvertAndCompose(X_WH)
+
+
+def test_bar_is_held_at_the_end() -> None:
+    context = built().default_context()
+    simulator = built().simulator(context)
+    modes = []
+    for k in range(100):
+        simulator.AdvanceTo(0.2 * (k + 1))
+        if mode(context) not in modes:
+            modes.append(mode(context))
+    assert modes == ["wait", "approach", "track", "grip", "retreat", "hold"]
+    before = fixture_in_gripper(context)
+    assert np.abs(before.translation()).max() < 0.015
+    simulator.AdvanceTo(25.0)
+    moved = before.InvertAndCompose(fixture_in_gripper(context))
+    # Held still: less than a millimetre and a quarter of a degree in five seconds.
+    assert np.linalg.norm(moved.translation()) < 1e-3
+    assert moved.rotation().ToAngleAxis().angle() < np.radians(0.25)
+
+
+def advanced(time: float, **values: object) -> Context:
+    """A context in the course of a capture."""
+    context = built().default_context()
+    built().write(context, {address.replace("__", "."): value for address, value in values.items()})
+    built().simulator(context).AdvanceTo(time)
+    return context
+
+
+def test_nothing_moves_without_go() -> None:
+    context = advanced(3.0, u__capture=0.0)
+    assert mode(context) == "wait"
+    command = built().read(context, "dps.impl.controller.joint_position")
+    np.testing.assert_array_equal(
+        command, built().read(built().default_context(), "dps.impl.controller.joint_position")
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"u__capture": -1.0}, "abort commanded"),
+        ({"sim__sense__target_pose__dropout": 1.0}, "the target is lost"),
+        ({"dps__impl__supervisor__reach": 0.5}, "the target is out of reach"),
+        ({"dps__impl__supervisor__largest_speed": 0.01}, "the target moves too fast"),
+        ({"dps__impl__supervisor__time_limit": 2.0}, "out of time"),
+    ],
+)
+def test_abort_says_why(values: dict[str, float], expected: str) -> None:
+    context = built().default_context()
+    simulator = built().simulator(context)
+    simulator.AdvanceTo(2.0)
+    assert mode(context) == "approach"
+    built().write(context, {address.replace("__", "."): value for address, value in values.items()})
+    simulator.AdvanceTo(6.0)
+    assert (mode(context), reason(context)) == ("abort", expected)
+
+
+def test_lost_target_is_no_start() -> None:
+    context = advanced(3.0, sim__sense__target_pose__dropout=1.0)
+    assert mode(context) == "wait"
+
+
+@pytest.mark.parametrize(("field", "value"), [("tumble_deg", -1.0), ("distance", 1.0), ("perception", "eyes")])
+def test_bad_fields_are_refused(field: str, value: object) -> None:
+    with pytest.raises(ScenarioError, match=field):
+        SatelliteScenario(**{field: value}).build()
