@@ -39,7 +39,7 @@ class SatelliteScenario(Scenario):
     perception: str = "pose_sensor"
     # Whether the servicer holds its attitude by reaction wheels.
     wheels: bool = False
-    # Errors of the sensors, latency in periods; the IMU's noise is in rad/s for the gyros, m/s^2 for the accelerometers.
+    # Errors of the sensors, latency in periods; the IMU's noise is in rad/s (gyros) and in m/s^2 (accelerometers).
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
     joint_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
     pose_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.005, latency=1))
