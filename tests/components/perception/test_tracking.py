@@ -130,7 +130,7 @@ def test_state_is_the_target_at_the_present() -> None:
     assert state[7:] == pytest.approx([0.0, 0.0, 0.05, 0.02, 0.0, 0.0], abs=2e-3)
     valid, age, attitude, position = tracker.GetOutputPort("status").Eval(context)
     assert valid == 1.0
-    assert age == pytest.approx(0.13)  # The last one held at 3.87 s.
+    assert age == pytest.approx(0.2)  # At 4.0 s, the pose of 3.8 s is the last one that was told.
     assert 0.0 < attitude < 0.01
     assert 0.0 < position < 0.02
 

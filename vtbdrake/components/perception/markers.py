@@ -379,10 +379,10 @@ def pose_from_markers(
 
     With the corners p_i of all markers in T, minimize Σ \|u_i - π(R_CT p_i + p_CT)\|² by Gauss-Newton steps. The
     covariance is σ² (JᵀJ)⁻¹ with the Jacobian J of the projection and σ the larger one of ``corner_noise`` and the
-    root mean square of the residuals. The start is the prediction, or OpenCV's SQPNP.
+    root mean square of the residuals. The steps start at the result of OpenCV's SQPNP.
 
-    A few small markers in one plane have two poses that fit almost equally well. So fewer than ``fewest`` markers are
-    used only with a prediction, which decides.
+    A few small markers in one plane have two poses that fit almost equally well. So with fewer than ``fewest`` markers
+    the steps start at the prediction, and without one there is no estimate.
 
     Args:
         detections: The markers in the image.
@@ -403,7 +403,7 @@ def pose_from_markers(
     points = board.corners[board.find(found.ids)].reshape(-1, 3)
     pixels = found.corners.reshape(-1, 2)
     intrinsics = np.asarray(intrinsics, dtype=float)
-    start = prediction or _start(points, pixels, intrinsics)
+    start = prediction if len(found.ids) < fewest else _start(points, pixels, intrinsics)
     fit = None if start is None else _refine(points, pixels, intrinsics, start)
     if fit is None:
         return PoseEstimate.missing(time=time)

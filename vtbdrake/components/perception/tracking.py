@@ -156,7 +156,7 @@ def _transition(track: Track, dt: float) -> Array:
     return F
 
 
-STATE_SIZE = 13
+STATE_SIZE, STATUS_SIZE = 13, 4
 
 
 def body_state(X_IT: RigidTransform, w: ArrayLike, v: ArrayLike) -> Array:

@@ -1,0 +1,312 @@
+"""The perception in the DPS: images and scans become poses of the target, for its tracker.
+
+Every estimate is the pose X_IT of the target T in the servicer's own inertial frame I, at the time at which the image
+was taken or the scan was complete. It is made from the poses of the base B at that time, as the `BaseEstimator`
+remembers them: so a part takes its sample two periods of the DPS after the sensor did. The newest pose in the history
+then is that of the sensor's instant, and the tracker's state is one period newer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import DiagramBuilder
+
+from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
+from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetector, detect_markers, pose_from_markers
+from vtbdrake.components.perception.registration import Faces, Registration, deskew, register_points
+from vtbdrake.components.perception.tracking import (
+    STATE_SIZE,
+    STATUS_SIZE,
+    MotionModel,
+    TargetTracker,
+    pose_of_state,
+)
+from vtbdrake.scan import Scan
+from vtbdrake.testbed.slow_part import SlowPart
+from vtbdrake_diagrams.satellite.bodies import Servicer, Target
+from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, BaseEstimator, pose_at
+
+if TYPE_CHECKING:
+    from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+
+Array = NDArray[np.float64]
+
+
+def target_board(target: Target | None = None) -> MarkerBoard:
+    """Return the markers of the target, a millimetre above its faces."""
+    target = target or Target()
+    poses = {}
+    for tag in target.tags:
+        z, y = np.array(tag.normal, dtype=float), np.array(tag.up, dtype=float)
+        R_TM = RotationMatrix(np.column_stack([np.cross(y, z), y, z]))
+        poses[tag.id] = RigidTransform(R_TM, tag.center + 0.001 * z)
+    return MarkerBoard.of(poses, size=target.tag_size)
+
+
+def target_faces(target: Target | None = None) -> Faces:
+    """Return the faces of the target's body and panels; the grapple fixture is not modelled."""
+    return Faces.of_boxes((RigidTransform(center), edges) for edges, center in (target or Target()).boxes)
+
+
+@dataclass
+class PerceptionConfig:
+    """How the DPS perceives the target."""
+
+    detector: MarkerDetector = field(default_factory=MarkerDetector)
+    registration: Registration = field(default_factory=Registration)
+    motion: MotionModel = field(default_factory=MotionModel)
+    # Whether the points of a scan are corrected by the estimated motion of the target during the scan.
+    deskew: bool = True
+    # From the sample of an image to its markers (s).
+    marker_latency: float = 0.06
+    # From the sample of a scan to its pose (s).
+    scan_latency: float = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedTarget:
+    """The target as the tracker showed it when a slow part took its sample.
+
+    Attributes:
+        state: The tracker's ``state``, (13,).
+        valid: Whether the tracker follows the target.
+        time: The time that the state is for, in s.
+    """
+
+    state: Array
+    valid: bool
+    time: float
+
+    def at(self, time: float) -> RigidTransform:
+        """Return X_IT at another time, with constant velocities."""
+        X_IT, dt = pose_of_state(self.state), time - self.time
+        turn = RotationMatrix(rotation_matrix(self.state[7:10] * dt))
+        return RigidTransform(turn @ X_IT.rotation(), X_IT.translation() + dt * self.state[10:13])
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPose:
+    """The target's pose from one image: the function of the slow part ``markers``.
+
+    Attributes:
+        board: The markers on the target.
+        X_BC: Pose of the camera, as the DPS knows it.
+        intrinsics: [fx, fy, cx, cy] of the camera in pixels.
+        detector: How markers are found.
+        latency: How old the camera's images are when it shows them, in s.
+        period: The period of the DPS, in s.
+    """
+
+    board: MarkerBoard
+    X_BC: RigidTransform
+    intrinsics: Array
+    detector: MarkerDetector
+    latency: float
+    period: float
+
+    def prepare(self) -> None:
+        """Load OpenCV."""
+        detect_markers(np.zeros((8, 8), dtype=np.uint8), self.detector)
+
+    def __call__(self, *, image: ImageRgba8U, history: Array, target: Array, status: Array) -> dict[str, Any]:
+        """Return the estimate of X_IT, and the count of the target's markers in the image."""
+        found = detect_markers(image, self.detector).on(self.board)
+        newest = float(history[0])
+        time = newest - self.latency
+        X_IC = pose_at(history, time) @ self.X_BC
+        tracked = TrackedTarget(target, bool(status[0]), newest + self.period)
+        prediction = X_IC.inverse() @ tracked.at(time) if tracked.valid else None
+        X_CT = pose_from_markers(found, self.board, self.intrinsics, time=time, prediction=prediction)
+        return {"estimate": X_CT.seen_from(X_IC), "count": np.array([len(found.ids)], dtype=float)}
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPose:
+    """The target's pose from one scan: the function of the slow part ``registration``.
+
+    Attributes:
+        faces: The model of the target.
+        X_BL: Pose of the scanner, as the DPS knows it.
+        registration: How points are registered.
+        deskew: Whether they are corrected by the motions of base and target during the scan.
+        attitude: R_IT to begin with while nothing is tracked; None waits for the markers.
+        period: The period of the DPS, in s.
+    """
+
+    faces: Faces
+    X_BL: RigidTransform
+    registration: Registration
+    deskew: bool
+    attitude: RotationMatrix | None
+    period: float
+
+    def __call__(
+        self, *, scan: Scan, history: Array, target: Array, status: Array, memory: PoseEstimate
+    ) -> tuple[PoseEstimate, PoseEstimate]:
+        """Return the estimate of X_IT twice: to be shown, and to be remembered, as each scan is registered once."""
+        if scan.stamp > memory.time:
+            tracked = TrackedTarget(target, bool(status[0]), float(history[0]) + self.period)
+            memory = self._register(scan, history, tracked)
+        return memory, memory
+
+    def _register(self, scan: Scan, history: Array, tracked: TrackedTarget) -> PoseEstimate:
+        if not len(scan.ranges) or not (tracked.valid or self.attitude):
+            return PoseEstimate.missing(time=scan.stamp)
+        eye = (pose_at(history, scan.stamp) @ self.X_BL).translation()
+        p_BQ = scan.points() @ self.X_BL.rotation().matrix().T + self.X_BL.translation()
+        fired = scan.stamp + (scan.times if self.deskew else np.zeros_like(scan.times))
+        points = in_inertial_frame(p_BQ, fired, history)
+        if tracked.valid:
+            starts = [tracked.at(scan.stamp)]
+            if self.deskew:
+                rate, velocity = tracked.state[7:10], tracked.state[10:13]
+                points = deskew(points, scan.times, origin=starts[0].translation(), velocity=velocity, rate=rate)
+        else:
+            starts = self._guesses(points, eye)
+        found = [
+            register_points(points, self.faces, start, eye=eye, time=scan.stamp, registration=self.registration)
+            for start in starts
+        ]
+        return min(found, key=lambda estimate: float(np.trace(estimate.covariance)))
+
+    def _guesses(self, points: Array, eye: Array) -> list[RigidTransform]:
+        """Return poses behind the nearest points, in attitudes about the one to begin with."""
+        assert self.attitude is not None
+        arms = points - eye
+        distances = np.linalg.norm(arms, axis=1)
+        middle = arms[distances < distances.min() + 0.5].mean(axis=0)
+        p_IT = eye + middle * (1.0 + 0.4 / float(np.linalg.norm(middle)))
+        turns = [_BASIN * np.array(turn) for turn in product((-1.0, 0.0, 1.0), repeat=3)]
+        return [RigidTransform(RotationMatrix(rotation_matrix(turn)) @ self.attitude, p_IT) for turn in turns]
+
+
+_BASIN = np.radians(25.0)  # How far apart the attitudes are in which a scan is registered at first.
+
+
+def in_inertial_frame(p_BQ: Array, times: Array, history: Array) -> Array:
+    """Return points that were measured in B at their own times, in I.
+
+    Args:
+        p_BQ: The points, (n, 3) in m.
+        times: When they were measured, (n,) in s.
+        history: The port ``history`` of the `BaseEstimator`.
+    """
+    past = np.reshape(history, (HISTORY, POSE))[::-1]
+    w, x, y, z, *position = (np.interp(times, past[:, 0], past[:, k]) for k in range(1, POSE))
+    v = np.column_stack([x, y, z])
+    square = (w**2 + x**2 + y**2 + z**2)[:, None]  # Between two quaternions, a little less than 1.
+    twice = 2.0 * np.cross(v, p_BQ)
+    turned: Array = p_BQ + (w[:, None] * twice + np.cross(v, twice)) / square
+    return turned + np.column_stack(position)
+
+
+def add_marker_part(
+    builder: DiagramBuilder,
+    base: BaseEstimator,
+    target: TargetTracker,
+    *,
+    config: PerceptionConfig,
+    period: float,
+    image_period: float,
+    info: CameraInfo,
+    image_latency: float = 0.0,
+) -> SlowPart:
+    """Add the slow part ``markers``, and the input port ``image`` of the Diagram that it belongs to.
+
+    Args:
+        builder: Of the Diagram ``env`` of the DPS.
+        base: Remembers the base's poses.
+        target: Predicts the target's pose.
+        config: How images are evaluated.
+        period: The period of the DPS, in s.
+        image_period: The period of the camera, in s.
+        info: The size of its images, and its intrinsics.
+        image_latency: How old its images are when it shows them, in s.
+
+    Returns:
+        The part, with the outputs ``estimate`` (of X_IT) and ``count``.
+    """
+    from pydrake.systems.sensors import ImageRgba8U
+
+    function = MarkerPose(
+        board=target_board(),
+        X_BC=Servicer().X_BC,
+        intrinsics=np.array([info.focal_x(), info.focal_y(), info.center_x(), info.center_y()]),
+        detector=config.detector,
+        latency=image_latency,
+        period=period,
+    )
+    part = SlowPart(
+        function,
+        inputs={"image": ImageRgba8U(info.width(), info.height()), **_ESTIMATES},
+        outputs={"estimate": PoseEstimate.missing(), "count": 1},
+        period=image_period,
+        latency=config.marker_latency,
+        offset=2.0 * period,
+    )
+    return _add(builder, "markers", part, base, target, sensor="image")
+
+
+def add_scan_part(
+    builder: DiagramBuilder,
+    base: BaseEstimator,
+    target: TargetTracker,
+    *,
+    config: PerceptionConfig,
+    period: float,
+    scan_period: float,
+    attitude: RotationMatrix | None = None,
+) -> SlowPart:
+    """Add the slow part ``registration``, and the input port ``scan`` of the Diagram that it belongs to.
+
+    Args:
+        builder: Of the Diagram ``env`` of the DPS.
+        base: Remembers the base's poses.
+        target: Predicts the target's pose.
+        config: How scans are evaluated.
+        period: The period of the DPS, in s.
+        scan_period: How often the part looks for a new scan, in s.
+        attitude: R_IT to begin with; None if the track begins with markers.
+
+    Returns:
+        The part, with the output ``estimate`` (of X_IT).
+    """
+    function = ScanPose(
+        faces=target_faces(),
+        X_BL=Servicer().X_BL,
+        registration=config.registration,
+        deskew=config.deskew,
+        attitude=attitude,
+        period=period,
+    )
+    part = SlowPart(
+        function,
+        inputs={"scan": Scan.empty(), **_ESTIMATES},
+        outputs={"estimate": PoseEstimate.missing()},
+        memory=PoseEstimate.missing(),
+        period=scan_period,
+        latency=config.scan_latency,
+        offset=2.0 * period,
+    )
+    return _add(builder, "registration", part, base, target, sensor="scan")
+
+
+# The inputs of both parts beside their sensor.
+_ESTIMATES = {"history": HISTORY * POSE, "target": STATE_SIZE, "status": STATUS_SIZE}
+
+
+def _add(
+    builder: DiagramBuilder, name: str, part: SlowPart, base: BaseEstimator, target: TargetTracker, *, sensor: str
+) -> SlowPart:
+    builder.AddNamedSystem(name, part)
+    builder.Connect(base.GetOutputPort("history"), part.GetInputPort("history"))
+    builder.Connect(target.GetOutputPort("state"), part.GetInputPort("target"))
+    builder.Connect(target.GetOutputPort("status"), part.GetInputPort("status"))
+    builder.ExportInput(part.GetInputPort(sensor), sensor)
+    return part
