@@ -44,29 +44,31 @@ def to_body(
     cdef float[::1] limit = limits
     cdef Py_ssize_t[::1] ray = rays
     cdef const double* X = &motion_WB[0]
-    cdef double radius = sphere_B[3], ahead, square
-    cdef double p_W[3]
-    cdef double d_W[3]
+    cdef double ahead, square, distance, radius = sphere_B[3]
+    cdef double center_W[3]
     cdef double p[3]
     cdef double d[3]
+    for k in range(3):
+        center_W[k] = X[9 + k] + X[3 * k] * sphere_B[0] + X[3 * k + 1] * sphere_B[1] + X[3 * k + 2] * sphere_B[2]
+    # A sphere that is at rest and holds the moving one.
+    radius += longest(times) * (length(X + 15) + length(X + 12) * length(&sphere_B[0]))
     for i in range(n):
-        for k in range(3):
-            p_W[k] = origins_W[i, k] - X[9 + k] - times[i] * X[15 + k]
-            d_W[k] = directions_W[i, k]
-        turn(X + 12, -times[i], p_W)
-        turn(X + 12, -times[i], d_W)
         ahead = square = 0.0
         for k in range(3):
-            p[k] = X[k] * p_W[0] + X[3 + k] * p_W[1] + X[6 + k] * p_W[2]
-            d[k] = X[k] * d_W[0] + X[3 + k] * d_W[1] + X[6 + k] * d_W[2]
-            ahead += (sphere_B[k] - p[k]) * d[k]
-            square += (sphere_B[k] - p[k]) ** 2
-        # Leave out what passes the bounding sphere, ends before it, or begins behind it.
+            distance = center_W[k] - origins_W[i, k]
+            ahead += distance * directions_W[i, k]
+            square += distance * distance
+        # Leave out what passes the sphere, ends before it, or begins behind it.
         if square - ahead * ahead > radius * radius or ahead - radius > nearest[i] or ahead + radius < 0.0:
             continue
         for k in range(3):
-            p_B[m, k] = <float>p[k]
-            d_B[m, k] = <float>d[k]
+            p[k] = origins_W[i, k] - X[9 + k] - times[i] * X[15 + k]
+            d[k] = directions_W[i, k]
+        turn(X + 12, -times[i], p)
+        turn(X + 12, -times[i], d)
+        for k in range(3):
+            p_B[m, k] = <float>(X[k] * p[0] + X[3 + k] * p[1] + X[6 + k] * p[2])
+            d_B[m, k] = <float>(X[k] * d[0] + X[3 + k] * d[1] + X[6 + k] * d[2])
         limit[m] = <float>nearest[i]
         ray[m] = i
         m += 1
@@ -94,6 +96,18 @@ def keep_nearest(
         nearest[i] = distances[k]
         cosines[i] = abs(x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]) / sqrt(x * x + y * y + z * z)
         bodies[i] = body
+
+
+cdef double longest(const double[::1] times) noexcept:
+    cdef double result = 0.0
+    cdef Py_ssize_t i
+    for i in range(times.shape[0]):
+        result = max(result, abs(times[i]))
+    return result
+
+
+cdef double length(const double* v) noexcept:
+    return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
 cdef inline void turn(const double* w, double t, double* v) noexcept:

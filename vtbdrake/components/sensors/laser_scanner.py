@@ -1,0 +1,418 @@
+"""3D laser scanners, whose rays are fired one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from math import inf, pi, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.systems.framework import (
+    AbstractStateIndex,
+    BasicVector,
+    Context,
+    EventStatus,
+    LeafSystem,
+    NumericParameterIndex,
+    State,
+    ValueProducer,
+)
+
+from vtbdrake.components.environment.haze import false_return_ranges, two_way_transmission
+from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.components.sensors.noise import noise_generator
+from vtbdrake.scan import Scan
+from vtbdrake.state import Codec, Element, discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import Frame
+    from pydrake.systems.framework import DiagramBuilder
+
+    from vtbdrake.components.environment import Haze
+    from vtbdrake.components.ray_casting import RayCaster
+
+Array = NDArray[np.float64]
+
+# Of two instants that are equal but for rounding, in s.
+_ROUNDING = 1e-9
+# The fields of an `ErrorModel` that ranges have.
+_ERRORS = ("noise", "bias", "quantization", "dropout", "seed")
+# The channel of the scanner's stream of random numbers.
+_CHANNEL = 0
+
+
+@dataclass(kw_only=True)
+class LaserScannerConfig:
+    """How a laser scanner scans. All values are parameters of the Context, too."""
+
+    # Scans per second.
+    frequency: float = 10.0
+    # Rays per second; a scan has rays / frequency, rounded to whole rows.
+    rays_per_second: float = 20_000.0
+    # Width of the field of view about z_L, in rad.
+    azimuth: float = 0.7
+    # Height of the field of view, in rad; 0 scans one row.
+    elevation: float = 0.5
+    # Distance below which nothing is reported, in m.
+    min_range: float = 0.2
+    # Distance at which a white, perpendicular surface is just detected in clear space, in m.
+    max_range: float = 50.0
+    # Share of the light that all surfaces reflect, diffusely.
+    reflectivity: float = 0.5
+    # Full angle of the beam's divergence, where its intensity has fallen to 1/e^2, in rad.
+    divergence: float = 0.0
+
+    def check(self, slice_period: float) -> None:
+        """Raise a ValueError if no scanner can scan like this.
+
+        Args:
+            slice_period: Of the scanner, in s.
+
+        Raises:
+            ValueError: A value that no scanner can have.
+        """
+        most = 1.0 / slice_period + _ROUNDING
+        checks = {
+            "frequency": (0.0 < self.frequency <= most, f"in scans per s, above 0 and at most {most:g}, one per slice"),
+            "rays_per_second": (self.frequency <= self.rays_per_second < inf, "finite, and at least one ray per scan"),
+            "azimuth": (0.0 < self.azimuth <= 2.0 * pi, "in rad, above 0 and at most 2 pi"),
+            "elevation": (0.0 <= self.elevation <= pi, "in rad, between 0 and pi"),
+            "min_range": (0.0 < self.min_range < inf, "in m, positive and finite"),
+            "max_range": (self.min_range < self.max_range < inf, "in m, finite and above min_range"),
+            "reflectivity": (0.0 <= self.reflectivity <= 1.0, "a share between 0 and 1"),
+            "divergence": (0.0 <= self.divergence < 0.5, "in rad, between 0 and 0.5"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                raise ValueError(f"LaserScanner: {name} must be {expected}, not {getattr(self, name)!r}")
+
+
+_FIELDS = tuple(field.name for field in fields(LaserScannerConfig))
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """The parameters as they are used."""
+
+    X_BL: RigidTransform
+    config: LaserScannerConfig
+    errors: ErrorModel
+
+    def __deepcopy__(self, memo: object) -> _Settings:
+        return self
+
+
+@dataclass(frozen=True)
+class ScanInProgress:
+    """The returns of the present scan so far, by slice: arrays of direction (3), range (m) and time since its start."""
+
+    slices: tuple[Array, ...] = ()
+
+    def __deepcopy__(self, memo: object) -> ScanInProgress:
+        return self
+
+    def returns(self) -> Array:
+        """Return all returns so far, shape (n, 5)."""
+        return np.concatenate(self.slices) if self.slices else np.zeros((0, 5))
+
+
+def _decode_progress(arrays: Mapping[str, np.ndarray]) -> ScanInProgress:
+    return ScanInProgress((np.asarray(arrays["returns"]),))
+
+
+_PROGRESS_CODEC = Codec(lambda progress: {"returns": progress.returns()}, _decode_progress)
+
+
+class LaserScanner(LeafSystem):
+    r"""Measures distances along rays that it fires one after the other.
+
+    .. pydrake_system::
+
+        name: LaserScanner
+        input_ports:
+        - body_poses
+        - body_spatial_velocities
+        - haze (optional: of a `Haze`)
+        output_ports:
+        - scan
+
+    ``scan`` is the last complete `Scan`, in the scanner's frame L (x forward, z up), stamped with the time of its end;
+    before the first, an empty one, stamped 0. A scan has n rays at equal intervals of 1 / (n frequency), row by row
+    from the top, each row from the right, where rows and columns have about the same angular distance. L starts where
+    ``frame`` is on its body B; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of L in B, moves it.
+
+    Time goes in slices. At the end of a slice all rays are cast that were fired during it, each at the poses at its own
+    firing time: these follow from poses and velocities at the end of the slice, which are taken as constant. So a
+    moving target is distorted as in reality, up to a h^2 / 2 at an acceleration a in slices of length h. A scan is
+    shown at the end of the slice in which it ends. A reader that is updated at the same instant by an unrestricted
+    update (a `SlowPart`) sees it one slice later. The frequency need not divide that of the slices. Frequency and rays
+    per second may be changed at any time, and take effect with the next scan.
+
+    A beam returns from a Lambertian surface that it hits at the distance r under the angle a of incidence. It is
+    detected if the received power (Hoefle and Pfeifer, "Correction of laser scanning intensity data: data and
+    model-driven approaches", 2007) reaches that of a white, perpendicular surface at the largest range:
+
+        reflectivity cos(a) exp(-2 b r) / r^2 >= 1 / max_range^2        (b: extinction of the haze)
+
+    So it drops out at grazing incidence, the sooner the farther away. Haze adds false returns, see
+    `false_return_ranges`. The return may come from anywhere in the beam's footprint: the beam is cast in a direction
+    that differs from the reported one by normal errors of a quarter of the divergence about both axes (Lichti and
+    Gordon, "Error propagation in directly georeferenced terrestrial laser scanner point clouds for cultural heritage
+    recording", 2004). So the error of a range grows with distance and incidence, r tan(a) divergence / 4, and a ray
+    beside an edge may hit either side. Ranges between the two sides (mixed pixels) do not occur.
+
+    An `ErrorModel` adds noise and bias (m), quantization (m) and drop-out (of single rays) to the ranges. A range that
+    is then below min_range is not reported.
+
+    The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``bias``, ``quantization``, ``dropout`` and ``seed`` are
+    parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns`` and ``fired`` (rays) of the present scan are
+    state.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        frame: Frame,
+        caster: RayCaster,
+        *,
+        config: LaserScannerConfig | None = None,
+        slice_period: float = 0.02,
+        stream: int = 7,
+        errors: ErrorModel | None = None,
+    ) -> None:
+        """Declare the scanner.
+
+        Args:
+            plant: The plant, whose bodies move.
+            frame: A frame of the plant, at which the scanner begins.
+            caster: What rays are cast at; several scanners can share it.
+            config: Initial values of the parameters.
+            slice_period: Length of a slice in s. It limits the frequency; shorter ones cost time.
+            stream: Number of the random stream, which makes the noise of several sensors independent.
+            errors: Errors of the ranges, and the seed; None for exact ranges.
+
+        Raises:
+            ValueError: A value that no scanner can have, or an error that scans do not have.
+        """
+        super().__init__()
+        config, errors = config or LaserScannerConfig(), errors or ErrorModel()
+        if not 0.0 < slice_period < inf:
+            raise ValueError(f"LaserScanner: the slice_period is positive, in s, not {slice_period!r}")
+        config.check(slice_period)
+        errors.check("LaserScanner")
+        for name in ("drift", "latency", "max_latency"):
+            if getattr(errors, name):
+                raise ValueError(f"LaserScanner: scans have no {name}; leave it out of the errors")
+        self._caster, self._body = caster, int(frame.body().index())
+        self._slice_period, self._stream = float(slice_period), int(stream)
+        self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
+        self._velocities_port = self.DeclareAbstractInputPort("body_spatial_velocities", Value[list[SpatialVelocity]]())
+        self._haze_port = self.DeclareVectorInputPort("haze", 5)
+        self.variables = (
+            *self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors),
+            *self._declare_state(),
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self._slice_period, 0.0, self._end_slice)
+
+    def _declare_parameters(
+        self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel
+    ) -> tuple[Element, ...]:
+        values = [getattr(config, name) for name in _FIELDS] + [getattr(errors, name) for name in _ERRORS]
+        index = NumericParameterIndex(self.DeclareNumericParameter(BasicVector([*pose_to_array(X_BL), *values])))
+        settings = ValueProducer(allocate=lambda: Value(object()), calc=weakly(self, LaserScanner._calc_settings))
+        entry = self.DeclareCacheEntry("settings", settings, {self.numeric_parameter_ticket(index)})
+        self._settings = entry.cache_index()
+        most = 1.0 / self._slice_period
+        described = {
+            "frequency": ("Hz", (0.0, most)),
+            "rays_per_second": ("1/s", (0.0, inf)),
+            "azimuth": ("rad", (0.0, 2.0 * pi)),
+            "elevation": ("rad", (0.0, pi)),
+            "min_range": ("m", (0.0, inf)),
+            "max_range": ("m", (0.0, inf)),
+            "reflectivity": ("1", (0.0, 1.0)),
+            "divergence": ("rad", (0.0, 0.5)),
+            "noise": ("m", (0.0, inf)),
+            "bias": ("m", (-inf, inf)),
+            "quantization": ("m", (0.0, inf)),
+            "dropout": ("1", (0.0, 1.0)),
+            "seed": ("1", (0.0, 2.0**53)),
+        }
+        return (
+            parameter("pose", index, shape=(6,), unit=POSE_UNIT),
+            *(
+                parameter(name, index, start=6 + k, unit=unit, bounds=bounds)
+                for k, (name, (unit, bounds)) in enumerate(described.items())
+            ),
+        )
+
+    def _declare_state(self) -> tuple[Element, ...]:
+        self._scan: AbstractStateIndex = self.DeclareAbstractState(Value(Scan.empty()))
+        self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
+        self.codecs = {int(self._progress): _PROGRESS_CODEC}
+        # Of the present scan; without rows, none has begun.
+        names = {"scan_start": "s", "scan_period": "s", "rows": "1", "columns": "1", "fired": "1"}
+        self._present = int(self.DeclareDiscreteState(len(names)))
+        self.DeclareStateOutputPort("scan", self._scan)
+        return tuple(
+            discrete_state(name, self._present, start=k, unit=unit) for k, (name, unit) in enumerate(names.items())
+        )
+
+    @property
+    def slice_period(self) -> float:
+        """Return the length of a slice (s)."""
+        return self._slice_period
+
+    def resume(self, context: Context, scan: Scan) -> None:
+        """Go on where a scanner stands that has shown ``scan`` last; the present scan begins anew."""
+        context.SetAbstractState(self._scan, scan)
+        context.SetAbstractState(self._progress, ScanInProgress())
+        context.SetDiscreteState(self._present, np.zeros(5))
+
+    def _calc_settings(self, context: Context, output: Value) -> None:
+        values = context.get_numeric_parameter(0).value()
+        config = LaserScannerConfig(**dict(zip(_FIELDS, values[6:].tolist(), strict=False)))
+        config.check(self._slice_period)
+        errors = ErrorModel(**dict(zip(_ERRORS, values[6 + len(_FIELDS) :].tolist(), strict=True)))
+        output.set_value(_Settings(pose_from_array(values[:6]), config, errors))
+
+    def _end_slice(self, context: Context, state: State) -> EventStatus:
+        settings: _Settings = self.get_cache_entry(self._settings).Eval(context)
+        now = context.get_time()
+        start, period, *counts = context.get_discrete_state(self._present).value().tolist()
+        rows, columns, fired = map(int, counts)
+        slices = context.get_abstract_state(int(self._progress)).get_value().slices
+        # No scan has begun, or the context has been set to a later time.
+        if not rows or start + (fired + 0.5) * period / (rows * columns) < now - 1.5 * self._slice_period:
+            start, period, (rows, columns) = now, 1.0 / settings.config.frequency, raster_size(settings.config)
+            slices, fired = (), 0
+        tick = round(now / self._slice_period)
+        generator = noise_generator(seed=int(settings.errors.seed), stream=self._stream, tick=tick, channel=_CHANNEL)
+        while True:
+            rays = rows * columns
+            due = min(rays, int((now + _ROUNDING - start) / period * rays + 0.5))
+            if due > fired:
+                directions = raster(rows, columns, settings.config.azimuth, settings.config.elevation)[fired:due]
+                times = (np.arange(fired, due) + 0.5) * (period / rays)
+                kept, ranges = self._fire(context, settings, generator, directions, times + (start - now))
+                slices = (*slices, np.column_stack((directions[kept], ranges, times[kept])))
+                fired = due
+            if fired < rays or start + period > now + _ROUNDING:
+                break
+            returns = ScanInProgress(slices).returns()
+            scan = Scan(returns[:, :3], returns[:, 3], np.minimum(returns[:, 4] - period, 0.0), start + period)
+            state.get_mutable_abstract_state(int(self._scan)).set_value(scan)
+            start, period, (rows, columns) = (
+                start + period,
+                1.0 / settings.config.frequency,
+                raster_size(settings.config),
+            )
+            slices, fired = (), 0
+        state.get_mutable_abstract_state(int(self._progress)).set_value(ScanInProgress(slices))
+        state.get_mutable_discrete_state().set_value(self._present, [start, period, rows, columns, fired])
+        return EventStatus.Succeeded()
+
+    def _fire(
+        self,
+        context: Context,
+        settings: _Settings,
+        generator: np.random.Generator,
+        directions: Array,
+        times: Array,
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return which rays are reported, and their ranges (m).
+
+        Args:
+            context: At the end of the slice.
+            settings: Of the scanner.
+            generator: Of the slice.
+            directions: Of the rays, as they are reported, shape (n, 3).
+            times: When they are fired, in s, counted from the end of the slice, shape (n,).
+        """
+        config, errors = settings.config, settings.errors
+        beams = directions
+        if config.divergence:
+            # The part along the beam vanishes with the length.
+            beams = directions + config.divergence / 4.0 * generator.standard_normal(directions.shape)
+            beams /= np.sqrt(np.einsum("ij,ij->i", beams, beams))[:, np.newaxis]
+        X_WB, V_WB = self._poses_port.Eval(context), self._velocities_port.Eval(context)
+        X_WL = X_WB[self._body] @ settings.X_BL
+        V_WL = V_WB[self._body].Shift(X_WB[self._body].rotation() @ settings.X_BL.translation())
+        # Beyond it, not even perpendicular surfaces are detected.
+        reach = config.max_range * sqrt(config.reflectivity)
+        hits = self._caster.cast(beams, times, X_WL=X_WL, V_WL=V_WL, X_WB=X_WB, V_WB=V_WB, reach=reach)
+        power, distances = hits.cosines * reach**2, hits.distances
+        if self._haze_port.HasValue(context):
+            extinction, backscatter = self._haze_port.Eval(context)[:2].tolist()
+            power *= two_way_transmission(extinction, np.minimum(distances, reach))
+            ranges = np.where(power >= distances**2, distances, inf)
+            uniform = generator.random(len(ranges))
+            false = false_return_ranges(
+                uniform, extinction=extinction, backscatter=backscatter, least_range=config.min_range
+            )
+            ranges = np.where(false < np.minimum(distances, reach), false, ranges)
+        else:
+            ranges = np.where(power >= distances**2, distances, inf)
+        kept = np.flatnonzero(ranges < inf)
+        ranges = _with_errors(ranges[kept], errors, generator)
+        reported = ranges >= config.min_range
+        return kept[reported], ranges[reported]
+
+
+def connect_laser_scanner(
+    builder: DiagramBuilder, scanner: LaserScanner, plant: MultibodyPlant, *, haze: Haze | None = None
+) -> None:
+    """Connect a laser scanner with the plant in which it is, and with the haze in front of it."""
+    for name in ("body_poses", "body_spatial_velocities"):
+        builder.Connect(plant.GetOutputPort(name), scanner.GetInputPort(name))
+    if haze is not None:
+        builder.Connect(haze.GetOutputPort("haze"), scanner.GetInputPort("haze"))
+
+
+def raster_size(config: LaserScannerConfig) -> tuple[int, int]:
+    """Return the numbers of rows and columns of a scan, whose angular distances are about equal."""
+    rays = config.rays_per_second / config.frequency
+    rows = max(1, round(sqrt(rays * config.elevation / config.azimuth)))
+    return rows, max(1, round(rays / rows))
+
+
+@lru_cache(16)
+def raster(rows: int, columns: int, azimuth: float, elevation: float) -> Array:
+    """Return the directions of a scan's rays in the order in which they are fired, read-only, shape (rows columns, 3).
+
+    Args:
+        rows: Number of rows, which follow each other from the top.
+        columns: Number of rays in each row, which follow each other from the right.
+        azimuth: Width of the field of view about z, in rad.
+        elevation: Its height, in rad.
+    """
+    up = elevation * (0.5 - (np.arange(rows) + 0.5) / rows)
+    left = azimuth * ((np.arange(columns) + 0.5) / columns - 0.5)
+    up, left = np.repeat(up, columns), np.tile(left, rows)
+    directions = np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
+    directions.flags.writeable = False
+    return directions
+
+
+def _with_errors(ranges: Array, errors: ErrorModel, generator: np.random.Generator) -> Array:
+    """Return the ranges (m) with their errors; 0 for those that drop out."""
+    if errors.noise:
+        ranges = ranges + errors.noise * generator.standard_normal(len(ranges))
+    if errors.bias:
+        ranges = ranges + errors.bias
+    if errors.quantization:
+        ranges = np.round(ranges / errors.quantization) * errors.quantization
+    if errors.dropout:
+        ranges = np.where(generator.random(len(ranges)) < errors.dropout, 0.0, ranges)
+    return ranges
