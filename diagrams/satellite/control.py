@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from vtbdrake.components.perception.estimate import rotation_vector
+from vtbdrake.components.perception.estimate import cross_matrix, rotation_vector
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.kinematics import arm_kernels
+from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
 from vtbdrake_diagrams.satellite.supervisor import ABORT, GUIDANCE, HOLD, RETREAT, Guidance
 
@@ -53,7 +53,7 @@ class ArmController(LeafSystem):
         super().__init__()
         self._period = period
         servicer = Servicer()
-        _, self._rates = arm_kernels()
+        self._rates = joint_rates()
         self._lower, self._upper = servicer.lower + 0.02, servicer.upper - 0.02
         self._stowed = np.array(servicer.stowed)
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
@@ -129,7 +129,7 @@ class ArmController(LeafSystem):
         R_BD = guidance.turned(relative.R_BH)
         e_p = relative.p_BH + offset - relative.p_BG
         e_R = rotation_vector(R_BD @ relative.R_BG.T)
-        v_BD = relative.v_BH + np.cross(relative.w_BH, offset) - guidance.rate * axis
+        v_BD = relative.v_BH + cross_matrix(relative.w_BH) @ offset - guidance.rate * axis
         return np.concatenate((relative.w_BH + _limited(k_R * e_R, turn), v_BD + _limited(k_p * e_p, speed)))
 
 

@@ -7,11 +7,11 @@ from functools import lru_cache
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
 
@@ -94,20 +94,15 @@ def pose_at(history: ArrayLike, time: float) -> RigidTransform:
     poses = np.reshape(np.asarray(history, dtype=float), (-1, POSE))
     times = poses[:, 0]
     if time >= times[0]:
-        return _pose(poses[0, 1:])
+        return pose_of_state(poses[0, 1:])
     if time <= times[-1]:
-        return _pose(poses[-1, 1:])
+        return pose_of_state(poses[-1, 1:])
     newer = int(np.searchsorted(-times, -time)) - 1
     after, before = poses[newer], poses[newer + 1]
     share = (time - before[0]) / (after[0] - before[0])
     q_before = before[1:5] * np.sign(before[1:5] @ after[1:5] or 1.0)
     # So close together that the mean of the quaternions is the orientation between them.
-    return _pose((1.0 - share) * np.concatenate((q_before, before[5:])) + share * after[1:])
-
-
-def _pose(numbers: Array) -> RigidTransform:
-    q = numbers[:4] / np.linalg.norm(numbers[:4])
-    return RigidTransform(RotationMatrix(Quaternion(q)), numbers[4:7])
+    return pose_of_state((1.0 - share) * np.concatenate((q_before, before[5:])) + share * after[1:])
 
 
 @lru_cache
@@ -116,14 +111,14 @@ def _navigation(period: float) -> Kernel:
     base, imu = casadi.SX.sym("base", BASE), casadi.SX.sym("imu", 6)
     _, q, p, _, v = casadi.vertsplit(base, [0, 1, 5, 8, 11, BASE])
     w, f = imu[:3], imu[3:]
-    q_mid, q_next = _turned(q, w * period / 2), _turned(q, w * period)
-    v_next = v + period * _rotated(q_mid, f)
+    q_mid, q_next = turned(q, w * period / 2), turned(q, w * period)
+    v_next = v + period * rotated(q_mid, f)
     p_next = p + period * (v + v_next) / 2
-    following = casadi.vertcat(0, q_next, p_next, _rotated(q_next, w), v_next)
+    following = casadi.vertcat(0, q_next, p_next, rotated(q_next, w), v_next)
     return Kernel("navigation", [base, imu], casadi.densify(following), compile=False)
 
 
-def _turned(q: casadi.SX, theta: casadi.SX) -> casadi.SX:
+def turned(q: casadi.SX, theta: casadi.SX) -> casadi.SX:
     """Return the quaternion of R exp([theta]x), for a small angle: to the fourth order."""
     square = casadi.sumsqr(theta) / 4
     a, b = 1 - square / 2 + square**2 / 24, (0.5 - square / 12 + square**2 / 240) * theta
@@ -132,7 +127,7 @@ def _turned(q: casadi.SX, theta: casadi.SX) -> casadi.SX:
     return turned / casadi.norm_2(turned)
 
 
-def _rotated(q: casadi.SX, u: casadi.SX) -> casadi.SX:
-    """Return R u."""
+def rotated(q: casadi.SX, u: casadi.SX) -> casadi.SX:
+    """Return R u, for R of the quaternion q."""
     t = 2 * casadi.cross(q[1:], u)
     return u + q[0] * t + casadi.cross(q[1:], t)

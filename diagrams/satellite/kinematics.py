@@ -10,30 +10,27 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint
 
 from vtbdrake.components.casadi_system.kernel import Kernel
-from vtbdrake.components.compiled_plant import PlantDynamics
+from vtbdrake.components.compiled_plant import FrameMotion, PlantDynamics
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, LINK_NAMES, Servicer
 
 REST = (0.0, 0.9, 0.0, 1.8, 0.0, 0.9, 0.0)
 """The arm's posture in the middle of its workspace (rad): the free motion of its elbow is drawn there."""
 
 
-@lru_cache
-def arm_kernels() -> tuple[Kernel, Kernel]:
-    """Return the gripper's pose [R_BG, p_BG] of q, and the joint rates of (q, V_BG, [posture gain, damping])."""
+def gripper(q: casadi.SX) -> FrameMotion:
+    """Return pose and Jacobian of the gripper G in B, for symbolic positions q (7, 1) of the arm's joints."""
     plant = _arm()
-    q = casadi.SX.sym("q", ARM_JOINTS)
-    model = PlantDynamics(plant, plant.CreateDefaultContext())
-    gripper = model.frame(plant.GetFrameByName("gripper"), q)
-    pose = casadi.vertcat(gripper.R.T.reshape((9, 1)), gripper.p)
-    V, gains = casadi.SX.sym("V", 6), casadi.SX.sym("gains", 2)
-    J = casadi.densify(gripper.J)
+    return PlantDynamics(plant, plant.CreateDefaultContext()).frame(plant.GetFrameByName("gripper"), q)
+
+
+@lru_cache
+def joint_rates() -> Kernel:
+    """Return the rates of the arm's joints (7,) as a kernel of (q, V_BG, [posture gain, damping])."""
+    q, V, gains = casadi.SX.sym("q", ARM_JOINTS), casadi.SX.sym("V", 6), casadi.SX.sym("gains", 2)
+    J = casadi.densify(gripper(q).J)
     drawn = gains[0] * (casadi.DM(REST) - q)
     solved = casadi.solve(J @ J.T + gains[1] ** 2 * casadi.SX.eye(6), V - J @ drawn)
-    rates = drawn + J.T @ solved
-    return (
-        Kernel("gripper", [q], casadi.densify(pose), compile=False),
-        Kernel("rates", [q, V, gains], casadi.densify(rates), compile=False),
-    )
+    return Kernel("joint_rates", [q, V, gains], casadi.densify(drawn + J.T @ solved), compile=False)
 
 
 def _arm() -> MultibodyPlant:

@@ -12,12 +12,12 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
 from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, pose_at
-from vtbdrake_diagrams.satellite.relative_motion import moved
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -66,7 +66,7 @@ class PoseSensor(SampledSensor):
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
 
     def _relative(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        X_WB, X_WT = (moved(x[start : start + 7], np.zeros(3), np.zeros(3), 0.0) for start in self._starts)
+        X_WB, X_WT = (pose_of_state(x[start : start + 7]) for start in self._starts)
         X_BT = X_WB.InvertAndCompose(X_WT)
         return np.concatenate((X_BT.rotation().ToQuaternion().wxyz(), X_BT.translation()))
 
@@ -126,7 +126,7 @@ class PoseReader(LeafSystem):
         if time < 0.0 or (pose == context.get_discrete_state(self._last).value()).all():
             return
         state.get_mutable_discrete_state(self._last).SetFromVector(pose)
-        X_BT = moved(pose, np.zeros(3), np.zeros(3), 0.0)
+        X_BT = pose_of_state(pose)
         X_IB: RigidTransform = pose_at(self._history.Eval(context), time)
         covariance = np.diag(np.repeat([2.0 * deviation, deviation], 3) ** 2)
         estimate = PoseEstimate.of(X_IB @ X_BT, covariance, time=time)

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import AngleAxis, Quaternion
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state.declarations import NO_DICT, weakly
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
-from vtbdrake_diagrams.satellite.estimation import BASE
-from vtbdrake_diagrams.satellite.kinematics import arm_kernels
+from vtbdrake_diagrams.satellite.estimation import BASE, rotated, turned
+from vtbdrake_diagrams.satellite.kinematics import gripper
 
 Array = NDArray[np.float64]
+
+# An age in s that stands for never, because ports carry finite numbers.
+_LONG_AGO = 1e6
 
 RELATIVE = 32
 """Size of a `Relative` as a vector."""
@@ -72,8 +76,7 @@ class RelativeMotion(LeafSystem):
     def __init__(self, *, period: float) -> None:
         super().__init__()
         self._period = period
-        self._X_TH = Target().X_TH
-        self._gripper, _ = arm_kernels()
+        self._kernel = _relative(period)
         self._base = self.DeclareVectorInputPort("base", BASE)
         self._target = self.DeclareVectorInputPort("target", 13)
         self._status = self.DeclareVectorInputPort("status", 4)
@@ -81,35 +84,33 @@ class RelativeMotion(LeafSystem):
         self.DeclareVectorOutputPort("relative", RELATIVE, weakly(self, RelativeMotion._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        base, target = self._base.Eval(context), self._target.Eval(context)
         valid, age = self._status.Eval(context)[:2].tolist()
-        w_IB, v_IB = base[8:11], base[11:14]
-        X_IB = moved(base[1:8], w_IB, v_IB, self._period)
-        X_IT = moved(target[:7], target[7:10], target[10:13], 0.0)
-        R_BI = X_IB.rotation().matrix().T
-        X_IH = X_IT @ self._X_TH
-        p_IH, p_IT, p_IB = X_IH.translation(), X_IT.translation(), X_IB.translation()
-        w_IT = target[7:10]
-        w = R_BI @ (w_IT - w_IB)
-        v = R_BI @ (target[10:13] + np.cross(w_IT, p_IH - p_IT) - v_IB - np.cross(w_IB, p_IH - p_IB))
-        R_BH = R_BI @ X_IH.rotation().matrix()
-        gripper = self._gripper.value((self._joints.Eval(context)[:ARM_JOINTS],))
-        output.SetFromVector(
-            np.concatenate(((min(age, 1e6), valid), R_BH.ravel(), R_BI @ (p_IH - p_IB), w, v, gripper))
-        )
+        arguments = self._base.Eval(context), self._target.Eval(context), self._joints.Eval(context)
+        output.SetFromVector(np.concatenate(((min(age, _LONG_AGO), valid), self._kernel.value(arguments))))
 
 
-def moved(pose: Array, w: Array, v: Array, dt: float) -> RigidTransform:
-    """Return where a body is ``dt`` seconds later.
+@lru_cache
+def _relative(period: float) -> Kernel:
+    """Return all but age and validity of a `Relative` as a kernel of (base, target, joint positions)."""
+    base, target = casadi.SX.sym("base", BASE), casadi.SX.sym("target", 13)
+    joints = casadi.SX.sym("joints", len(JOINT_NAMES))
+    _, q_IB, p_IB, w_IB, v_IB = casadi.vertsplit(base, [0, 1, 5, 8, 11, BASE])
+    q_IT, p_IT, w_IT, v_IT = casadi.vertsplit(target, [0, 4, 7, 10, 13])
+    q_IB = turned(q_IB, period * rotated(_inverse(q_IB), w_IB))
+    p_IB = p_IB + period * v_IB
+    X_TH = Target().X_TH
+    arm = rotated(q_IT, casadi.DM(X_TH.translation()))
 
-    Args:
-        pose: [quaternion wxyz, position (m)], shape (7,).
-        w: Its angular velocity in the frame in which its pose is given (rad/s), shape (3,).
-        v: Its velocity (m/s), shape (3,).
-        dt: In s.
-    """
-    R = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
-    angle = float(np.linalg.norm(w)) * dt
-    if angle:
-        R = RotationMatrix(AngleAxis(angle, w * (dt / angle))) @ R
-    return RigidTransform(R, pose[4:7] + dt * v)
+    def in_base(u: casadi.SX) -> casadi.SX:
+        return rotated(_inverse(q_IB), u)
+
+    axes = [in_base(rotated(q_IT, casadi.DM(column))) for column in X_TH.rotation().matrix().T]
+    R_BH, p_BH = casadi.horzcat(*axes), in_base(p_IT + arm - p_IB)
+    v = v_IT + casadi.cross(w_IT, arm) - v_IB - casadi.cross(w_IB, p_IT + arm - p_IB)
+    G = gripper(joints[:ARM_JOINTS])
+    values = [R_BH.T.reshape((9, 1)), p_BH, in_base(w_IT - w_IB), in_base(v), G.R.T.reshape((9, 1)), G.p]
+    return Kernel("relative", [base, target, joints], casadi.densify(casadi.vertcat(*values)), compile=False)
+
+
+def _inverse(q: casadi.SX) -> casadi.SX:
+    return casadi.vertcat(q[0], -q[1:])
