@@ -60,6 +60,18 @@ def test_only_what_is_read_is_measured():
     assert 10 * 2 <= sight.measured - before <= 10 * 3
 
 
+def test_a_motion_is_recorded_once_for_all_tasks():
+    task = along(make(horizon=40.0, sample_period=4.0))
+    first = RolloutRunner(task)
+    sight = first.testbed.simulated_sensors["sight"]
+    first.run({PLACE: [0.0, 0.0, 0.0]})
+    recorded = sight.measured
+    RolloutRunner(replace(task, record=()), first.testbed).run({PLACE: [0.0, 0.0, 1.0]})
+    assert sight.measured - recorded < 40
+    first.run({PLACE: [0.0, 0.0, 0.0], **START})
+    assert sight.measured - recorded > 400
+
+
 def test_samples_closer_than_the_memory_are_simulated_as_a_whole():
     task = make(horizon=1.0, sample_period=0.05)
     point = {PLACE: [0.3, 0.0, 0.0], **START}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -76,6 +77,10 @@ class Recording:
     worlds: list[np.ndarray] = field(default_factory=list)
 
 
+# Testbed -> what a motion depends on beside what is set in s0 -> what is set in s0 -> its recording.
+_RECORDINGS: WeakKeyDictionary[VirtualTestbed, dict[Hashable, dict[Hashable, Recording]]] = WeakKeyDictionary()
+
+
 class MotionPlayer:
     """Sets contexts of a testbed to recorded states, and compares them with these.
 
@@ -143,6 +148,15 @@ class MotionPlayer:
                 begin = (np.floor(begin / step) - 1.0 + _BETWEEN) * step
             found.append(float(begin) if begin > before else None)
         return found
+
+    def recordings(self, instants: np.ndarray) -> dict[Hashable, Recording]:
+        """Return the recordings from default starts with samples at these instants, so far, to be added to.
+
+        Args:
+            instants: The simulator's time at each sample, shape (n,).
+        """
+        known = _RECORDINGS.setdefault(self._testbed, {})
+        return known.setdefault((self.motion.memory, tuple(self.motion.varied), instants.tobytes()), {})
 
     def take(self, context: Context) -> FlatState:
         """Return the state from which a window begins."""

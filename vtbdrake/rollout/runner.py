@@ -72,7 +72,6 @@ class RolloutRunner:
         self._copier = self.testbed.copier_from(self.testbed)
         self._beginning = Beginning(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
-        self._recordings: dict[Hashable, Recording] = {}
         self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
@@ -203,15 +202,17 @@ class RolloutRunner:
     def _set_times(self) -> None:
         self._t0 = self._beginning.context.get_time()
         self._instants = self.task.instants(self._t0, self._timings)
-        self._recordings.clear()
         self._windows: list[float | None] = [None] * len(self._times)
         if self._player is not None:
             self._windows = self._player.begins(self._instants)
+            by_default = self.task.start is None and self._beginning.start is None
+            self._recordings = self._player.recordings(self._instants) if by_default else {}
 
     def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
         """Return the motion with the varied variables as they are in s0, recorded when it is first asked for.
 
-        What fails or ends it early does the same to the rollouts along it, which go on by themselves from there.
+        From default starts it is recorded once for all tasks on this testbed with the same samples. What fails or ends
+        it early does the same to the rollouts along it, which go on by themselves from there.
         """
         if self._player is None:
             return Recording()
