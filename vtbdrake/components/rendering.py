@@ -24,10 +24,8 @@ if TYPE_CHECKING:
 # Set when rendering has been found to work, also for child processes.
 _CHECKED = "VTBDRAKE_RENDERING"
 _PROBE_TIMEOUT = 60.0  # s
-# Name of the renderer in the scene of a camera.
-RENDERER = "camera"
-# Pixels per side of a shadow map. Below 1024, edges of shadows have visible steps.
-_SHADOW_MAP_SIZE = 2048
+# The renderers in the scene of a camera.
+SUN, FILL = "sun", "fill"
 # Shapes with an inside, in which a camera sees nothing.
 _WITH_INSIDE = {"Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"}
 
@@ -85,27 +83,37 @@ class Illumination:
     # Brightness of a white surface in front of the camera's own lamp, at a distance of 1 m.
     lamp: float = 0.0
 
-    def renderer(self) -> RenderEngine:
-        """Return Drake's VTK renderer in this light, without a display."""
+    @property
+    def shadows(self) -> bool:
+        """Return whether the sun throws shadows."""
+        return bool(self.light) and self.light[14] >= 0.5
+
+    @property
+    def fills(self) -> bool:
+        """Return whether there is light beside the sun's."""
+        return (bool(self.light) and self.light[10] > 0.0) or self.lamp > 0.0
+
+    def renderers(self) -> dict[str, RenderEngine]:
+        """Return two of Drake's VTK renderers, without a display: one in sunlight, one in all other light."""
         from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams
 
-        params = RenderEngineVtkParams(backend="EGL")
-        if self.light:
-            params.lights = light_sources(self.light)
-            params.default_clear_color = self.light[11:14]
-            params.cast_shadows, params.shadow_map_size = self.light[14] >= 0.5, _SHADOW_MAP_SIZE
-        else:
-            params.lights = [LightParameter()]
+        sky = RenderEngineVtkParams().default_clear_color
+        sun, *fill = light_sources(self.light) if self.light else [LightParameter()]
         if self.lamp > 0.0:
-            params.lights += [LightParameter(type="point", intensity=self.lamp, attenuation_values=[0.0, 0.0, 1.0])]
-        for light in params.lights:
-            light.intensity *= self.exposure
-        params.default_clear_color = np.minimum(self.exposure * np.asarray(params.default_clear_color), 1.0)
-        return MakeRenderEngineVtk(params)
+            fill += [LightParameter(type="point", intensity=self.lamp, attenuation_values=[0.0, 0.0, 1.0])]
+        backgrounds = {SUN: np.asarray(self.light[11:14] if self.light else sky), FILL: np.zeros(3)}
+        made = {}
+        for name, lights in {SUN: [sun], FILL: fill or [LightParameter(intensity=0.0)]}.items():
+            for light in lights:
+                light.intensity *= self.exposure
+            background = np.minimum(self.exposure * backgrounds[name], 1.0)
+            params = RenderEngineVtkParams(backend="EGL", lights=lights, default_clear_color=background)
+            made[name] = MakeRenderEngineVtk(params)
+        return made
 
 
 class RenderedScene:
-    """A copy of the perception geometry of a scene, with a renderer of its own.
+    """A copy of the perception geometry of a scene, with renderers of its own.
 
     It is a cache: what it shows depends on the arguments of `view` only.
     """
@@ -119,7 +127,7 @@ class RenderedScene:
         return RenderedScene()
 
     def view(self, query: QueryObject, illumination: Illumination) -> QueryObject:
-        """Return the scene of ``query`` for rendering with the renderer `RENDERER`, in its present poses.
+        """Return the scene of ``query`` for rendering with `SUN` and `FILL`, in its present poses.
 
         The inside of primitive shapes can be found by ``ComputeSignedDistanceToPoint``.
 
@@ -132,9 +140,10 @@ class RenderedScene:
         if self._version is None or not self._version.IsSameAs(inspector.geometry_version(), Role.kPerception):
             self._build(inspector)
         if illumination != self._illumination:
-            if self._illumination is not None:
-                self._scene_graph.RemoveRenderer(self._context, RENDERER)
-            self._scene_graph.AddRenderer(self._context, RENDERER, illumination.renderer())
+            for name, renderer in illumination.renderers().items():
+                if self._scene_graph.HasRenderer(self._context, name):
+                    self._scene_graph.RemoveRenderer(self._context, name)
+                self._scene_graph.AddRenderer(self._context, name, renderer)
             self._illumination = illumination
         poses = FramePoseVector()
         for theirs, ours in self._frames:

@@ -328,3 +328,13 @@ def test_used_scenes_are_freed() -> None:
     del scene
     gc.collect()
     assert found() is None
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 10.0, 30.0, 60.0, 85.0])
+def test_lone_box_is_not_in_its_own_shadow(angle_deg: float) -> None:
+    angle = np.radians(angle_deg)
+    direction = (np.cos(angle), 0.0, -np.sin(angle))
+    seen = [Scene(LightConfig(direction=direction, shadows=shadows)) for shadows in (True, False)]
+    shaded, flat = (scene.render(scene.context()) for scene in seen)
+    assert flat.max() > 0
+    np.testing.assert_array_equal(shaded, flat)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
@@ -31,9 +33,10 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from vtbdrake.components.environment.haze import hazed
 from vtbdrake.components.environment.light import LIGHT_SIZE
-from vtbdrake.components.rendering import RENDERER, Illumination, RenderedScene, RenderingError
+from vtbdrake.components.rendering import FILL, SUN, Illumination, RenderedScene, RenderingError
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, uniform_noise
+from vtbdrake.components.shadows import sunlit
 from vtbdrake.state import parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
@@ -90,8 +93,9 @@ class Camera(LeafSystem):
 
     The world is rendered by VTK in the light of the port ``light`` (without it, a white light from the camera, before
     Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail, bright
-    ones saturate. Exposure times have no length: there is no motion blur. Haze is added to the 8-bit image, from a
-    depth image of its own. A surface within the distance ``near`` of the camera is not seen.
+    ones saturate. The sun throws shadows that are right to a pixel or two (`sunlit`); a lamp and the Earth throw none.
+    Exposure times have no length: there is no motion blur. Haze is added to the 8-bit image, by the distance along
+    each ray. A surface within the distance ``near`` of the camera is not seen.
 
     The count y of a pixel is that of the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
     count m, n of N(0, 1), full scale S = 255, and g the gain:
@@ -255,33 +259,27 @@ class Camera(LeafSystem):
     def _see(self, context: Context) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
         """Return the colour image without noise, (h, w, 4), and the depth image, (h, w), if there is one."""
         values = self._parameters(context)
-        X_PC = pose_from_array(values[:6])
         light = tuple(self._light_port.Eval(context).tolist()) if self._light_port.HasValue(context) else ()
-        brightness = float(values[10] * values[11])
+        haze = self._haze_port.Eval(context) if self._haze_port.HasValue(context) else np.zeros(5)
+        illumination = Illumination(light, float(values[10] * values[11]), float(values[12]))
         query = self._query_port.Eval(context)
         scene: RenderedScene = self.get_cache_entry(self._scene).Eval(context)
-        view = scene.view(query, Illumination(light, brightness, float(values[12])))
-        X_WC = _pose_of(query, self._frame_number) @ X_PC
+        view = scene.view(query, illumination)
+        X_WC = _pose_of(query, self._frame_number) @ pose_from_array(values[:6])
         self._check_outside(view, X_WC.translation())
-        core = RenderCameraCore(
-            RENDERER,
-            CameraInfo(self._width, self._height, *values[6:10].tolist()),
-            ClippingRange(self._near, self._far),
-            RigidTransform(),
-        )
-        world = view.inspector().world_frame_id()
-        color = view.RenderColorImage(ColorRenderCamera(core, False), world, X_WC).data
-        haze = self._haze_port.Eval(context) if self._haze_port.HasValue(context) else np.zeros(5)
-        if self._depth is None and not haze[0]:
-            return color, None
-        depth_camera = DepthRenderCamera(core, DepthRange(self._near, self._far))
-        depth = view.RenderDepthImage(depth_camera, world, X_WC).data[..., 0]
-        if haze[0]:
-            distance = depth * _ray_lengths(self._width, self._height, values[6:10])
-            airlight = np.minimum(_FULL_SCALE * brightness * haze[2:], _FULL_SCALE)
-            mixed = hazed(color[..., :3], distance=distance, extinction=haze[0], airlight=airlight)
-            color = np.dstack((np.rint(mixed).astype(np.uint8), color[..., 3]))
-        return color, None if self._depth is None else depth
+        camera = _RenderCamera(view, CameraInfo(self._width, self._height, *values[6:10]), self._near, self._far, X_WC)
+        color = camera.color(SUN)
+        depth = camera.depth() if illumination.shadows or haze[0] or self._depth is not None else None
+        if depth is not None and illumination.shadows:
+            _shade(color, camera, depth, direction=light[:3], reach=self._far)
+        if illumination.fills:
+            color[..., :3] += np.minimum(camera.color(FILL)[..., :3], 255 - color[..., :3])
+        if depth is not None and haze[0]:
+            distance = depth * np.linalg.norm(camera.rays_C, axis=2)
+            airlight = np.minimum(_FULL_SCALE * illumination.exposure * haze[2:], _FULL_SCALE)
+            mixed = hazed(color[..., :3].astype(float), distance=distance, extinction=haze[0], airlight=airlight)
+            color[..., :3] = np.rint(mixed)
+        return color, depth if self._depth is not None else None
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
         for found in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
@@ -373,8 +371,46 @@ def _color_image(color: NDArray[np.uint8]) -> ImageRgba8U:
     return image
 
 
-def _ray_lengths(width: int, height: int, intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the length of the ray of each pixel up to z_C = 1, shape (h, w)."""
-    fx, fy, cx, cy = intrinsics
-    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
-    return np.sqrt(1.0 + x**2 + y[:, np.newaxis] ** 2)
+class _RenderCamera:
+    """Renders colour and depth of a scene with one camera."""
+
+    def __init__(self, view: QueryObject, info: CameraInfo, near: float, far: float, X_WC: RigidTransform) -> None:
+        self.view, self._info, self._near, self._far, self.X_WC = view, info, near, far, X_WC
+        self._world = view.inspector().world_frame_id()
+
+    def _core(self, renderer: str) -> RenderCameraCore:
+        return RenderCameraCore(renderer, self._info, ClippingRange(self._near, self._far), RigidTransform())
+
+    def color(self, renderer: str) -> NDArray[np.uint8]:
+        """Return the colour image, shape (h, w, 4)."""
+        image = self.view.RenderColorImage(ColorRenderCamera(self._core(renderer), False), self._world, self.X_WC)
+        return np.array(image.data)
+
+    def depth(self) -> NDArray[np.float32]:
+        """Return the depth image, shape (h, w)."""
+        camera = DepthRenderCamera(self._core(SUN), DepthRange(self._near, self._far))
+        return np.array(self.view.RenderDepthImage(camera, self._world, self.X_WC).data[..., 0])
+
+    @cached_property
+    def rays_C(self) -> NDArray[np.float64]:
+        """Return the ray of each pixel up to z_C = 1, shape (h, w, 3)."""
+        info = self._info
+        x = (np.arange(info.width()) + 0.5 - info.center_x()) / info.focal_x()
+        y = (np.arange(info.height()) + 0.5 - info.center_y()) / info.focal_y()
+        return np.dstack((*np.meshgrid(x, y), np.ones((y.size, x.size))))
+
+
+def _shade(
+    color: NDArray[np.uint8],
+    camera: _RenderCamera,
+    depth: NDArray[np.float32],
+    *,
+    direction: Sequence[float],
+    reach: float,
+) -> None:
+    """Darken the pixels of ``color`` that are in shadow, in place."""
+    bright = np.isfinite(depth) & (depth > 0.0) & color[..., :3].any(axis=2)
+    points_C = camera.rays_C[bright] * depth[bright][:, np.newaxis]
+    points_W = points_C @ camera.X_WC.rotation().matrix().T + camera.X_WC.translation()
+    share = sunlit(camera.view, renderer=FILL, points_W=points_W, direction=direction, reach=reach)
+    color[bright, :3] = np.rint(color[bright, :3] * share[:, np.newaxis])
