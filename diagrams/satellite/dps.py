@@ -2,45 +2,92 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
-from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantValueSource,
+    ConstantVectorSource,
+    Demultiplexer,
+    Multiplexer,
+    Saturation,
+)
 
+from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.tracking import TargetTracker
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.control import ArmController
 from vtbdrake_diagrams.satellite.estimation import BASE, BaseEstimator
+from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_marker_part, add_scan_part
 from vtbdrake_diagrams.satellite.pose_sensor import PoseReader
 from vtbdrake_diagrams.satellite.relative_motion import RelativeMotion
 from vtbdrake_diagrams.satellite.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from pydrake.systems.sensors import CameraInfo
 
 PERIOD = 0.02
 """The period of the DPS and of the sensors that it needs in every sample, in s."""
 POSE_PERIOD = 0.1
 """The period of the pose sensor, in s."""
 
+# The signals of the sensors, and the names of the tracker's ports for them.
+_SIGNALS = {"camera": "image", "scanner": "scan"}
+_SOURCES = {"camera": "markers", "scanner": "registration", "pose_sensor": "pose"}
 
-def make_dps(*, period: float = PERIOD, wheels: bool = False, pose_latency: float = 0.0) -> Diagram:
+
+@dataclass(frozen=True)
+class Eyes:
+    """What the DPS perceives the target with.
+
+    Attributes:
+        guides: The sensors that the tracker follows: some of ``camera``, ``scanner`` and ``pose_sensor``.
+        aboard: Those of ``camera`` and ``scanner`` whose data are evaluated, whether the tracker follows them or not.
+        config: How images and scans are evaluated.
+        image: Size of the images and intrinsics of the camera, if it is aboard.
+        image_period: Of the camera, in s.
+        image_latency: How old the images are when they are shown, in s.
+        scan_period: How often the DPS looks for a new scan, in s.
+        pose_latency: How old the poses of the pose sensor are when they are shown, in s.
+    """
+
+    guides: tuple[str, ...]
+    aboard: tuple[str, ...]
+    config: PerceptionConfig
+    image: CameraInfo | None
+    image_period: float
+    image_latency: float
+    scan_period: float
+    pose_latency: float
+
+
+def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` leads the capture, ``act`` limits.
 
     Input ports: ``joint_position`` (9: the arm's joints in rad, the fingers in m), ``imu`` (6), ``target_pose`` (7, see
-    `PoseSensor`) and the command ``capture`` (1: go ahead, 0: wait, -1: abort). Output ports: ``joint_position`` (9)
-    and, with ``wheels``, ``wheel_torque`` (3, N m, on the base about its axes).
+    `PoseSensor`), ``image`` and ``scan`` if the sensors are aboard, and the command ``capture`` (1: go ahead, 0: wait,
+    -1: abort). Output ports: ``joint_position`` (9) and, with ``wheels``, ``wheel_torque`` (3, N m, on the base about
+    its axes).
 
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense())
-    env = builder.AddNamedSystem("env", _make_env(period=period, pose_latency=pose_latency))
+    env = builder.AddNamedSystem("env", _make_env(eyes, period=period))
     impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
     act = builder.AddNamedSystem("act", _make_act(wheels=wheels))
     for signal in ("joint_position", "imu"):
         builder.ExportInput(sense.GetInputPort(signal), signal)
-    builder.ExportInput(env.GetInputPort("target_pose"), "target_pose")
+    for signal in ("target_pose", *(_SIGNALS[sensor] for sensor in eyes.aboard)):
+        builder.ExportInput(env.GetInputPort(signal), signal)
     builder.ExportInput(impl.GetInputPort("capture"), "capture")
     builder.Connect(sense.GetOutputPort("imu"), env.GetInputPort("imu"))
     builder.Connect(sense.GetOutputPort("joint_position"), impl.GetInputPort("joints"))
@@ -71,15 +118,50 @@ def _make_sense() -> Diagram:
     return builder.Build()
 
 
-def _make_env(*, period: float, pose_latency: float) -> Diagram:
-    """Return the perceived environment: where the base is in its inertial frame I, and how the target moves there."""
+def _make_env(eyes: Eyes, *, period: float) -> Diagram:
+    """Return the perceived environment: where the base is in its inertial frame I, and how the target moves there.
+
+    The tracker has an input port for every source that is aboard; those that do not guide it show no estimate there.
+    So a DPS that is guided by the pose sensor can continue from the state of one that sees.
+    """
     builder = DiagramBuilder()
     base = builder.AddNamedSystem("base", BaseEstimator(period=period))
-    reader = PoseReader(period=POSE_PERIOD, delay=period, latency=pose_latency)
+    reader = PoseReader(period=POSE_PERIOD, delay=period, latency=eyes.pose_latency)
     builder.AddNamedSystem("pose_reader", reader)
-    target = builder.AddNamedSystem("target", TargetTracker(["pose"], starting=["pose"], period=period))
+    sensors = (*eyes.aboard, "pose_sensor")
+    starting = [_SOURCES[sensor] for sensor in eyes.guides if sensor != "scanner"] or [_SOURCES["scanner"]]
+    tracker = TargetTracker(
+        [_SOURCES[sensor] for sensor in sensors], starting=starting, period=period, motion=eyes.config.motion
+    )
+    target = builder.AddNamedSystem("target", tracker)
+    sources = {"pose_sensor": reader.GetOutputPort("estimate")}
+    if eyes.image is not None:
+        markers = add_marker_part(
+            builder,
+            base,
+            target,
+            config=eyes.config,
+            period=period,
+            image_period=eyes.image_period,
+            info=eyes.image,
+            image_latency=eyes.image_latency,
+        )
+        sources["camera"] = markers.GetOutputPort("estimate")
+    if "scanner" in eyes.aboard:
+        attitude = RotationMatrix() if eyes.guides == ("scanner",) else None
+        registration = add_scan_part(
+            builder, base, target, config=eyes.config, period=period, scan_period=eyes.scan_period, attitude=attitude
+        )
+        sources["scanner"] = registration.GetOutputPort("estimate")
+    for sensor in sensors:
+        port = sources[sensor]
+        if sensor not in eyes.guides:
+            unused = builder.AddNamedSystem(
+                f"no_{_SOURCES[sensor]}", ConstantValueSource(Value(PoseEstimate.missing()))
+            )
+            port = unused.get_output_port()
+        builder.Connect(port, target.GetInputPort(_SOURCES[sensor]))
     builder.Connect(base.GetOutputPort("history"), reader.GetInputPort("history"))
-    builder.Connect(reader.get_output_port(), target.GetInputPort("pose"))
     builder.ExportInput(base.GetInputPort("imu"), "imu")
     builder.ExportInput(reader.GetInputPort("target_pose"), "target_pose")
     builder.ExportOutput(base.GetOutputPort("base"), "base")

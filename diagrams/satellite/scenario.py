@@ -2,22 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
 
+from vtbdrake.components.environment.light import LightConfig
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
+from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, make_dps
+from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, Eyes, make_dps
+from vtbdrake_diagrams.satellite.perception import PerceptionConfig, target_board
 from vtbdrake_diagrams.satellite.plant import plant_config
 from vtbdrake_diagrams.satellite.supervisor import GO, STOP
 
+if TYPE_CHECKING:
+    from pydrake.systems.sensors import CameraInfo
+
+SCAN_PERIOD = 0.1
+"""How often the DPS looks for a new scan, in s."""
+
 _LARGEST_TUMBLE_DEG = 30.0
+
+
+PERCEPTIONS = ("camera+scanner", "camera", "scanner", "pose_sensor")
+ONLOOKERS = ("", *PERCEPTIONS[:3])
+
+
+def _scanner() -> LaserScannerConfig:
+    return LaserScannerConfig(frequency=2.0, rays_per_second=4000.0, azimuth=1.0, elevation=0.8, max_range=30.0)
+
+
+def _light() -> LightConfig:
+    """Return the sun from behind the servicer, 45 deg off the normal of the front face, and the Earth below."""
+    return LightConfig(direction=(0.7, 0.5, -0.5), earth_shine=0.1)
 
 
 @dataclass
@@ -35,8 +59,27 @@ class SatelliteScenario(Scenario):
     tumble_deg: float = 1.5
     # The distance of the target's centre from the servicer's when the target faces it, in m.
     distance: float = 2.5
-    # How the target is perceived: pose_sensor.
-    perception: str = "pose_sensor"
+    # What the tracker of the DPS follows: camera+scanner, camera, scanner, or pose_sensor, which stands for both.
+    perception: str = "camera+scanner"
+    # Sensors that are aboard beside those that guide, and whose data are evaluated: camera, scanner or camera+scanner.
+    onlookers: str = ""
+    # Whether camera and scanner show nothing, and cost nothing: a black image, and a scan without points.
+    blind: bool = False
+    # The docking camera: pixels, field of view from top to bottom in rad, images per second, errors in counts.
+    image_width: int = 320
+    image_height: int = 240
+    field_of_view: float = 0.9
+    camera_rate: float = 5.0
+    camera_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1.0))
+    # The laser scanner, and the errors of its ranges in m.
+    scanner: LaserScannerConfig = field(default_factory=_scanner)
+    scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.01))
+    # Sun and earth-shine.
+    light: LightConfig = field(default_factory=_light)
+    # Brightness of the lamp on the camera, see `Camera`.
+    lamp: float = 0.0
+    # How images and scans are evaluated.
+    evaluation: PerceptionConfig = field(default_factory=PerceptionConfig)
     # Whether the servicer holds its attitude by reaction wheels.
     wheels: bool = False
     # Errors of the sensors, latency in periods; the IMU's noise is in rad/s (gyros) and in m/s^2 (accelerometers).
@@ -50,17 +93,43 @@ class SatelliteScenario(Scenario):
             "seed": (self.seed >= 0, "not negative"),
             "tumble_deg": (0.0 <= self.tumble_deg <= _LARGEST_TUMBLE_DEG, f"within [0, {_LARGEST_TUMBLE_DEG:g}] deg/s"),
             "distance": (self.distance >= 1.8, "at least 1.8 m: nearer, the satellites would touch"),
-            "perception": (self.perception in ("pose_sensor",), "one of pose_sensor"),
+            "perception": (self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
+            "onlookers": (self.onlookers in ONLOOKERS, f"one of {', '.join(PERCEPTIONS[:3])}, or empty"),
+            "image_width": (self.image_width > 0, "positive, in pixels"),
+            "image_height": (self.image_height > 0, "positive, in pixels"),
+            "field_of_view": (0.0 < self.field_of_view < np.pi, "between 0 and pi rad"),
+            "camera_rate": (0.0 < self.camera_rate <= 0.5 / PERIOD, f"above 0 and at most {0.5 / PERIOD:g} images/s"),
+            "lamp": (self.lamp >= 0.0, "not negative"),
             "plant_config": (self.plant_config.time_step > 0.0, "of a discrete plant: servos and gripper need it"),
         }
         for name, (good, expected) in checks.items():
             if not good:
                 raise ScenarioError(f"SatelliteScenario.{name} must be {expected}, not {getattr(self, name)!r}")
-        for name in ("imu_errors", "joint_errors", "pose_errors"):
-            try:
+        try:
+            self.light.check()
+            for name in ("imu_errors", "joint_errors", "pose_errors", "camera_errors", "scanner_errors"):
                 getattr(self, name).check(f"SatelliteScenario.{name}")
-            except ValueError as error:
-                raise ScenarioError(str(error)) from None
+        except ValueError as error:
+            raise ScenarioError(str(error)) from None
+
+    @property
+    def aboard(self) -> tuple[str, ...]:
+        """Those of camera and scanner whose data the DPS evaluates."""
+        return tuple(sensor for sensor in ("camera", "scanner") if sensor in f"{self.perception}+{self.onlookers}")
+
+    @property
+    def camera_info(self) -> CameraInfo:
+        """Size and intrinsics of the docking camera."""
+        from pydrake.systems.sensors import CameraInfo
+
+        return CameraInfo(self.image_width, self.image_height, self.field_of_view)
+
+    def mental(self) -> Self:
+        """Return what the servicer simulates when it reasons: a pose sensor in place of what it sees with.
+
+        The DPS of the copy has the same parts, so that it continues from the state of the running one.
+        """
+        return replace(self, perception="pose_sensor", onlookers="+".join(self.aboard), blind=True)
 
     def interface(self) -> Interface:
         s = Servicer()
@@ -86,17 +155,40 @@ class SatelliteScenario(Scenario):
                     max_age=age,
                 ),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-10.0, upper=10.0, max_age=age),
-                Signal("target_pose", size=7, unit="1, m", lower=-100.0, upper=100.0, max_age=5 * POSE_PERIOD),
+                Signal("target_pose", size=7, unit="1, m", lower=-100.0, upper=100.0),
+                *self._abstract_signals(),
             ],
             act=act,
             commands=[Signal("capture", size=1, lower=STOP, upper=GO, default=GO)],
         )
 
+    def _abstract_signals(self) -> list[Signal]:
+        signals = []
+        if "camera" in self.aboard:
+            from pydrake.systems.sensors import ImageRgba8U
+
+            image = ImageRgba8U(self.image_width, self.image_height)
+            signals.append(Signal("image", model_value=image, max_age=5.0 / self.camera_rate))
+        if "scanner" in self.aboard:
+            signals.append(Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency))
+        return signals
+
     def make_dps(self) -> Diagram:
-        return make_dps(wheels=self.wheels, pose_latency=self.pose_errors.latency * POSE_PERIOD)
+        eyes = Eyes(
+            guides=tuple(self.perception.split("+")),
+            aboard=self.aboard,
+            config=self.evaluation,
+            image=self.camera_info if "camera" in self.aboard else None,
+            image_period=1.0 / self.camera_rate,
+            image_latency=self.camera_errors.latency / self.camera_rate,
+            scan_period=SCAN_PERIOD,
+            pose_latency=self.pose_errors.latency * POSE_PERIOD,
+        )
+        return make_dps(eyes, wheels=self.wheels)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the satellite runs without a plant.
+        from vtbdrake.components.perception.markers import add_markers
         from vtbdrake_diagrams.satellite.plant import add_servicer, add_target
         from vtbdrake_diagrams.satellite.pose_sensor import PoseSensor
         from vtbdrake_diagrams.satellite.start import Release, random_start
@@ -105,6 +197,7 @@ class SatelliteScenario(Scenario):
         plant, _ = builder.add_plant(self.plant_config)
         servicer = add_servicer(plant, wheels=self.wheels)
         target = add_target(plant, start.X_WT)
+        add_markers(plant, plant.GetBodyByName("body", target), target_board())
         plant.Finalize()
         base, body = plant.GetBodyByName("base", servicer), plant.GetBodyByName("body", target)
 
@@ -112,8 +205,18 @@ class SatelliteScenario(Scenario):
         builder.add_sensor("joint_position", JointEncoders(plant, joints, period=PERIOD, errors=self.joint_errors))
         imu = Imu(plant, plant.GetFrameByName("imu", servicer), period=PERIOD, errors=self.imu_errors)
         builder.add_sensor("imu", imu)
-        pose_sensor = PoseSensor(plant, base, body, period=POSE_PERIOD, stream=2, errors=self.pose_errors)
-        builder.add_sensor("target_pose", pose_sensor)
+        if self.perception == "pose_sensor":
+            pose_sensor = PoseSensor(plant, base, body, period=POSE_PERIOD, stream=2, errors=self.pose_errors)
+            builder.add_sensor("target_pose", pose_sensor)
+        else:
+            nothing = builder.add("sense", "target_pose", ConstantVectorSource(np.zeros(7)))
+            builder.sim_sensor("target_pose", nothing.get_output_port())
+        if self.aboard and self.blind:
+            for signal in self._abstract_signals():
+                dark = builder.add("sense", signal.name, ConstantValueSource(signal.abstract_value()))
+                builder.sim_sensor(signal.name, dark.get_output_port())
+        else:
+            self._add_eyes(builder)
 
         # The servos are the plant's own PD controllers; they are to reach the position and to rest there.
         rest = np.vstack([np.eye(len(JOINT_NAMES)), np.zeros((len(JOINT_NAMES), len(JOINT_NAMES)))])
@@ -130,6 +233,34 @@ class SatelliteScenario(Scenario):
         release = builder.add("env", "release", Release(plant, target, start))
         builder.connect(plant.get_state_output_port(), release.get_input_port())
         builder.connect(release.get_output_port(), plant.get_applied_spatial_force_input_port())
+
+    def _add_eyes(self, builder: VirtualTestbedBuilder) -> None:
+        """Add the docking camera ``docking_camera`` with the ``light``, and the laser scanner ``scanner``."""
+        from vtbdrake.components.environment.light import Light
+        from vtbdrake.components.ray_casting import RayCaster
+        from vtbdrake.components.sensors.camera import Camera, connect_camera
+        from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
+
+        plant, scene_graph = builder.plant, builder.scene_graph
+        if "camera" in self.aboard:
+            light = builder.add("env", "light", Light(self.light))
+            camera = Camera(
+                plant,
+                plant.GetFrameByName("camera"),
+                period=1.0 / self.camera_rate,
+                info=self.camera_info,
+                errors=self.camera_errors,
+            )
+            builder.add("sense", "docking_camera", camera)
+            connect_camera(builder.diagram_builder, camera, scene_graph, light=light)
+            builder.sim_sensor("image", camera.GetOutputPort("color_image"))
+        if "scanner" in self.aboard:
+            caster = RayCaster(plant, scene_graph)
+            frame = plant.GetFrameByName("scanner")
+            scanner = LaserScanner(plant, frame, caster, config=self.scanner, errors=self.scanner_errors)
+            builder.add("sense", "scanner", scanner)
+            connect_laser_scanner(builder.diagram_builder, scanner, plant)
+            builder.sim_sensor("scan", scanner.GetOutputPort("scan"))
 
     @staticmethod
     def _declare_belief(builder: VirtualTestbedBuilder) -> None:

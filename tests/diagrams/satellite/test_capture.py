@@ -16,7 +16,7 @@ from vtbdrake_diagrams.satellite.supervisor import MODES, REASONS
 
 @cache
 def built() -> VirtualTestbed:
-    return SatelliteScenario(seed=1, tumble_deg=3.0).build()
+    return SatelliteScenario(seed=1, tumble_deg=3.0, perception="pose_sensor").build()
 
 
 def mode(context: Context) -> str:
