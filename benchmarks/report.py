@@ -21,6 +21,7 @@ BENCHMARKS: Registry = {
     "parallel_efficiency_python": "benchmarks.parallel:parallel_efficiency_python",
     "cluster_projection": "benchmarks.cluster:cluster_projection",
     "casadi_system": "benchmarks.casadi_system:casadi_system",
+    "image_switch": "benchmarks.image_switch:image_switch",
     "decision_overhead": "benchmarks.decision:decision_overhead",
     "predictive_sampling": "benchmarks.predictive_sampling:predictive_sampling",
     "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
