@@ -68,7 +68,7 @@ class SlowParts:
                     f"{period:g} s it takes at least {2.0 * period:g} s for a result to come back"
                 )
             try:
-                functions[path] = dumps(part.function)
+                functions[path] = dumps(part.function_beside(period))
             except Exception as error:
                 raise ValueError(
                     f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "

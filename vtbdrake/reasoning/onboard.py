@@ -20,6 +20,7 @@ from vtbdrake.reasoning.reasoner import Reasoner
 from vtbdrake.state import NO_DICT, parameter
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
+from vtbdrake.testbed.slow_part import SlowFunction
 
 if TYPE_CHECKING:
     from vtbdrake.reasoning.space import Element
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# The share of the latency that a decision beside a loop may take; the rest is for the way there and back.
+# The share of the time for an answer that a decision beside a loop may take; the rest is for the way there and back.
 _SHARE = 0.8
 
 _DECISION, _CANDIDATE, _CANDIDATE_AT = "decision", "candidate", "candidate_at"
@@ -66,7 +67,8 @@ class OnboardReasoner(SlowPart):
 
     In a simulation the thinking time is the latency, and the budget is one of rollouts, so that a decision can be
     repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop it thinks in
-    processes of its own, and the budget ends after 0.8 of the latency; the best candidate by then is the decision.
+    processes of its own, and the budget ends after 0.8 of the latency less one period of the loop; the best candidate
+    by then is the decision.
 
     Args:
         size: Entries of the decision.
@@ -75,7 +77,7 @@ class OnboardReasoner(SlowPart):
             (``dps.<path>.candidate``, or one entry ``dps.<path>.candidate[0]``).
         quality: See `Reasoner`.
         horizon: Of a rollout in seconds from t_k on; longer than the latency.
-        budget: Of a decision; it counts rollouts. Its seconds, if given, take the place of 0.8 of the latency: more,
+        budget: Of a decision; it counts rollouts. Its seconds, if given, are the longest time beside a loop: more,
             say, for a machine in lock-step, which waits.
         period, latency, offset, patience: See `SlowPart`. As a decision takes no longer than its latency, the patience
             is short.
@@ -126,8 +128,9 @@ class OnboardReasoner(SlowPart):
             **(options or {}),
         }
         believed = dict(believed or {})
+        self._thinker = _Thinker(arguments, niceness)
         super().__init__(
-            _Thinker(arguments, _SHARE * latency, niceness),
+            self._thinker,
             inputs=believed,
             outputs={_DECISION: size, **dict.fromkeys((_QUALITY, _IMPROVEMENT, _ROLLOUTS), 1)},
             period=period,
@@ -152,6 +155,10 @@ class OnboardReasoner(SlowPart):
             *(parameter(name, groups[name], shape=() if n == 1 else (n,)) for name, n in sizes.items()),
             parameter(_CANDIDATE_AT, self._candidate_at, unit="s"),
         )
+
+    def function_beside(self, period: float) -> SlowFunction:
+        thinker = self._thinker.limited(_SHARE * (self.latency - period))
+        return replace(self.function, function=thinker)
 
     def _sample(self, context: Context, state: State) -> None:
         if not self.mental:
@@ -180,20 +187,24 @@ class _Thinker:
 
     Args:
         arguments: Those of the reasoner.
-        seconds: The longest wall time of a decision beside a loop.
         niceness: Of the process beside a loop, and of its workers.
+        seconds: The longest wall time of a decision beside a loop, if the budget has none.
     """
 
-    def __init__(self, arguments: Mapping[str, Any], seconds: float, niceness: int) -> None:
+    def __init__(self, arguments: Mapping[str, Any], niceness: int, seconds: float | None = None) -> None:
         self._arguments = dict(arguments)
-        self._seconds, self._niceness = seconds, niceness
+        self._niceness, self._seconds = niceness, seconds
         self._budget: Budget = replace(self._arguments["budget"], seconds=None)
         self._reasoner: Reasoner | None = None
         self._last_reason = ""
         self._taking_turns = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _Thinker, (self._arguments, self._seconds, self._niceness)
+        return _Thinker, (self._arguments, self._niceness, self._seconds)
+
+    def limited(self, seconds: float) -> _Thinker:
+        """Return one whose decisions beside a loop take ``seconds`` at most."""
+        return _Thinker(self._arguments, self._niceness, seconds)
 
     def prepare(self) -> None:
         """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""

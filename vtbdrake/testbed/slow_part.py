@@ -458,6 +458,13 @@ class SlowPart(LeafSystem):
         """Return the memory that the next call begins with; empty for a part without."""
         return self._read(self.GetMyContextFromRoot(context)).memory
 
+    def function_beside(self, period: float) -> SlowFunction:
+        """Return the function for a process beside a loop with this period in seconds.
+
+        An answer has the latency less a period: its sample leaves after a step, and it is needed before another.
+        """
+        return self.function
+
     def deliver(self, context: Context, tick: int, arrays: Arrays) -> None:
         """Deliver the result of sample number ``tick``: it is shown when it is due, and its memory counts at once.
 
