@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ import numpy as np
 from tests.cli.program import run
 from tests.cli.test_run import PATIENCE, start
 from tests.control.scripted import ScriptedBridge
-from tests.reasoning.pusher import PLANNER, PusherScenario
+from tests.monitoring.residuals.line import Together
+from tests.reasoning.pusher import PLANNER, STATE, PusherScenario
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.stepping import Cycle
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.machine import MachineProcess
+from vtbdrake.machine import Machine, MachineConfig, MachineProcess
+from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
 from vtbdrake.recording import read_log
 from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
@@ -117,6 +121,30 @@ def test_latency_of_three_periods_is_enough() -> None:
             if runtime.slow_parts.statistics[PLANNER].results:
                 break
         assert runtime.slow_parts.statistics[PLANNER].results == 1
+
+
+def test_alarm_of_the_residuals_asks_for_a_decision() -> None:
+    scenario = PusherScenario(rollouts=6, latency=0.5)
+    machine = Machine(scenario, MachineConfig(period=PERIOD))
+    together = Together(scenario, machine, values={"u.goal": 0.4})
+    runtime = together.driver
+    config = ResidualConfig(period=PERIOD, tolerance={"sense.state": 1e-3})
+
+    def ask(cycle: Cycle) -> None:
+        if monitor.alarms:
+            runtime.request(partial(runtime.write, {"u.request": float(len(monitor.alarms))}))
+
+    with runtime, ResidualMonitor(runtime, "twin", config=config, worker=False) as monitor:
+        runtime.watch(ask)
+        assert runtime.slow_parts.wait(60.0)
+        together.run(200)
+        assert runtime.target.read(runtime.context, f"{PLANNER}.taken") == 0.0 and not monitor.alarms
+        machine.write({STATE: [0.3, 0.0]})  # A push that the model does not know.
+        for _ in range(200):
+            together.run(1)
+            assert runtime.slow_parts.wait(60.0)
+        read = {name: runtime.target.read(runtime.context, f"{PLANNER}.{name}") for name in ("taken", "valid")}
+    assert monitor.alarms and read["taken"] >= 1.0 and read["valid"] == 1.0
 
 
 def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
