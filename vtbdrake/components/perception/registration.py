@@ -79,34 +79,44 @@ class Faces:
         nearest = p[best] + R[best, :, 0] * on_face[:, :1] + R[best, :, 1] * on_face[:, 1:]
         return nearest, R[best, :, 2], ~beyond[rows, best].any(axis=1)
 
-    def edge_directions(self, points: Array, *, eye: Array) -> tuple[Array, Array, Array]:
-        """Find the directions in which points cover a face from one edge to the other, so that both edges were seen.
+    def offsets(self, points: Array, *, eye: Array, thickness: float) -> tuple[Array, Array, Array, Array]:
+        """Measure how far points lie beside the faces that they cover from one edge to the other.
 
-        Points with a mean distance s from each other end within s of both edges; where exactly, is unknown by s / 2.
+        Points say where their plane is, but not where in it. On a face that is cut into strips, the first and the last
+        point of a strip end within the points' mean distance s of the edges. So their middle is that of the face, with
+        a standard deviation of s / √24 if the ends are uniformly distributed. The offset is the mean over the strips;
+        as neighbouring strips often end alike, they do not count as independent.
 
         Args:
-            points: On the faces, in T, (n, 3) in m.
+            points: In T, (n, 3) in m.
             eye: Where they were seen from, in T, (3,) in m.
+            thickness: How far from a face its points may lie, in m.
 
         Returns:
-            The centres of these faces (k, 3), the directions (k, 3), both in T, and s (k,) in m.
+            For each direction along a face in which both edges were seen: the centre of the face (k, 3), the direction
+            (k, 3), the offset of the points (k,) in m and its standard deviation (k,) in m.
         """
-        centres, directions, distances = [], [], []
+        found: list[tuple[Array, Array, float, float]] = []
         for pose, half in zip(self.poses, self.half_sizes, strict=True):
             if pose[:, 2] @ (eye - pose[:, 3]) <= 0.0:
                 continue
             local = (points - pose[:, 3]) @ pose[:, :3]
-            on = local[(np.abs(local[:, 2]) < 1e-6) & (np.abs(local[:, :2]) < half).all(axis=1), :2]
-            if len(on) < 10:
-                continue
-            low, high = on.min(axis=0), on.max(axis=0)
-            s = float(np.sqrt(np.prod(high - low) / len(on)))
+            on = local[(np.abs(local[:, 2]) < thickness) & (np.abs(local[:, :2]) < half + thickness).all(axis=1), :2]
+            s = float(np.sqrt(4.0 * np.prod(half) / max(len(on), 1)))
             for k in range(2):
-                if high[k] > half[k] - 1.5 * s and low[k] < 1.5 * s - half[k]:
-                    centres.append(pose[:, 3])
-                    directions.append(pose[:, k])
-                    distances.append(s)
-        return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(distances)
+                count = int(2.0 * half[1 - k] / (1.5 * s))
+                if count < 3:
+                    continue
+                strip = ((on[:, 1 - k] / half[1 - k] + 1.0) * 0.5 * count).astype(int).clip(0, count - 1)
+                low, high = np.full(count, np.inf), np.full(count, -np.inf)
+                np.minimum.at(low, strip, on[:, k])
+                np.maximum.at(high, strip, on[:, k])
+                whole = (high > half[k] - 2.0 * s) & (low < 2.0 * s - half[k])
+                if whole.sum() >= 3:
+                    offset = float(np.mean(0.5 * (low[whole] + high[whole])))
+                    found.append((pose[:, 3], pose[:, k], offset, s / 24.0**0.5))
+        centres, directions, offsets, deviations = zip(*found, strict=True) if found else ((), (), (), ())
+        return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(offsets), np.array(deviations)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Faces:
         return self
@@ -163,6 +173,8 @@ class Registration:
             )
 
 
+# So many steps at least minimize the offsets along the faces, too.
+_LAST_STEPS = 6
 # The start counts as a measurement with these standard deviations, so that what the points leave open (the motion
 # along a plane, if only one is seen) stays as predicted, with a covariance that tells so.
 _PRIOR = np.concatenate([np.full(3, 0.3**-2), np.full(3, 0.3**-2)])
@@ -183,8 +195,8 @@ def register_points(
     Σ w(r) r², r = n·(p - q), is minimized over small motions of T (Chen and Medioni, "Object modelling by registration
     of multiple range images", 1992). n is the face's normal, and for points beyond an edge the direction from q to p.
     Points farther from the body than a limit, which shrinks from step to step, are left out; the others have Tukey's
-    weights w. The covariance is the inverse normal matrix of the points above the faces,
-    and of the directions in which both edges of a face were seen (`Faces.edge_directions`).
+    weights w. Once the steps are small, the offsets along the faces (`Faces.offsets`) are minimized, too. The
+    covariance is the inverse normal matrix of the points above faces and of these offsets.
 
     Args:
         points: In A, (n, 3) in m, measured at one instant, or de-skewed.
@@ -204,40 +216,54 @@ def register_points(
     if len(near) > settings.most_points:
         near = near[np.linspace(0, len(near) - 1, settings.most_points).astype(int)]
     limit, least = settings.basin, 4.0 * settings.range_noise
-    prior, offset = np.diag(_PRIOR) * settings.range_noise**2, np.zeros(6)
-    for _ in range(settings.steps):
+    offset, settled = np.zeros(6), False
+    for k in range(settings.steps):
         if len(near) < settings.fewest_points:
             return PoseEstimate.missing(time=time)
-        in_T = (near - p) @ R
-        nearest, normals, above = faces.nearest(in_T, eye=(eye - p) @ R)
+        in_T, eye_T = (near - p) @ R, (eye - p) @ R
+        nearest, normals, above = faces.nearest(in_T, eye=eye_T)
         gap = in_T - nearest
         distance = np.linalg.norm(gap, axis=1)
         n_T = np.where(above[:, None] | (distance < 1e-9)[:, None], normals, gap / np.maximum(distance, 1e-9)[:, None])
         r = np.einsum("ni,ni->n", n_T, gap)
-        weight = np.where(distance < limit, (1.0 - np.minimum(distance / limit, 1.0) ** 2) ** 2, 0.0)
-        n = n_T @ R.T
+        weight = (1.0 - np.minimum(distance / limit, 1.0) ** 2) ** 2
         # A motion [θ; d] of T changes r by -n·(θ × (p - p_AT) + d).
-        J = np.concatenate([np.cross(near - p, n), n], axis=1)
-        H = (weight[:, None] * J).T @ J + prior
-        step = np.linalg.solve(H, J.T @ (weight * r) - prior @ offset)
+        J = _jacobian(near - p, n_T @ R.T)
+        edges, beside, deviations = _edges(faces, in_T, R, eye_T, least) if settled else _NO_EDGES
+        information = np.diag(_PRIOR) + (edges / deviations[:, None] ** 2).T @ edges
+        H = (weight[:, None] * J).T @ J / settings.range_noise**2 + information
+        b = J.T @ (weight * r) / settings.range_noise**2 + edges.T @ (beside / deviations**2) - _PRIOR * offset
+        step = np.linalg.solve(H, b)
         step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-12))
         R, p, offset = rotation_matrix(step[:3]) @ R, p + step[3:], offset + step
-        if limit == least and np.abs(step).max() < 1e-5:
+        largest = float(np.abs(step).max())
+        if settled and largest < 1e-4:
             break
+        settled = settled or (limit == least and largest < 1e-3) or k >= settings.steps - _LAST_STEPS
         limit = max(least, 0.5 * limit)
     on_body = above & (distance < least)
     count, close = int(on_body.sum()), int((distance < settings.basin).sum())
     if count < settings.fewest_points or count < settings.share * close:
         return PoseEstimate.missing(time=time)
     variance = max(settings.range_noise**2, float(np.mean(r[on_body] ** 2)))
-    information = J[on_body].T @ J[on_body] / variance + np.diag(_PRIOR)
-    centres, directions, spacing = faces.edge_directions(nearest[on_body], eye=(eye - p) @ R)
-    along = directions @ R.T
-    edges = np.concatenate([np.cross(centres @ R.T, along), along], axis=1)
-    information += (edges / (0.5 * spacing[:, None]) ** 2).T @ edges
-    covariance = np.linalg.inv(information) + settings.systematic**2 * np.eye(6)
+    covariance = np.linalg.inv(J[on_body].T @ J[on_body] / variance + information)
+    covariance += settings.systematic**2 * np.eye(6)
     X_AT = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
     return PoseEstimate.of(X_AT, 0.5 * (covariance + covariance.T), time=time)
+
+
+def _jacobian(arms: Array, directions: Array) -> Array:
+    """Return how far points at ``arms`` from To move along ``directions`` per motion [θ; d] of T, (n, 6)."""
+    return np.concatenate([np.cross(arms, directions), directions], axis=1)
+
+
+_NO_EDGES = np.zeros((0, 6)), np.zeros(0), np.zeros(0)
+
+
+def _edges(faces: Faces, in_T: Array, R: Array, eye_T: Array, thickness: float) -> tuple[Array, Array, Array]:
+    """Return the Jacobian, the value and the standard deviation of each offset along a face."""
+    centres, directions, offsets, deviations = faces.offsets(in_T, eye=eye_T, thickness=thickness)
+    return _jacobian(centres @ R.T, directions @ R.T), offsets, deviations
 
 
 def _within(points: Array, centre: Array, faces: Faces, distance: float) -> Array:
