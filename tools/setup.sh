@@ -11,6 +11,8 @@ EXTRAS=dev,perception,notebook,optuna,cluster,dataframe,recording
 # A shared library that the wheels expect from the system, and Debian's package of it. pydrake and lcm link to GLib;
 # everything else comes with the wheels or with any Debian.
 LIBRARIES=(libglib-2.0.so.0:libglib2.0-0)
+# Cameras need EGL with Mesa's drivers; nothing else does.
+RENDERING=(libegl1 libgl1-mesa-dri)
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() { say "$@"; exit 1; }
@@ -80,6 +82,16 @@ has_compiler() {
 }
 has_headers() { [ -f "$("$python" -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h" ]; }
 has_library() { "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "$1" 2>/dev/null; }
+# Cameras are rendered by EGL without a display (Mesa's surfaceless platform); libEGL alone, without drivers, cannot.
+can_render() {
+    "$python" - 2>/dev/null <<'EOF'
+from ctypes import CDLL, c_void_p
+egl = CDLL("libEGL.so.1")
+egl.eglGetPlatformDisplay.restype = c_void_p
+display = egl.eglGetPlatformDisplay(0x31DD, c_void_p(), c_void_p())
+raise SystemExit(not (display and egl.eglInitialize(c_void_p(display), None, None)))
+EOF
+}
 missing() {
     has_venv || echo "python$version-venv"
     has_compiler || echo "gcc libc6-dev"
@@ -100,6 +112,15 @@ if [ -n "$packages" ]; then
     need_packages $packages
     packages=$(missing)
     [ -z "$packages" ] || fail "still missing after the installation: "$packages
+fi
+if ! can_render; then
+    if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
+        need_packages "${RENDERING[@]}"
+        can_render || say "images cannot be rendered, although ${RENDERING[*]} are installed"
+    else
+        say "images cannot be rendered here, all else works. For cameras, install Debian's packages or their equivalent:"
+        say "    sudo apt-get update && sudo apt-get install --yes --no-install-recommends ${RENDERING[*]}"
+    fi
 fi
 
 # Only an environment that this script made may be replaced: one that was left unfinished or is of another Python.

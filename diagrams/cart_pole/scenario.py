@@ -84,10 +84,7 @@ class CartPoleScenario(Scenario):
 
     def mental(self) -> CartPoleScenario:
         """Return the scenario of the mental copy: one time step per sample, sensors without random errors."""
-        errors = {
-            name: replace(getattr(self, name), noise=0.0, drift=0.0, dropout=0.0)
-            for name in ("position_errors", "velocity_errors")
-        }
+        errors = {name: getattr(self, name).without_chance() for name in ("position_errors", "velocity_errors")}
         return replace(self, plant_config=_plant(self.period), is_mental=True, **errors)
 
     def interface(self) -> Interface:

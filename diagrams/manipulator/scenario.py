@@ -168,7 +168,7 @@ class ManipulatorScenario(Scenario):
     def _without_chance(self) -> ManipulatorScenario:
         """Return this scenario with sensors without random errors, as predictions need it."""
         names = ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
-        return replace(self, **{n: replace(getattr(self, n), noise=0.0, drift=0.0, dropout=0.0) for n in names})
+        return replace(self, **{name: getattr(self, name).without_chance() for name in names})
 
     def make_dps(self) -> Diagram:
         return make_dps(self.law, period=self.period, compile=self.compile)

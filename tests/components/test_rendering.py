@@ -9,10 +9,11 @@ import pytest
 from vtbdrake.components.rendering import RenderingError, check_rendering
 
 
-def test_missing_driver_is_an_error_that_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+# As if the packages were not there: where libEGL finds Mesa, and Mesa its drivers.
+@pytest.mark.parametrize("variable", ["__EGL_VENDOR_LIBRARY_FILENAMES", "LIBGL_DRIVERS_PATH"])
+def test_missing_package_is_an_error_that_names_it(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("VTBDRAKE_RENDERING", raising=False)
-    # GLVND finds Mesa's EGL by these files: as if the package were not there.
-    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent.json")
+    monkeypatch.setenv(variable, "/nonexistent")
     with pytest.raises(RenderingError, match="libegl1 libgl1-mesa-dri"):
         check_rendering()
     assert "VTBDRAKE_RENDERING" not in os.environ

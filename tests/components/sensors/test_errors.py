@@ -218,3 +218,24 @@ def test_noise_of_a_sensor_that_has_none_is_refused() -> None:
 
     with pytest.raises(ValueError, match="has no noise"):
         Switch()
+
+
+def test_outliers_have_their_rate_and_size_and_spare_the_rest() -> None:
+    samples, p, size = 4000, 0.05, 3.0
+    errors = ErrorModel(noise=0.01, outlier_probability=p, outlier_size=size, seed=4)
+    off = readings(Ramp(errors), samples) - readings(Ramp(ErrorModel(noise=0.01, seed=4)), samples)
+    outliers = (off != 0.0).any(axis=1)
+    # The whole sample is an outlier.
+    assert (off[outliers] != 0.0).all()
+    assert outliers.mean() == pytest.approx(p, abs=4.0 * np.sqrt(p * (1.0 - p) / samples))
+    n = off[outliers].size
+    assert off[outliers].std() == pytest.approx(size, rel=4.0 / np.sqrt(2.0 * n))
+
+
+def test_outliers_can_be_set_by_address() -> None:
+    always = readings(Ramp(ErrorModel()), 10, outlier_probability=1.0, outlier_size=0.5) - ramp(10)
+    n = np.array([normal_noise(2, seed=0, stream=STREAM, tick=k, channel=4) for k in range(10)])
+    np.testing.assert_allclose(always, 0.5 * n, atol=1e-15)
+    for wrong in ({"outlier_probability": 1.5}, {"outlier_size": -1.0}):
+        with pytest.raises(ValueError, match="outlier"):
+            Ramp(ErrorModel(**wrong))

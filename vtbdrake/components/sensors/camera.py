@@ -152,7 +152,7 @@ class Camera(LeafSystem):
         super().__init__()
         errors = errors or ErrorModel()
         errors.check("Camera")
-        for name in ("bias", "drift", "quantization"):
+        for name in ("bias", "drift", "quantization", "outlier_probability", "outlier_size"):
             if getattr(errors, name):
                 raise ValueError(f"Camera: images have no {name}; leave it out of the errors")
         if not 0.0 < period < inf:

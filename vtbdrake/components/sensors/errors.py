@@ -1,4 +1,4 @@
-"""Measurement errors of sensors: bias, drift, quantization, latency and drop-out."""
+"""Measurement errors of sensors: outliers, bias, drift, quantization, latency and drop-out."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ from vtbdrake.state import Element, discrete_state, parameter
 from vtbdrake.state.declarations import weakly
 
 # Channels of a sensor's stream; 0 is its white noise.
-_DRIFT_CHANNEL, _DROPOUT_CHANNEL = 1, 2
+_DRIFT_CHANNEL, _DROPOUT_CHANNEL, _OUTLIER_CHANNEL, _OUTLIER_SIZE_CHANNEL = 1, 2, 3, 4
 
 
 @dataclass
 class ErrorModel:
     r"""The errors of a sampled sensor, in the order in which a sample meets them.
 
-    With the measured quantity m_k at tick k, of the period T, and n, n' of N(0, 1), u uniform in [0, 1), all three
+    With the measured quantity m_k at tick k, of the period T, and n, n', n'' of N(0, 1), u, u' uniform in [0, 1), all
     functions of (seed, stream, k):
 
         w_k = w_{k-1} + drift sqrt(T) n'_k,   w_{-1} = 0          (a random walk, of variance drift^2 t)
-        z_k = round((m_k + noise n_k + bias + w_k) / q) q         (q = quantization; left as it is where q = 0)
+        o_k = outlier_size n''_k if u'_k < outlier_probability, else 0
+        z_k = round((m_k + noise n_k + o_k + bias + w_k) / q) q   (q = quantization; left as it is where q = 0)
         y_k = y_{k-1} if u_k < dropout, else z_{k-latency}
 
-    y is what the sensor shows; before the first sample, y and z are its default.
+    y is what the sensor shows; before the first sample, y and z are its default. Noise and outliers together have a
+    contaminated normal distribution (Tukey, "A survey of sampling from contaminated distributions", 1960).
 
     The values hold for all entries of the sensor; by address, they can be set entry by entry, and changed at any time.
     """
@@ -56,8 +58,16 @@ class ErrorModel:
     max_latency: int = 0
     # Probability that a sample does not arrive.
     dropout: float = 0.0
+    # Probability that a sample is an outlier, in all its entries.
+    outlier_probability: float = 0.0
+    # Standard deviation of what an outlier is off by, in the unit of the signal.
+    outlier_size: float = 0.0
     # Of all random numbers, beside the stream, which belongs to the sensor.
     seed: int = 0
+
+    def without_chance(self) -> ErrorModel:
+        """Return the model without its random errors, as predictions need it."""
+        return replace(self, noise=0.0, drift=0.0, dropout=0.0, outlier_probability=0.0)
 
     def check(self, owner: str) -> None:
         """Raise a ValueError if no sensor can have such errors.
@@ -76,6 +86,8 @@ class ErrorModel:
                 "a whole number of periods",
             ),
             "dropout": (0.0 <= self.dropout <= 1.0, "a probability, between 0 and 1"),
+            "outlier_probability": (0.0 <= self.outlier_probability <= 1.0, "a probability, between 0 and 1"),
+            "outlier_size": (0.0 <= self.outlier_size < inf, "a standard deviation, finite and not negative"),
             "seed": (0 <= self.seed <= 2**53 and self.seed == int(self.seed), "a whole number between 0 and 2^53"),
         }
         for name, (good, expected) in checks.items():
@@ -95,6 +107,8 @@ class _Settings:
     quantization: NDArray[np.float64] | None = None
     latency: int = 0
     dropout: float = 0.0
+    outlier_probability: float = 0.0
+    outlier_size: float = 0.0
 
     def __deepcopy__(self, memo: object) -> _Settings:
         # Clones of a Context share it.
@@ -110,8 +124,9 @@ class ErrorStage:
 
     Attributes:
         variables: the parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also
-            ``bias``, ``drift``, ``quantization`` (one per entry), ``latency`` and ``dropout``, and the state ``walk``
-            (the drift) and ``in_transit`` (the samples not yet shown, newest first).
+            ``bias``, ``drift``, ``quantization`` (one per entry), ``latency``, ``dropout``, ``outlier_probability``
+            and ``outlier_size``, and the state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown,
+            newest first).
     """
 
     def __init__(
@@ -146,7 +161,7 @@ class ErrorStage:
         if model is not None:
             self._longest = max(int(model.latency), int(model.max_latency))
             values += np.repeat([model.bias, model.drift, model.quantization], self._n).tolist()
-            values += [float(model.latency), float(model.dropout)]
+            values += [float(model.latency), float(model.dropout), model.outlier_probability, model.outlier_size]
             self._memory = int(sensor.DeclareDiscreteState(np.r_[np.zeros(self._n), np.tile(default, self._longest)]))
         self._parameters = int(sensor.DeclareNumericParameter(BasicVector(values)))
         entry = sensor.DeclareCacheEntry(
@@ -172,6 +187,8 @@ class ErrorStage:
         yield parameter("quantization", index, start=start + 2 * n, shape=(n,), unit=unit, bounds=(0.0, inf))
         yield parameter("latency", index, start=start + 3 * n, unit="period", bounds=(0.0, float(self._longest)))
         yield parameter("dropout", index, start=start + 3 * n + 1, bounds=(0.0, 1.0))
+        yield parameter("outlier_probability", index, start=start + 3 * n + 2, bounds=(0.0, 1.0))
+        yield parameter("outlier_size", index, start=start + 3 * n + 3, unit=unit, bounds=(0.0, inf))
         yield discrete_state("walk", self._memory, shape=(n,), unit=unit)
         if self._longest:
             yield discrete_state("in_transit", self._memory, start=n, shape=(self._longest, n), unit=unit)
@@ -182,7 +199,7 @@ class ErrorStage:
         found = _Settings(int(values[0]), _unless_zero(np.repeat(values[1:start], self._counts)))
         if self._more:
             bias, drift, quantization = values[start : start + 3 * n].reshape(3, n)
-            latency, dropout = values[start + 3 * n :].tolist()
+            latency, dropout, outlier_probability, outlier_size = values[start + 3 * n :].tolist()
             found = replace(
                 found,
                 bias=_unless_zero(bias),
@@ -190,6 +207,8 @@ class ErrorStage:
                 quantization=_unless_zero(quantization),
                 latency=round(latency),
                 dropout=dropout,
+                outlier_probability=outlier_probability,
+                outlier_size=outlier_size,
             )
         settings.set_value(found)
 
@@ -229,6 +248,10 @@ class ErrorStage:
         walk = memory[:n]
         if settings.drift is not None:
             walk = walk + settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
+        if settings.outlier_probability and (
+            uniform_noise(channel=_OUTLIER_CHANNEL, **key) < settings.outlier_probability
+        ):
+            y = y + settings.outlier_size * normal_noise(n, channel=_OUTLIER_SIZE_CHANNEL, **key)
         if settings.bias is not None:
             y = y + settings.bias
         if np.count_nonzero(walk):
