@@ -61,8 +61,8 @@ class ArmController(LeafSystem):
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
         command = self.DeclareDiscreteState(servicer.home)
         self.DeclareStateOutputPort("joint_position", command)
-        # The rates of the arm's joints, and for how long an abort has lasted.
-        memory = self.DeclareDiscreteState(ARM_JOINTS + 1)
+        # The rates of the arm's joints, for how long an abort has lasted, and the positions measured last.
+        memory = self.DeclareDiscreteState(np.concatenate((np.zeros(ARM_JOINTS + 1), servicer.home)))
         self._command, self._memory = int(command), int(memory)
         declared = {
             "position_gain": (1.0, "1/s"),
@@ -83,6 +83,9 @@ class ArmController(LeafSystem):
             discrete_state("joint_position", self._command, shape=(len(JOINT_NAMES),), unit="rad, m"),
             discrete_state("joint_rate_command", self._memory, shape=(ARM_JOINTS,), unit="rad/s"),
             discrete_state("aborted_for", self._memory, start=ARM_JOINTS, unit="s"),
+            discrete_state(
+                "measured_position", self._memory, start=ARM_JOINTS + 1, shape=(len(JOINT_NAMES),), unit="rad, m"
+            ),
             *(
                 parameter(name, 0, start=k, unit=unit, bounds=(0.0, inf))
                 for k, (name, (_, unit)) in enumerate(declared.items())
@@ -119,7 +122,7 @@ class ArmController(LeafSystem):
         fingers = command[ARM_JOINTS:]
         fingers = fingers + np.clip(guidance.opening - fingers, -T * finger_rate, T * finger_rate)
         state.set_value(self._command, np.concatenate((following, fingers)))
-        state.set_value(self._memory, np.concatenate((rates, (aborted,))))
+        state.set_value(self._memory, np.concatenate((rates, (aborted,), measured)))
 
     @staticmethod
     def _twist(relative: Relative, guidance: Guidance, k_p: float, k_R: float, speed: float, turn: float) -> Array:

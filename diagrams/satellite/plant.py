@@ -28,7 +28,7 @@ def plant_config() -> MultibodyPlantConfig:
 def add_servicer(
     plant: MultibodyPlant, servicer: Servicer | None = None, *, wheels: bool = False, servos: bool = True
 ) -> ModelInstanceIndex:
-    """Add the servicer, floating freely, with its arm stowed; and remove gravity, as both satellites are in free fall.
+    """Add the servicer, floating freely, with its arm stowed; and remove gravity, as all is in free fall.
 
     Args:
         plant: The plant, not yet finalized.
@@ -55,7 +55,11 @@ def add_servicer(
 
 
 def add_target(plant: MultibodyPlant, X_WT: RigidTransform | None = None) -> ModelInstanceIndex:
-    """Add the target, without markers, floating freely at ``X_WT``; by default 2.5 m in front of the servicer."""
+    """Add the target, without markers, floating freely at ``X_WT``; by default 2.5 m in front of the servicer.
+
+    Gravity is removed.
+    """
+    plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     (instance,) = Parser(plant).AddModels(str(TARGET_SDF))
     body = plant.GetBodyByName("body", instance)
     plant.SetDefaultFloatingBaseBodyPose(body, X_WT or RigidTransform([2.5, 0.0, 0.0]))

@@ -7,16 +7,20 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
 
 from vtbdrake.components.environment.light import LightConfig
+from vtbdrake.components.perception.estimate import rotation_matrix
+from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.scan import Scan
+from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
-from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, Eyes, make_dps
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, target_board
 from vtbdrake_diagrams.satellite.plant import plant_config
@@ -233,6 +237,7 @@ class SatelliteScenario(Scenario):
         release = builder.add("env", "release", Release(plant, target, start))
         builder.connect(plant.get_state_output_port(), release.get_input_port())
         builder.connect(release.get_output_port(), plant.get_applied_spatial_force_input_port())
+        self._declare_belief(builder)
 
     def _add_eyes(self, builder: VirtualTestbedBuilder) -> None:
         """Add the docking camera ``docking_camera`` with the ``light``, and the laser scanner ``scanner``."""
@@ -264,8 +269,37 @@ class SatelliteScenario(Scenario):
 
     @staticmethod
     def _declare_belief(builder: VirtualTestbedBuilder) -> None:
-        """Declare what the servicer believes: base and target move as it estimates, in its own inertial frame."""
+        """Declare what the servicer believes: both bodies move in its own inertial frame as it estimates.
+
+        All of it is one period old: so old are the samples of encoders and IMU. The fingers rest.
+        """
         for k, name in enumerate(JOINT_NAMES):
-            builder.believe(
-                f"sim.sys.servicer.{name}.position", of=["sense.joint_position"], by=itemgetter(k), age=PERIOD
-            )
+            address = f"sim.sys.servicer.{name}"
+            of = ["dps.impl.controller.measured_position"]
+            builder.believe(f"{address}.position", of=of, by=itemgetter(k), age=PERIOD)
+            if k < ARM_JOINTS:
+                of = ["dps.impl.controller.joint_rate_command"]
+                builder.believe(f"{address}.velocity", of=of, by=itemgetter(k), age=PERIOD)
+        base, target = "dps.env.base", "dps.env.target"
+        builder.believe(
+            "sim.sys.servicer.base.pose",
+            of=[f"{base}.orientation", f"{base}.position"],
+            by=lambda q, p: pose_to_array(pose_of_state(np.concatenate((q, p)))),
+            age=PERIOD,
+        )
+        builder.believe(
+            "sim.sys.servicer.base.velocity",
+            of=[f"{base}.angular_velocity", f"{base}.velocity"],
+            by=lambda w, v: np.concatenate((w, v)),
+            age=PERIOD,
+        )
+        of = [f"{target}.pose", f"{target}.velocity"]
+        builder.believe("sim.sys.target.body.pose", of=of, by=_one_period_before, age=PERIOD)
+        builder.believe("sim.sys.target.body.velocity", of=of[1:], age=PERIOD)
+
+
+def _one_period_before(pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Return the pose (6,) that a body with a velocity (6,) had one period ago."""
+    X_IT = pose_from_array(pose)
+    turned = RotationMatrix(rotation_matrix(-PERIOD * velocity[:3])) @ X_IT.rotation()
+    return pose_to_array(RigidTransform(turned, X_IT.translation() - PERIOD * velocity[3:]))
