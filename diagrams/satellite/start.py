@@ -16,6 +16,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericP
 
 from vtbdrake.state import parameter
 from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.satellite.bodies import Target
 
 Array = NDArray[np.float64]
@@ -44,6 +45,13 @@ class Start:
     X_WT: RigidTransform
     w_WT: Array
     v_WT: Array
+
+    def values(self) -> dict[str, Array]:
+        """Return the start as values by address, for a rollout of any `SatelliteScenario`."""
+        return {
+            "sim.sys.target.body.pose": pose_to_array(self.X_WT),
+            "sim.env.release.velocity": np.concatenate((self.w_WT, self.v_WT)),
+        }
 
 
 def random_start(seed: int, *, tumble: float, distance: float) -> Start:

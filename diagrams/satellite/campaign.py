@@ -1,0 +1,188 @@
+"""How often does the capture succeed, and why does it fail?
+
+``python -m vtbdrake_diagrams.satellite.campaign [--captures N] [--perception P] [--workers W] [--seed S]`` simulates
+captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with camera and
+scanner in the loop, and prints one row per capture.
+
+What counts, fixed before any result was seen:
+
+* The bar is held: the supervisor is in its mode ``hold``, and the bar is in truth between the fingers' pads, no further
+  than `GRIP_LENGTH` from the middle of the hand along it, and than `GRIP_DEPTH` along the direction of approach.
+* The relative motion has stopped: the bar moves by less than `CREEP` against the hand, and the arm by less than
+  `JOINT_CREEP`, in the last half second.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.cli.output import table
+from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.rollout import Executor, ProcessExecutor, Quality, RolloutResult, RolloutTask
+from vtbdrake.state.systems import pose_from_array
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
+from vtbdrake_diagrams.satellite.kinematics import gripper
+from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
+from vtbdrake_diagrams.satellite.start import Start, random_start
+from vtbdrake_diagrams.satellite.supervisor import HOLD, MODES, REASONS
+
+LARGEST_TUMBLE = np.radians(3.0)
+HORIZON = 75.0
+"""Longest capture in s: the supervisor gives up after 60 s."""
+GRIP_LENGTH = 0.06
+"""In m: the bar reaches 0.13 m to both sides, the fingers 0.04 m."""
+GRIP_DEPTH = 0.02
+"""In m: the pads reach from 0.04 m behind G to 0.05 m before it, the bar 0.033 m to both sides of H."""
+CREEP = 1e-3
+"""In m."""
+JOINT_CREEP = 2e-3
+"""In rad."""
+
+MODE, REASON = "dps.impl.supervisor.mode", "dps.impl.supervisor.reason"
+BASE, TARGET = "sim.sys.servicer.base.pose", "sim.sys.target.body.pose"
+_JOINTS = tuple(f"sim.sys.servicer.{name}.position" for name in JOINT_NAMES)
+_SAMPLE_PERIOD = 0.5
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The end of a capture.
+
+    Attributes:
+        tumble: Angular velocity of the target in rad/s.
+        mode: The last mode of the supervisor.
+        reason: Why it was entered.
+        duration: In s, until the relative motion had stopped or the capture was aborted.
+        offset: p_GoHo_G at the end, in m.
+        creep: By how much the bar moved against the hand in the last half second, in m.
+        joint_creep: By how much the arm's joints moved then, at most, in rad.
+        base_angle: By which angle the base has turned, in rad.
+    """
+
+    tumble: float
+    mode: str
+    reason: str
+    duration: float
+    offset: np.ndarray
+    creep: float
+    joint_creep: float
+    base_angle: float
+
+    @property
+    def failure(self) -> str:
+        """Why the capture failed; empty if it succeeded."""
+        if self.mode != MODES[int(HOLD)]:
+            return self.reason
+        if abs(self.offset[1]) > GRIP_LENGTH or abs(self.offset[2]) > GRIP_DEPTH or abs(self.offset[0]) > 0.01:
+            return "the bar is not between the fingers"
+        if self.creep > CREEP or self.joint_creep > JOINT_CREEP:
+            return "the relative motion has not stopped"
+        return ""
+
+
+def capture_task(scenario: SatelliteScenario) -> RolloutTask:
+    """Return the rollouts of a capture, which end when it has succeeded or is aborted."""
+    quality = Quality(lambda mode: mode, of=MODE)
+    record = [MODE, REASON, BASE, TARGET, *_JOINTS]
+    return RolloutTask(scenario, HORIZON, quality, HOLD - 0.5, sample_period=_SAMPLE_PERIOD, record=record)
+
+
+def judge(result: RolloutResult) -> Capture:
+    """Return what came of a rollout of `capture_task`, from its true motion."""
+    record = result.record
+    tumble = float(np.linalg.norm(np.asarray(result.parameters["sim.env.release.velocity"])[:3]))
+    if result.end == "failed" or len(result.times) < 2:
+        return Capture(tumble, "failed", result.message, np.nan, np.full(3, np.nan), np.nan, np.nan, np.nan)
+    before, after = _fixture_in_gripper(record, -2), _fixture_in_gripper(record, -1)
+    arm = np.array([[record[address][k] for address in _JOINTS[:ARM_JOINTS]] for k in (-2, -1)])
+    return Capture(
+        tumble=tumble,
+        mode=MODES[int(record[MODE][-1])],
+        reason=REASONS[int(record[REASON][-1])],
+        duration=float(result.times[-1]),
+        offset=after.translation(),
+        creep=float(np.linalg.norm(after.translation() - before.translation())),
+        joint_creep=float(np.abs(arm[1] - arm[0]).max()),
+        base_angle=float(pose_from_array(record[BASE][-1]).rotation().ToAngleAxis().angle()),
+    )
+
+
+def starts(count: int, *, seed: int, distance: float) -> list[Start]:
+    """Return random starts with random tumble rates."""
+    tumbles = LARGEST_TUMBLE * np.random.default_rng(seed).uniform(size=count)
+    return [random_start(seed + k, tumble=float(w), distance=distance) for k, w in enumerate(tumbles)]
+
+
+def captures(
+    scenario: SatelliteScenario, executor: Executor, *, count: int, seed: int
+) -> Iterator[tuple[int, Capture]]:
+    """Run captures from random starts, and yield them with their numbers as they finish."""
+    points = [start.values() for start in starts(count, seed=seed, distance=scenario.distance)]
+    for index, result in executor.run(capture_task(scenario), points):
+        yield index, judge(result)
+
+
+def report(found: Sequence[Capture]) -> str:
+    """Return the table of captures, the failures by reason, and the rate of success."""
+    header = ("tumble deg/s", "end", "s", "off mm", "creep mm", "base deg", "failure")
+    rows = [
+        (
+            f"{np.degrees(c.tumble):.2f}",
+            c.mode,
+            f"{c.duration:.1f}",
+            " ".join(f"{1e3 * v:.0f}" for v in c.offset),
+            f"{1e3 * c.creep:.2f}",
+            f"{np.degrees(c.base_angle):.1f}",
+            c.failure,
+        )
+        for c in found
+    ]
+    failures = Counter(c.failure for c in found if c.failure)
+    caught = len(found) - failures.total()
+    reasons = "".join(f"\n{count} x {reason}" for reason, count in failures.most_common())
+    return f"{table(header, rows)}\n{caught} of {len(found)} captured{reasons}"
+
+
+def _fixture_in_gripper(record: dict[str, np.ndarray], k: int) -> RigidTransform:
+    """Return X_GH at a sample."""
+    pose = _gripper().value([np.array([record[address][k] for address in _JOINTS[:ARM_JOINTS]])])
+    X_BG = RigidTransform(RotationMatrix(pose[:9].reshape(3, 3)), pose[9:])
+    X_BT = pose_from_array(record[BASE][k]).InvertAndCompose(pose_from_array(record[TARGET][k]))
+    return X_BG.InvertAndCompose(X_BT @ Target().X_TH)
+
+
+@lru_cache
+def _gripper() -> Kernel:
+    q = casadi.SX.sym("q", ARM_JOINTS)
+    G = gripper(q)
+    pose = casadi.densify(casadi.vertcat(G.R.T.reshape((9, 1)), G.p))
+    return Kernel("gripper", [q], pose, compile=False)
+
+
+def main() -> None:
+    """Run the campaign, and print its table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--captures", type=int, default=40)
+    parser.add_argument("--perception", default="camera+scanner")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=1000)
+    chosen = parser.parse_args()
+    scenario = SatelliteScenario(perception=chosen.perception)
+    found: dict[int, Capture] = {}
+    with ProcessExecutor(chosen.workers) as executor:
+        for index, capture in captures(scenario, executor, count=chosen.captures, seed=chosen.seed):
+            found[index] = capture
+            print(f"{len(found)} of {chosen.captures}: {capture.failure or 'captured'}", flush=True)
+    print(report([found[index] for index in sorted(found)]))
+
+
+if __name__ == "__main__":
+    main()
