@@ -68,9 +68,9 @@ class CartPoleScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        for name, expected in (("period", "positive, in s"), ("force_limit", "positive, in N")):
-            if not getattr(self, name) > 0.0:
-                raise ScenarioError(f"CartPoleScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        self.require(
+            period=(self.period > 0.0, "positive, in s"), force_limit=(self.force_limit > 0.0, "positive, in N")
+        )
         try:
             self.plan()
             for name in ("position_errors", "velocity_errors"):

@@ -76,19 +76,16 @@ class ManipulatorScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        checks = {
-            "law": (self.law in LAWS, f"one of {', '.join(LAWS)}"),
-            "period": (self.period > 0.0, "positive, in s"),
-            "plant_config.time_step": (self.plant_config.time_step > 0.0, "positive, in s: the testbed is discrete"),
-            "wall_stiffness": (self.wall_stiffness > 0.0, "positive, in N/m"),
-            "wall_dissipation": (self.wall_dissipation >= 0.0, "not negative"),
-            "wall_friction": (self.wall_friction >= 0.0, "not negative"),
-        }
-        for name, (good, expected) in checks.items():
-            if not good:
-                owner, _, item = f"self.{name}".rpartition(".")
-                value = self.plant_config.time_step if owner.endswith("plant_config") else getattr(self, item)
-                raise ScenarioError(f"ManipulatorScenario.{name} must be {expected}, not {value!r}")
+        self.require(
+            law=(self.law in LAWS, f"one of {', '.join(LAWS)}"),
+            period=(self.period > 0.0, "positive, in s"),
+            **{
+                "plant_config.time_step": (self.plant_config.time_step > 0.0, "positive, in s: the testbed is discrete")
+            },
+            wall_stiffness=(self.wall_stiffness > 0.0, "positive, in N/m"),
+            wall_dissipation=(self.wall_dissipation >= 0.0, "not negative"),
+            wall_friction=(self.wall_friction >= 0.0, "not negative"),
+        )
         for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors"):
             try:
                 getattr(self, name).check(f"ManipulatorScenario.{name}")

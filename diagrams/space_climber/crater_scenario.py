@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventSta
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
 from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
@@ -68,17 +68,14 @@ class CraterScenario(SpaceClimberScenario):
 
     def validate(self) -> None:
         super().validate()
-        checks = {
-            "slope_deg": (self.slope_deg == 0.0, "0: the crater's ground has slopes of its own"),
-            "clearance": (0.0 <= self.clearance <= 0.15, "within [0, 0.15] m"),
-            "seed": (self.seed >= 0, "not negative"),
-            "roughness": (0.0 <= self.roughness <= 0.1, "within [0, 0.1] m"),
-            "roughness_seed": (self.roughness_seed >= 0, "not negative"),
-            "patience": (self.patience >= 0.0, "not negative, in s"),
-        }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ScenarioError(f"CraterScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        self.require(
+            slope_deg=(self.slope_deg == 0.0, "0: the crater's ground has slopes of its own"),
+            clearance=(0.0 <= self.clearance <= 0.15, "within [0, 0.15] m"),
+            seed=(self.seed >= 0, "not negative"),
+            roughness=(0.0 <= self.roughness <= 0.1, "within [0, 0.1] m"),
+            roughness_seed=(self.roughness_seed >= 0, "not negative"),
+            patience=(self.patience >= 0.0, "not negative, in s"),
+        )
 
     @property
     def crater(self) -> Crater:
@@ -159,9 +156,9 @@ class EndOfClimb(LeafSystem):
         """Declare the system.
 
         Args:
-            base: index of the robot's torso in the plant.
-            period: of its checks, in s.
-            patience: for how long a robot that is stuck has come no further from the axis (by `PROGRESS`), in s; 0: no
+            base: Index of the robot's torso in the plant.
+            period: Period of its checks, in s.
+            patience: For how long a robot that is stuck has come no further from the axis (by `PROGRESS`), in s; 0: no
                 robot is stuck.
         """
         super().__init__()

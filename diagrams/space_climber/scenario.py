@@ -14,13 +14,7 @@ from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
-from vtbdrake.testbed import (
-    Interface,
-    Scenario,
-    ScenarioError,
-    Signal,
-    VirtualTestbedBuilder,
-)
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.gait import GAITS
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
@@ -71,16 +65,13 @@ class SpaceClimberScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        checks = {
-            "gravity": (self.gravity > 0.0, "positive, in m/s^2"),
-            "slope_deg": (abs(self.slope_deg) <= 45.0, "within 45 deg"),
-            "friction": (self.friction >= 0.0, "not negative"),
-            "gait": (self.gait in GAITS, f"one of {', '.join(GAITS)}"),
-            "period": (self.period > 0.0, "positive, in s"),
-        }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ScenarioError(f"SpaceClimberScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        self.require(
+            gravity=(self.gravity > 0.0, "positive, in m/s^2"),
+            slope_deg=(abs(self.slope_deg) <= 45.0, "within 45 deg"),
+            friction=(self.friction >= 0.0, "not negative"),
+            gait=(self.gait in GAITS, f"one of {', '.join(GAITS)}"),
+            period=(self.period > 0.0, "positive, in s"),
+        )
 
     def interface(self) -> Interface:
         m = Morphology()

@@ -213,8 +213,8 @@ def test_switch_to_silent_machine_is_refused(listens, stale):
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"sense": {"nose": "real"}}, "no sensor signal 'nose'"),
-        ({"act": {"nose": "sim"}}, "no actuator signal 'nose'"),
+        ({"sense": {"nose": "real"}}, "T_sense has no signal 'nose'"),
+        ({"act": {"nose": "sim"}}, "T_act has no signal 'nose'"),
         ({"sense": "twin"}, "sim, real, not to 'twin'"),
         ({"act": {"velocity": "up"}}, "sim, real, twin, not to 'up'"),
         ({"mode": "real", "act": "sim"}, "not both"),

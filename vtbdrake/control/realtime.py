@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import NoReturn, Self
 
 from vtbdrake.control import runaway
@@ -136,9 +136,7 @@ class RealTime:
             self._undo = undo.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._undo.close()
 
     def __str__(self) -> str:
@@ -203,13 +201,17 @@ def _locked_memory() -> Iterator[None]:
     was_locked = _locked_kilobytes() > 0
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
-        error = ctypes.get_errno()
-        raise OSError(error, os.strerror(error))
+        raise _last_error()
     try:
         yield
     finally:
         if not was_locked:
             libc.munlockall()
+
+
+def _last_error() -> OSError:
+    number = ctypes.get_errno()
+    return OSError(number, os.strerror(number))
 
 
 def _locked_kilobytes() -> int:
@@ -249,8 +251,7 @@ def _timer_slack() -> Iterator[None]:
     libc = ctypes.CDLL(None, use_errno=True)
     before = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
     if before < 0 or libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0) != 0:
-        error = ctypes.get_errno()
-        raise OSError(error, os.strerror(error))
+        raise _last_error()
     try:
         yield
     finally:

@@ -12,8 +12,8 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.stepping import SWITCH
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
-from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM
-from vtbdrake.testbed.testbed import MODES, check_mode
+from vtbdrake.testbed.switch import REAL, SIM
+from vtbdrake.testbed.testbed import Positions, wanted_positions
 
 if TYPE_CHECKING:
     from vtbdrake.control.runtime import Runtime
@@ -39,8 +39,8 @@ def prepare(
     runtime: Runtime,
     mode: str | None = None,
     *,
-    sense: str | Mapping[str, str] | None = None,
-    act: str | Mapping[str, str] | None = None,
+    sense: Positions = None,
+    act: Positions = None,
 ) -> Preparation:
     """Collect the reasons against a switch; `Runtime.prepare` calls this.
 
@@ -52,14 +52,7 @@ def prepare(
         ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
     """
     target = runtime.target
-    if mode is not None:
-        check_mode(mode)
-        if sense is not None or act is not None:
-            raise ValueError(f"give either the mode ({mode}) or the positions of a side, not both")
-        sense, act = MODES[mode]
-    interface = target.interface
-    senses = _positions("sensor", sense, [signal.name for signal in interface.sense], SENSE_POSITIONS)
-    acts = _positions("actuator", act, [signal.name for signal in interface.act], ACT_POSITIONS)
+    senses, acts = wanted_positions(target.interface, mode, sense, act)
     if isinstance(target, DpsAlone) and any(position != REAL for position in [*senses.values(), *acts.values()]):
         raise ValueError("the DPS alone has no simulated world: it can be switched to real only")
     now = runtime.clock.now()
@@ -85,20 +78,6 @@ def prepare(
         reasons += discontinuities(runtime, becoming)
 
     return Preparation(senses, acts, tuple(reasons), runtime.cycles)
-
-
-def _positions(
-    kind: str, wanted: str | Mapping[str, str] | None, names: list[str], positions: tuple[str, ...]
-) -> dict[str, str]:
-    if wanted is None:
-        return {}
-    given = dict.fromkeys(names, wanted) if isinstance(wanted, str) else dict(wanted)
-    for name, position in given.items():
-        if name not in names:
-            raise ValueError(f"there is no {kind} signal {name!r} to switch; there are: {', '.join(names)}")
-        if position not in positions:
-            raise ValueError(f"the {kind} signal {name} goes to one of {', '.join(positions)}, not to {position!r}")
-    return given
 
 
 def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, float]]) -> None:

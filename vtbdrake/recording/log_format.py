@@ -21,6 +21,7 @@ from vtbdrake.control.stepping import Change
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake.testbed.addressed import record_differences
 from vtbdrake.testbed.scenario_file import is_imported
 
 VERSION = 3
@@ -258,15 +259,7 @@ class LogHeader:
         Raises:
             LogError: Another one was recorded, or another version of it; the error lists the differences.
         """
-        mine = scenario_record(scenario)
-        keys = ["scenario"] if mine.get("scenario") != self.record.get("scenario") else sorted({*mine, *self.record})
-        missing = object()
-        differing = [
-            f"{key}: {self.record.get(key, 'nothing')!r} in the log, {mine.get(key, 'nothing')!r} here"
-            for key in keys
-            if mine.get(key, missing) != self.record.get(key, missing)
-        ]
-        if differing:
+        if differing := record_differences(self.record, scenario_record(scenario), where="in the log"):
             raise LogError(f"the log is of another scenario, or of another version of it ({'; '.join(differing)})")
 
 

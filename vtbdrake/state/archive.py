@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,33 +25,19 @@ class ArchiveError(ValueError):
     """A file that is damaged, or of another kind."""
 
 
-def write_archive(
-    path: str | os.PathLike[str],
-    *,
-    kind: str,
-    version: int,
-    header: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-) -> None:
-    """Write ``arrays`` and ``header`` (plain data) as a file of ``kind``.
+def write_archive(path: str | os.PathLike[str], **parts: Any) -> None:
+    """Write a file, whole or not at all; ``parts`` are the arguments of `archive_bytes`."""
+    with whole_file(path) as partial:
+        partial.write_bytes(archive_bytes(**parts))
+
+
+def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return an archive of ``kind`` with ``arrays`` and ``header`` (plain data).
 
     Raises:
         ValueError: They would not be read again, see `read_archive`.
     """
-    with whole_file(path) as partial, partial.open("wb") as file:
-        _write(file, kind, version, header, arrays)
-
-
-def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return the bytes that `write_archive` writes."""
-    buffer = io.BytesIO()
-    _write(buffer, kind, version, header, arrays)
-    return buffer.getvalue()
-
-
-def _write(
-    file: IO[bytes], kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-) -> None:
+    file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_HEADER, json.dumps({"kind": kind, "version": version, "arrays": len(arrays), **header}))
         for key, value in arrays.items():
@@ -63,6 +49,7 @@ def _write(
             f"{size} bytes that can be packed into {file.tell()} would be rejected as a compression bomb: save "
             "less at once"
         )
+    return file.getvalue()
 
 
 def _most(packed: int) -> int:

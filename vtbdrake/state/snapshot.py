@@ -293,10 +293,4 @@ class StateCopier:
 
 def _is_empty(system: System) -> bool:
     context = system.CreateDefaultContext()
-    return bool(
-        context.num_continuous_states() == 0
-        and context.num_discrete_state_groups() == 0
-        and context.num_abstract_states() == 0
-        and context.num_numeric_parameter_groups() == 0
-        and context.num_abstract_parameters() == 0
-    )
+    return not (any(numeric_groups(context)) or context.num_abstract_states() or context.num_abstract_parameters())

@@ -111,12 +111,12 @@ def group_size(context: Context, group: str, index: int) -> int:
 
 
 def read_group(context: Context, group: str, index: int) -> np.ndarray:
-    """Return a copy of a numeric group of a leaf context."""
+    """Return a copy of a numeric group of a leaf context, of any scalar."""
     if group == CONTINUOUS:
-        return np.array(context.get_continuous_state_vector().CopyToVector())
-    if group == DISCRETE:
-        return np.array(context.get_discrete_state(index).value())
-    return np.array(context.get_numeric_parameter(index).value())
+        vector = context.get_continuous_state_vector()
+    else:
+        vector = context.get_discrete_state(index) if group == DISCRETE else context.get_numeric_parameter(index)
+    return vector.CopyToVector()
 
 
 def write_group(context: Context, group: str, index: int, value: np.ndarray) -> None:

@@ -257,25 +257,14 @@ class AddressedDiagram:
         return snapshots.take(self.diagram, context, self._variables, scenario=record)
 
     def check_scenario(self, snapshot: Snapshot) -> None:
-        """Raise a SnapshotError if the snapshot is of another scenario, or no snapshot.
-
-        Raises:
-            SnapshotError: The snapshot is none, or is of another scenario.
-        """
+        """Raise a SnapshotError if the snapshot is of another scenario, or no snapshot."""
         if not isinstance(snapshot, Snapshot):
             raise SnapshotError(
                 f"a state is restored from a snapshot, by Snapshot.load(file), say, not from {snapshot!r}"
             )
         if self.scenario is None or not snapshot.scenario:
             return
-        mine, theirs = self.scenario.record(), snapshot.scenario
-        keys = ["scenario"] if theirs["scenario"] != mine["scenario"] else [*mine, *(theirs.keys() - mine.keys())]
-        differing = [
-            f"{key}: {theirs.get(key, 'nothing')!r} there, {mine.get(key, 'nothing')!r} here"
-            for key in keys
-            if key not in mine or key not in theirs or mine[key] != theirs[key]
-        ]
-        if differing:
+        if differing := record_differences(snapshot.scenario, self.scenario.record(), where="there"):
             raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
 
     def copier_from(self, source: AddressedDiagram) -> StateCopier:
@@ -306,6 +295,17 @@ class AddressedDiagram:
         """Return the paths of the systems that are written in Python and have work to do while time runs."""
         # The board of the switches has no work to do.
         return tuple(path for path, system in leaves(self.diagram) if is_python(system) and path != BOARD)
+
+
+def record_differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], *, where: str) -> list[str]:
+    """Return how a scenario's record differs from that of this one, each as a phrase; ``where`` is where it stands."""
+    keys = ["scenario"] if theirs.get("scenario") != mine.get("scenario") else dict.fromkeys([*mine, *theirs])
+    nothing = object()
+    return [
+        f"{key}: {theirs.get(key, 'nothing')!r} {where}, {mine.get(key, 'nothing')!r} here"
+        for key in keys
+        if theirs.get(key, nothing) != mine.get(key, nothing)
+    ]
 
 
 def is_dps(path: str) -> bool:

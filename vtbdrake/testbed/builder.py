@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 from numpy.typing import ArrayLike
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 ROLES = ("sense", "sys", "act", "env")
 S = TypeVar("S", bound=System)
+P = TypeVar("P", InputPort, OutputPort)
 
 
 # Systems of Drake that copies of a context cannot continue, and what to use instead.
@@ -141,32 +142,21 @@ class VirtualTestbedBuilder:
 
     def sim_sensor(self, name: str, port: OutputPort) -> None:
         """Offer ``port`` as the simulated sensor signal ``name``."""
-        self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort).check_port(port, _owner(port))
-        self.sensors[name] = port
+        self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort)
 
     def sim_actuator(self, name: str, port: InputPort) -> None:
         """Lead the actuator signal ``name`` to ``port`` of the simulated world."""
-        self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort).check_port(
-            port, _owner(port)
-        )
-        self.actuators[name] = port
+        self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort)
 
     def command(self, name: str, port: OutputPort) -> None:
         """Take the command ``name`` from ``port``, instead of the variable ``u.<name>``."""
-        self._claim(self.interface.commands, name, "command", self._commands, port, OutputPort).check_port(
-            port, _owner(port)
-        )
-        self._commands[name] = port
+        self._claim(self.interface.commands, name, "command", self._commands, port, OutputPort)
 
     @staticmethod
     def _claim(
-        signals: Sequence[Signal],
-        name: str,
-        kind: str,
-        taken: Mapping[str, object],
-        port: InputPort | OutputPort,
-        kind_of_port: type,
-    ) -> Signal:
+        signals: Sequence[Signal], name: str, kind: str, taken: dict[str, P], port: P, kind_of_port: type[P]
+    ) -> None:
+        """Check that ``port`` can carry the signal ``name``, which has no port yet, and add it to ``taken``."""
         known = {signal.name: signal for signal in signals}
         if name not in known:
             raise SignalError(f"the interface has no {kind} signal {name!r}; it has: {', '.join(known) or 'none'}")
@@ -174,7 +164,8 @@ class VirtualTestbedBuilder:
             raise SignalError(f"the {kind} signal {name} takes an {kind_of_port.__name__} of a system, not {port!r}")
         if name in taken:
             raise SignalError(f"two ports are given for the {kind} signal {name}")
-        return known[name]
+        known[name].check_port(port, str(port.get_system().get_name()))
+        taken[name] = port
 
     def set_dps(self, dps: S) -> S:
         """Add the data processing system: one System whose ports have the names of the interface's signals."""
@@ -335,7 +326,3 @@ class VirtualTestbedBuilder:
                 raise ValueError(f"the plant has no model instance {name}; it has: {', '.join(roles)}")
             roles[name] = role
         return roles
-
-
-def _owner(port: InputPort | OutputPort) -> str:
-    return str(port.get_system().get_name())

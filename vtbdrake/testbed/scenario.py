@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -134,6 +135,20 @@ class Scenario(ABC):
                 f"{name}.simulator_config.start_time must be 0, not {config.start_time} s: a simulation starts at the "
                 "time of its Context, which you can set"
             )
+
+    def require(self, **checks: tuple[bool, str]) -> None:
+        """Check fields in `validate` of a subclass.
+
+        Args:
+            checks: Field -> whether its value is good, and what it must be, in words. Nested fields have dotted names.
+
+        Raises:
+            ScenarioError: A value is not good; the error has all of that.
+        """
+        for name, (good, expected) in checks.items():
+            if not good:
+                value = attrgetter(name)(self)
+                raise ScenarioError(f"{type(self).__name__}.{name} must be {expected}, not {value!r}")
 
     def build(self, *, mode: str = "sim", meshcat: Meshcat | None = None, prefix: str = "") -> VirtualTestbed:
         """Build a new testbed.

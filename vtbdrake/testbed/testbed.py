@@ -14,11 +14,12 @@ from pydrake.systems.framework import Context, Diagram, System
 from vtbdrake.state import Snapshot, SnapshotError, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, T_SENSE, TWIN, Selector
+from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, TWIN
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.builder import VirtualTestbedBuilder
     from vtbdrake.testbed.scenario import Scenario
+    from vtbdrake.testbed.signal import Interface
     from vtbdrake.testbed.switch import Switches
 
 
@@ -73,14 +74,43 @@ class BeliefRule:
 MODES = {"sim": (SIM, SIM), "shadow": (REAL, SIM), "real": (REAL, REAL), "twin": (REAL, TWIN)}
 
 
-def check_mode(mode: str) -> None:
-    """Raise a ValueError if ``mode`` is not a mode of a testbed.
+Positions = str | Mapping[str, str] | None
+"""Wanted positions of one side's switches: of all signals, or by signal; None changes nothing."""
 
-    Raises:
-        ValueError: ``mode`` is not a mode of a testbed.
-    """
+
+def check_mode(mode: str) -> None:
+    """Raise a ValueError if ``mode`` is not a mode of a testbed."""
     if mode not in MODES:
         raise ValueError(f"a testbed's mode is one of {', '.join(MODES)}, not {mode!r}")
+
+
+def wanted_positions(
+    interface: Interface, mode: str | None, sense: Positions, act: Positions
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the wanted positions of the sensor and of the actuator signals, by signal.
+
+    Raises:
+        ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
+    """
+    if mode is not None:
+        check_mode(mode)
+        if sense is not None or act is not None:
+            raise ValueError(f"give either the mode ({mode}) or the positions of a side, not both")
+        sense, act = MODES[mode]
+    wanted: list[dict[str, str]] = []
+    for side, given, signals, positions in (
+        ("T_sense", sense, interface.sense, SENSE_POSITIONS),
+        ("T_act", act, interface.act, ACT_POSITIONS),
+    ):
+        names = [signal.name for signal in signals]
+        by_signal = dict.fromkeys(names, given) if isinstance(given, str) else dict(given or {})
+        for name, position in by_signal.items():
+            if name not in names:
+                raise ValueError(f"{side} has no signal {name!r}; it has: {', '.join(names)}")
+            if position not in positions:
+                raise ValueError(f"{side}.{name} goes to one of {', '.join(positions)}, not to {position!r}")
+        wanted.append(by_signal)
+    return wanted[0], wanted[1]
 
 
 class VirtualTestbed(AddressedDiagram):
@@ -150,8 +180,8 @@ class VirtualTestbed(AddressedDiagram):
         context: Context,
         mode: str | None = None,
         *,
-        sense: str | Mapping[str, str] | None = None,
-        act: str | Mapping[str, str] | None = None,
+        sense: Positions = None,
+        act: Positions = None,
     ) -> None:
         """Throw switches, at any time.
 
@@ -168,18 +198,9 @@ class VirtualTestbed(AddressedDiagram):
                 or its value is NaN or does not fit. Then no switch has been thrown.
         """
         self.check_context(context)
-        if mode is not None:
-            check_mode(mode)
-            if sense is not None or act is not None:
-                raise ValueError(f"give either the mode ({mode}) or the positions of a side, not both")
-            sense, act = MODES[mode]
-        changes = [
-            *self._changes("T_sense", self._sense, SENSE_POSITIONS, sense),
-            *self._changes("T_act", self._act, ACT_POSITIONS, act),
-        ]
-        for selector, position in changes:
-            name = selector.name.removeprefix(T_SENSE)
-            if name != selector.name and position == REAL:
+        senses, acts = wanted_positions(self.interface, mode, sense, act)
+        for name, position in senses.items():
+            if position == REAL:
                 port = self.diagram.GetInputPort(f"real.sense.{name}")
                 if not port.HasValue(context):
                     raise ValueError(
@@ -187,22 +208,9 @@ class VirtualTestbed(AddressedDiagram):
                         "its switch is thrown to real"
                     )
                 self._signals[name].check_value(port.Eval(context))
-        for selector, position in changes:
-            selector.set(context, position)
-
-    @staticmethod
-    def _changes(
-        side: str, selectors: Mapping[str, Selector], positions: tuple[str, ...], wanted: str | Mapping[str, str] | None
-    ) -> list[tuple[Selector, str]]:
-        if wanted is None:
-            return []
-        by_signal = dict.fromkeys(selectors, wanted) if isinstance(wanted, str) else wanted
-        for name, position in by_signal.items():
-            if name not in selectors:
-                raise ValueError(f"{side} has no signal {name!r}; it has: {', '.join(selectors)}")
-            if position not in positions:
-                raise ValueError(f"{side}.{name} goes to one of {', '.join(positions)}, not to {position!r}")
-        return [(selectors[name], position) for name, position in by_signal.items()]
+        for selectors, positions in ((self._sense, senses), (self._act, acts)):
+            for name, position in positions.items():
+                selectors[name].set(context, position)
 
     # -- s(t) as a whole
 
