@@ -18,7 +18,7 @@ from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import failed
-from vtbdrake.rollout.start import Start
+from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
 
@@ -48,14 +48,14 @@ class DaskExecutor(Executor):
     that fails too, it is a failed result. Without any worker left, the executor waits for new ones.
 
     Args:
-        client: a client of the cluster, which stays open, or the address of the scheduler; by default the address in
+        client: A client of the cluster, which stays open, or the address of the scheduler; by default the address in
             the environment variable ``DASK_SCHEDULER_ADDRESS``.
-        time_limit: the wall time for one rollout, in seconds, without building its testbed.
-        in_flight: the number of rollouts that the cluster has at a time; by default twice its threads.
+        time_limit: The wall time for one rollout, in seconds, without building its testbed.
+        in_flight: The number of rollouts that the cluster has at a time; by default twice its threads.
 
     Raises:
-        ValueError: no scheduler is given.
-        WorkerError: the scheduler does not answer.
+        ValueError: No scheduler is given.
+        WorkerError: The scheduler does not answer.
     """
 
     cancels = False
@@ -77,19 +77,8 @@ class DaskExecutor(Executor):
         self._sent: OrderedDict[str, str] = OrderedDict()
 
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point; see `Executor.run`.
-
-        Raises:
-            ValueError: there is a ``cutoff``, which needs processes of our own.
-            WorkerError: the task cannot be sent to the workers, or the scheduler is lost.
-        """
         if cutoff is not None:
             raise ValueError("a Dask cluster cannot cancel rollouts: use executor='processes'")
         name = self._send(self._pickler.pickle(task))

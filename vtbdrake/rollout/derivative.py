@@ -37,10 +37,10 @@ class DerivativeRunner:
 
     Args:
         task: The rollout. Its threshold is ignored.
-        testbed: built from the task's scenario, of systems that convert to AutoDiffXd.
+        testbed: Built from the task's scenario, of systems that convert to AutoDiffXd.
 
     Raises:
-        DerivativeError: a system does not convert, or the integrator controls its error.
+        DerivativeError: A system does not convert, or the integrator controls its error.
     """
 
     def __init__(self, task: RolloutTask, testbed: VirtualTestbed) -> None:
@@ -74,15 +74,15 @@ class DerivativeRunner:
         """Run one rollout with derivatives.
 
         Args:
-            parameters: address -> value, set in s0.
-            by: the n addresses of the parameters of the derivatives.
+            parameters: Address -> value, set in s0.
+            by: The n addresses of the parameters of the derivatives.
 
         Returns:
             The number that the quality is read as, and its derivatives, shape (n,).
 
         Raises:
-            DerivativeError: a parameter is not part of the numeric groups of the context.
-            RuntimeError: the simulation fails.
+            DerivativeError: A parameter is not part of the numeric groups of the context.
+            RuntimeError: The simulation fails.
         """
         context = self._start(parameters)
         directions = {address: self._direction(parameters, address) for address in by}
@@ -150,7 +150,7 @@ class DerivativeRunner:
         for path, system, converted in self._pairs:
             leaf = system.GetMyMutableContextFromRoot(context)
             for group, index in numeric_groups(leaf):
-                entries = _entries(converted.GetMyContextFromRoot(seeded), group, index)
+                entries = read_group(converted.GetMyContextFromRoot(seeded), group, index)
                 key = (path, group, index)
                 values[key] = ExtractValue(entries).ravel()
                 gradient = ExtractGradient(entries)
@@ -185,11 +185,3 @@ class DerivativeRunner:
             return value, np.trapezoid(slopes, times, axis=0)
         # Envelope theorem: at the best time f is stationary in time, or the time is an end.
         return value, slopes[int(np.flatnonzero(times == t)[0])]
-
-
-def _entries(leaf: Any, group: str, index: int) -> np.ndarray:
-    if group == "continuous":
-        return np.array(leaf.get_continuous_state_vector().CopyToVector())
-    if group == "discrete":
-        return np.array(leaf.get_discrete_state(index).CopyToVector())
-    return np.array(leaf.get_numeric_parameter(index).CopyToVector())

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
-from types import TracebackType
 from typing import Any, Self
 
 from tqdm.auto import tqdm
@@ -22,12 +21,14 @@ from tqdm.auto import tqdm
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
-from vtbdrake.rollout.start import Start, start_of_each
+from vtbdrake.rollout.start import Start, Starts, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
 Parameters = Mapping[str, Any]
+
+_log = logging.getLogger(__name__)
 
 NAMES = ("auto", "serial", "threads", "processes", "dask")
 
@@ -48,19 +49,14 @@ class Executor(ABC):
     rollout. A task is known by its identity: hand in the same object each time.
 
     Attributes:
-        cancels: whether it takes a `Cutoff`.
+        cancels: Whether it takes a `Cutoff`.
     """
 
     cancels: bool = True
 
     @abstractmethod
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Run one rollout per point, and yield (index of the point, result) as they finish.
 
@@ -70,14 +66,16 @@ class Executor(ABC):
         the scenario refuses, is raised, and ends the others.
 
         Args:
-            task: what the rollouts have in common.
-            points: one per rollout.
-            start: where the rollouts begin, instead of the task's own s0: one start for all, or one for each point.
+            task: What the rollouts have in common.
+            points: One per rollout.
+            start: Where the rollouts begin, instead of the task's own s0: one start for all, or one for each point.
                 It is the cheap way to begin elsewhere: nothing is built, and only the start is sent to the workers.
-            cutoff: ends rollouts early. Those that its deadline cancels are not yielded.
+            cutoff: Ends rollouts early. Those that its deadline cancels are not yielded.
 
         Raises:
-            ValueError: there is a ``cutoff``, and the executor cannot cancel rollouts (see ``cancels``).
+            ValueError: There is a ``cutoff``, and the executor cannot cancel rollouts (see ``cancels``).
+            WorkerError: The task cannot be sent to the workers, they are lost or take no more work, or the executor
+                has not finished another call.
         """
 
     def close(self) -> None:
@@ -87,9 +85,7 @@ class Executor(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -97,20 +93,15 @@ class SerialExecutor(Executor):
     """One rollout after another, in this thread.
 
     Args:
-        testbed: is used where it is the task's; others are built.
-        kept: how many testbeds are kept, for points with different scenario fields.
+        testbed: Is used where it is the task's; others are built.
+        kept: How many testbeds are kept, for points with different scenario fields.
     """
 
     def __init__(self, testbed: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
         self._runners = Runners(Testbeds(testbed, kept=kept))
 
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
         starts = start_of_each(start, len(points))
         for index, (point, begins) in enumerate(zip(points, starts, strict=True)):
@@ -143,9 +134,9 @@ class ThreadExecutor(Executor):
     The fastest where all systems are Drake's: a system in Python makes the threads wait for each other.
 
     Args:
-        workers: how many threads; the number of cores if left out.
-        testbed: is used where it is the task's; others are built.
-        kept: how many testbeds are kept, for points with different scenario fields.
+        workers: How many threads; the number of cores if left out.
+        testbed: Is used where it is the task's; others are built.
+        kept: How many testbeds are kept, for points with different scenario fields.
     """
 
     def __init__(self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, kept: int = KEPT) -> None:
@@ -157,12 +148,7 @@ class ThreadExecutor(Executor):
         weakref.finalize(self, _stop, self._jobs, self._threads)
 
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
         starts = start_of_each(start, len(points))
         if len(points) == 1:  # Without the cost of another thread.
@@ -224,15 +210,12 @@ def checked_workers(workers: int | None) -> int:
     """Return the number of workers; the number of cores if ``workers`` is None.
 
     Raises:
-        ValueError: there are none, or it is no number.
+        ValueError: There are none, or it is no number.
     """
     count = cores() if workers is None else as_whole("the number of workers", workers)
     if count < 1:
         raise ValueError(f"an executor needs at least one worker, not {workers}")
     return count
-
-
-_log = logging.getLogger(__name__)
 
 
 def run_rollouts(
@@ -293,13 +276,13 @@ def make_executor(
     Args:
         executor: ``auto``, ``serial``, ``threads``, ``processes`` or ``dask``; an Executor of ours; any
             `concurrent.futures.Executor`; or a `distributed.Client`.
-        testbed: the testbed of the rollouts; serial rollouts and threads use it.
-        rollouts: the number of rollouts; a single one is run in this thread.
-        workers: the number of threads or processes; by default the number of cores.
-        time_limit: the longest wall time of one rollout, in seconds; only processes and Dask can end one.
+        testbed: The testbed of the rollouts; serial rollouts and threads use it.
+        rollouts: The number of rollouts; a single one is run in this thread.
+        workers: The number of threads or processes; by default the number of cores.
+        time_limit: The longest wall time of one rollout, in seconds; only processes and Dask can end one.
 
     Raises:
-        ValueError: the executor is unknown, or cannot use ``workers`` or ``time_limit``.
+        ValueError: The executor is unknown, or cannot use ``workers`` or ``time_limit``.
     """
     if executor == "auto":
         alone = min(rollouts, checked_workers(workers)) <= 1

@@ -25,7 +25,7 @@ from vtbdrake.rollout.pickled_task import (
 )
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import Runners, Testbeds, failed
-from vtbdrake.rollout.start import Start
+from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
@@ -47,8 +47,8 @@ class FuturesExecutor(Executor):
     returns ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` says how many run at a time.
 
     Args:
-        pool: the pool that runs the rollouts.
-        in_flight: the number of rollouts that the pool has at a time; by default twice its workers, so that none waits.
+        pool: The pool that runs the rollouts.
+        in_flight: The number of rollouts that the pool has at a time; by default twice its workers, so that none waits.
             An interruption takes back what has not begun; what runs goes on to its end.
     """
 
@@ -63,19 +63,8 @@ class FuturesExecutor(Executor):
         self._rescue: ProcessExecutor | None = None
 
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point; see `Executor.run`.
-
-        Raises:
-            ValueError: there is a ``cutoff``, which needs processes of our own.
-            WorkerError: the task cannot be sent to another process, or the pool takes no more work.
-        """
         if cutoff is not None:
             raise ValueError("a pool of concurrent.futures cannot cancel rollouts: use executor='processes'")
         pickled = self._pickler.pickle(task)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
-from vtbdrake.rollout.start import Start, start_of_each
+from vtbdrake.rollout.start import Start, Starts, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 KEPT_TASKS = 16
@@ -23,8 +23,8 @@ class PickledTask:
     """A pickled task.
 
     Attributes:
-        content: the bytes, which `unpack` reads.
-        digest: a digest of the content.
+        content: The bytes, which `unpack` reads.
+        digest: A digest of the content.
     """
 
     content: bytes
@@ -41,7 +41,7 @@ class TaskPickler:
         """Return the pickled task. A task is known by its identity.
 
         Raises:
-            WorkerError: it cannot be pickled.
+            WorkerError: It cannot be pickled.
         """
         if id(task) not in self._pickled:
             self._pickled[id(task)] = (task, _pickle(task))
@@ -67,7 +67,7 @@ def pack(point: Mapping[str, Any]) -> bytes:
     """Return a point (address -> value) as bytes, which `unpack` reads.
 
     Raises:
-        WorkerError: a value cannot be pickled.
+        WorkerError: A value cannot be pickled.
     """
     try:
         return dumps(dict(point))
@@ -83,13 +83,13 @@ def pack(point: Mapping[str, Any]) -> bytes:
         raise
 
 
-def pack_starts(start: Start | Sequence[Start] | None, count: int) -> list[bytes]:
+def pack_starts(start: Starts, count: int) -> list[bytes]:
     """Return the start of each of ``count`` rollouts as bytes, for `unpack_start`; the task's own s0 is empty.
 
     A start that several rollouts share is the same object for all of them.
 
     Raises:
-        StartError: it is no start, or there are too many or too few.
+        StartError: It is no start, or there are too many or too few.
     """
     starts = start_of_each(start, count)
     packed = {one: pickle.dumps(one) if one is not None else b"" for one in dict.fromkeys(starts)}
@@ -106,7 +106,7 @@ def unpack(content: bytes) -> Any:
     """Return an object that was pickled in another process.
 
     Raises:
-        WorkerError: this process cannot import what the content needs.
+        WorkerError: This process cannot import what the content needs.
     """
     try:
         return pickle.loads(content)

@@ -19,9 +19,9 @@ class Cutoff:
     """What is known only when rollouts are begun, and ends them early.
 
     Attributes:
-        deadline: by `time.monotonic`, which all processes of a computer share. A rollout that is not finished then is
-            cancelled at its next sample, and has no result.
-        to_beat: a value of the task's quality, in the user's terms. A rollout of a task with `Pruning` ends when it
+        deadline: When, by `time.monotonic`, which all processes of a computer share. A rollout that is not finished
+            then is cancelled at its next sample, and has no result.
+        to_beat: A value of the task's quality, in the user's terms. A rollout of a task with `Pruning` ends when it
             can no longer be better. NaN: none.
     """
 
@@ -44,14 +44,14 @@ class Pruning:
     ``patience`` seconds. This is an assumption: that nothing would be gained later.
 
     Attributes:
-        bound: function (remaining time in seconds, values of ``of``...) that returns the best f (or the lowest cost)
+        bound: Function (remaining time in seconds, values of ``of``...) that returns the best f (or the lowest cost)
             that is still possible, now and later. It must be optimistic. None: `Quality.upper`, or 0 for a cost.
-        of: addresses of variables or vector output ports.
-        patience: in seconds of simulated time; for qualities that are read as ``best``.
-        gain: what counts as gained, in the unit of the quality: more than this over the last gain.
+        of: Addresses of variables or vector output ports.
+        patience: Seconds of simulated time; for qualities that are read as ``best``.
+        gain: What counts as gained, in the unit of the quality: more than this over the last gain.
 
     Raises:
-        ValueError: a number is out of range, or ``of`` and ``bound`` do not go together.
+        ValueError: A number is out of range, or ``of`` and ``bound`` do not go together.
     """
 
     bound: Callable[..., float] | None = None
@@ -77,14 +77,14 @@ class Prospect:
     """What one rollout can still reach, from sample to sample.
 
     Args:
-        pruning: when it ends.
+        pruning: When it ends.
         quality: f.
-        measures: what else is measured; the constraints among them count.
+        measures: What else is measured; the constraints among them count.
         horizon: t_m in seconds.
-        to_beat: see `Cutoff`.
+        to_beat: See `Cutoff`.
 
     Attributes:
-        reachable: the best value that the rollout can still have, in the user's terms.
+        reachable: The best value that the rollout can still have, in the user's terms.
     """
 
     def __init__(
@@ -109,12 +109,12 @@ class Prospect:
         """Return how and why the rollout ends early with these samples; None if it goes on, or is over anyway.
 
         Args:
-            t: time of the sample in seconds from t0.
-            samples: of f, and of the other measures.
-            values: of the arguments of the bound.
+            t: Time of the sample in seconds from t0.
+            samples: Samples of f, and of the other measures.
+            values: Values of the arguments of the bound.
 
         Raises:
-            QualityError: the bound raises, or returns NaN.
+            QualityError: The bound raises, or returns NaN.
         """
         f = self._sign * samples[0]
         if self._last is not None:

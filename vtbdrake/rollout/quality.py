@@ -40,7 +40,7 @@ def check_reading(reading: str) -> str:
     """Return ``reading``; raise a ValueError if it is unknown.
 
     Raises:
-        ValueError: it is unknown.
+        ValueError: It is unknown.
     """
     if reading not in READINGS:
         raise ValueError(f"a quality over time is read as one of {', '.join(READINGS)}, not {reading!r}")
@@ -56,10 +56,10 @@ class Measure:
     """A function of quality variables, sampled over a rollout and read as one number.
 
     Attributes:
-        f: the function. It gets the quality variables in the order of ``of``, floats or arrays.
+        f: The function. It gets the quality variables in the order of ``of``, floats or arrays.
         of: sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
             DPS's or the simulation's; ``time`` is the simulation's clock.
-        reading: how the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
+        reading: How the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
             time, by the trapezoidal rule). All mean the samples up to where the rollout ends: at t_m, or earlier where
             a threshold is exceeded or a system of the testbed asks for the end; an integral is then one over less time.
     """
@@ -95,8 +95,8 @@ class Measure:
         """Return f of the quality variables.
 
         Args:
-            values: those of the quality variables, in the order of ``of``.
-            time: of the sample, in seconds, for error messages.
+            values: Those of the quality variables, in the order of ``of``.
+            time: Time of the sample, in seconds, for error messages.
 
         Raises:
             QualityError: f raises, or returns something that is not a finite number.
@@ -130,7 +130,7 @@ class Quality(Measure):
 
     Attributes:
         minimize: f is a cost.
-        upper: the most that f can be, if that is known: it lets racing drop a candidate that can no longer win.
+        upper: The most that f can be, if that is known: it lets racing drop a candidate that can no longer win.
     """
 
     minimize: bool = field(default=False, kw_only=True)
@@ -175,8 +175,8 @@ class Constraint(Measure):
     """A condition of a rollout: f(q(t)) is at most, or at least, a limit; by default at every sample time.
 
     Attributes:
-        at_most, at_least: the limits, in the unit of f; one of them or both.
-        reading: see `Measure`; ``worst`` means at every sample time up to where the rollout ends, ``best`` at one.
+        at_most, at_least: The limits, in the unit of f; one of them or both.
+        reading: See `Measure`; ``worst`` means at every sample time up to where the rollout ends, ``best`` at one.
     """
 
     reading: str = field(default="worst", kw_only=True)

@@ -33,7 +33,7 @@ class Check:
     """The findings of `check_rollouts`.
 
     Attributes:
-        findings: one sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
+        findings: One sentence or two each: what is wrong, where, and the remedy. Empty if nothing was found.
         seconds: The simulated time of the checked part of a rollout.
         failure: The reason for which that rollout fails and cannot be checked further; empty if it does not fail.
     """
@@ -60,12 +60,12 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
     """Compare rollouts that must agree: repeated, side by side on one Diagram, and in another process.
 
     Args:
-        task: of the rollouts.
-        testbed: of the task's scenario, on which the rollouts run.
-        points: address -> value; the first is repeated, the last runs beside it. None sets a field of the scenario.
+        task: Task of the rollouts.
+        testbed: Testbed of the task's scenario, on which the rollouts run.
+        points: Address -> value; the first is repeated, the last runs beside it. None sets a field of the scenario.
 
     Raises:
-        QualityError: the quality is wrong, so that nothing can be compared.
+        QualityError: The quality is wrong, so that nothing can be compared.
     """
     point, other = points[0], points[-1]
     reference = list(_within(_BUDGET, _trace(RolloutRunner(task, testbed), point)))

@@ -65,6 +65,10 @@ class Start:
         return cls(context.get_time(), testbed.whole_layout.take(context), values)
 
 
+# Where rollouts begin: one start for all, or one for each; None is the task's own s0.
+Starts = Start | Sequence[Start] | None
+
+
 class Beginning:
     """The context from which the rollouts of one runner begin; it is set to one start after another.
 
@@ -145,7 +149,7 @@ class Beginning:
         }
 
 
-def start_of_each(start: Start | Sequence[Start] | None, count: int) -> list[Start | None]:
+def start_of_each(start: Starts, count: int) -> list[Start | None]:
     """Return the start of each of ``count`` rollouts.
 
     Args:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from math import inf
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, NamedTuple
 
 from vtbdrake.argument_checks import as_number
 from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
@@ -21,7 +21,7 @@ from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds, failed
-from vtbdrake.rollout.start import Start
+from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
 _log = logging.getLogger(__name__)
@@ -47,10 +47,10 @@ class ProcessExecutor(Executor):
     field, leaves memory behind.
 
     Args:
-        workers: the number of processes; by default the number of cores.
-        time_limit: the wall time for one rollout, in seconds.
-        kept: the number of testbeds that each process keeps, for points with different scenario fields.
-        growth: the number of bytes by which the memory of a process may grow after its first rollout.
+        workers: The number of processes; by default the number of cores.
+        time_limit: The wall time for one rollout, in seconds.
+        kept: The number of testbeds that each process keeps, for points with different scenario fields.
+        growth: The number of bytes by which the memory of a process may grow after its first rollout.
     """
 
     def __init__(
@@ -76,18 +76,8 @@ class ProcessExecutor(Executor):
             self._workers.append(_Worker(self._kept, self._growth))
 
     def run(
-        self,
-        task: RolloutTask,
-        points: Sequence[Parameters],
-        *,
-        start: Start | Sequence[Start] | None = None,
-        cutoff: Cutoff | None = None,
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point; see `Executor.run`.
-
-        Raises:
-            WorkerError: the task cannot be sent to another process, or the executor has not finished another call.
-        """
         starts = pack_starts(start, len(points))
         yield from self.run_pickled(self._pickler.pickle(task), points, starts, cutoff=cutoff)
 
@@ -107,19 +97,17 @@ class ProcessExecutor(Executor):
             )
         self._running = True
         try:
-            yield from self._run(task.content, points, starts, cutoff)
+            yield from self._run(_Call(task.content, points, starts, cutoff, deque(range(len(points)))))
         finally:
             self._running = False
 
-    def _run(
-        self, task: bytes, points: Sequence[Parameters], starts: Sequence[bytes], cutoff: Cutoff | None
-    ) -> Iterator[tuple[int, RolloutResult]]:
-        waiting = deque(range(len(points)))
+    def _run(self, call: _Call) -> Iterator[tuple[int, RolloutResult]]:
+        points, cutoff, waiting = call.points, call.cutoff, call.waiting
         losses: dict[int, str] = {}
         error: BaseException | None = None
         self.start(len(points))
         try:
-            self._hand_out(task, waiting, points, starts, cutoff)
+            self._hand_out(call)
             left = len(points)
             while left:
                 finished: list[tuple[int, RolloutResult]] = []
@@ -150,7 +138,7 @@ class ProcessExecutor(Executor):
                     waiting.clear()
                 if error is None:
                     # Workers go on while the caller uses the finished results.
-                    self._hand_out(task, waiting, points, starts, cutoff)
+                    self._hand_out(call)
                 left -= len(finished)
                 yield from finished
                 if error is not None:
@@ -161,43 +149,30 @@ class ProcessExecutor(Executor):
                 self._workers.remove(worker)
                 worker.kill()
 
-    def _hand_out(
-        self,
-        task: bytes,
-        waiting: deque[int],
-        points: Sequence[Parameters],
-        starts: Sequence[bytes],
-        cutoff: Cutoff | None,
-    ) -> None:
+    def _hand_out(self, call: _Call) -> None:
         """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
+        waiting = call.waiting
         for idle in [worker for worker in self._workers if not worker.jobs]:
             worker = self._replace(idle) if waiting and idle.grown else idle
-            while waiting and not self._give(worker, task, waiting, points, starts, cutoff):
+            while waiting and not self._give(worker, call):
                 worker = self._replace(worker)  # It died while it was idle or starting.
         for worker in self._workers:
             if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # `_replies` notices a worker that has died.
-                self._give(worker, task, waiting, points, starts, cutoff)
+                self._give(worker, call)
 
-    def _give(
-        self,
-        worker: _Worker,
-        task: bytes,
-        waiting: deque[int],
-        points: Sequence[Parameters],
-        starts: Sequence[bytes],
-        cutoff: Cutoff | None,
-    ) -> bool:
+    def _give(self, worker: _Worker, call: _Call) -> bool:
         """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
+        waiting, cutoff = call.waiting, call.cutoff
         index = waiting[0]
         limited = self._time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
-        message = (b"L" if limited else b"R") + pickle.dumps((index, pack(points[index]), cutoff))
-        start = starts[index]
+        message = (b"L" if limited else b"R") + pickle.dumps((index, pack(call.points[index]), cutoff))
+        start = call.starts[index]
         if worker.jobs and len(message) + (0 if worker.has(start) else len(start)) > _SMALL:
             return True
         waiting.popleft()
         try:
-            worker.give(task, start, index, message)
+            worker.give(call.task, start, index, message)
         except (OSError, ProcessStartError) as error:
             worker.jobs.pop()
             waiting.appendleft(index)
@@ -250,6 +225,16 @@ class ProcessExecutor(Executor):
         for worker in self._workers:
             worker.kill()
         self._workers.clear()
+
+
+class _Call(NamedTuple):
+    """The rollouts of one call of `ProcessExecutor.run`."""
+
+    task: bytes
+    points: Sequence[Parameters]
+    starts: Sequence[bytes]
+    cutoff: Cutoff | None
+    waiting: deque[int]  # indices of the points that no worker has got
 
 
 class _Worker:
@@ -310,7 +295,7 @@ def checked_time_limit(time_limit: float) -> float:
     """Return a time limit in seconds as a float.
 
     Raises:
-        ValueError: it is not positive.
+        ValueError: It is not positive.
     """
     time_limit = as_number("the time limit", time_limit)
     if not time_limit > 0.0:
@@ -329,9 +314,9 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
     before an answer.
 
     Args:
-        parent: the connection to the executor.
-        kept: the number of testbeds to keep.
-        growth: the number of bytes by which the memory may grow after the first rollout.
+        parent: The connection to the executor.
+        kept: The number of testbeds to keep.
+        growth: The number of bytes by which the memory may grow after the first rollout.
     """
     report_ready(parent)
     connection = Connection(parent.detach())
