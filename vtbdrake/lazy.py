@@ -1,4 +1,4 @@
-"""Packages that import their public names when these are first used."""
+"""Packages that import their public names when these are first used, and modules of extras."""
 
 import ast
 import sys
@@ -33,3 +33,16 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], Any], Callable[
         return sorted({*vars(sys.modules[package]), *homes})
 
     return getattr_, dir_, sorted(homes)
+
+
+def extra_module(name: str, *, purpose: str, extra: str) -> Any:
+    """Return a module that an extra of vtbdrake installs.
+
+    Raises:
+        ModuleNotFoundError: It is not installed; the error names what needs it, and the extra.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        package = name.partition(".")[0]
+        raise ModuleNotFoundError(f"{purpose} needs {package}: pip install 'vtbdrake[{extra}]'") from error

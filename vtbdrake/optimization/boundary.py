@@ -207,7 +207,7 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
         upper=upper,
         by_condition=by_condition,
         examined=(float(values.min()), float(values.max())),
-        gap=max(_widest_gap([value for value, _ in outcomes if value <= lower]) for outcomes in own),
+        gap=max(float(np.diff([v for v, _ in outcomes if v <= lower]).max(initial=0.0)) for outcomes in own),
         step=float(np.diff(np.unique(values)).min(initial=inf)),
         chances=tuple(sorted(chances, key=lambda chance: (chance.value, chance.condition))),
         safe_beyond=_distinct(beyond),
@@ -231,10 +231,6 @@ def _interval(outcomes: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 def _distinct(values: Iterable[float]) -> tuple[float, ...]:
     return tuple(sorted({float(value) for value in values}))
-
-
-def _widest_gap(values: Sequence[float]) -> float:
-    return float(np.diff(values).max(initial=0.0))
 
 
 class Refinement:
@@ -410,25 +406,22 @@ class _Search:
 
     def repeat(self, indices: Sequence[int], *, repeats: int, jitter: float) -> dict[int, list[float]]:
         """Repeat values under all conditions; return index -> the share of unsafe rollouts under each condition."""
-        conditions = range(len(self._problem.conditions))
-        wanted = [(index, condition) for index in indices for condition in conditions]
+        count = len(self._problem.conditions)
+        wanted = [(index, condition) for index in indices for condition in range(count)]
         new = [candidate for candidate in wanted if candidate not in self._counts]
         if new:
             self.examine(new)
-        keys: list[RolloutKey] = []
-        for candidate in wanted:
-            _, condition = candidate
-            keys += [((value,), condition) for value in self._jittered(candidate, repeats, jitter)]
+        keys: list[RolloutKey] = [
+            ((value,), candidate[1]) for candidate in wanted for value in self._jittered(candidate, repeats, jitter)
+        ]
         unsafe = self._roll(keys, self._repeated).reshape(-1, repeats).sum(axis=1)
+        shares = []
         for candidate, more in zip(wanted, unsafe.tolist(), strict=True):
             rollouts, bad = self._counts[candidate]
             self._counts[candidate] = rollouts + repeats, bad + more
+            shares.append((bad + more) / (rollouts + repeats))
         self._chances.update(wanted)
-        return {index: [self._share(index, condition) for condition in conditions] for index in indices}
-
-    def _share(self, index: int, condition: int) -> float:
-        rollouts, unsafe = self._counts[index, condition]
-        return unsafe / rollouts
+        return {index: shares[k * count : (k + 1) * count] for k, index in enumerate(indices)}
 
     def _jittered(self, candidate: Candidate, repeats: int, jitter: float) -> list[float]:
         """Return values beside that of a candidate; the same ones in every search."""

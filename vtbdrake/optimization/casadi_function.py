@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import casadi
@@ -132,18 +133,18 @@ class ProblemFunction(casadi.Callback):
 
     # -- what CasADi calls
 
-    def get_n_in(self) -> int:
-        return 1
-
-    def get_n_out(self) -> int:
-        return 1
-
     def get_sparsity_in(self, i: int) -> casadi.Sparsity:
         return casadi.Sparsity.dense(len(self._problem.parameters), 1)
 
     def eval(self, arg: Sequence[Any]) -> list[Any]:
-        try:
+        with self.kept_error():
             return [self.value(np.array(arg[0]))]
+
+    @contextmanager
+    def kept_error(self) -> Iterator[None]:
+        """Keep the exception of an evaluation for `check`."""
+        try:
+            yield
         except BaseException as error:
             self.error = error
             raise
@@ -169,9 +170,6 @@ class _Jacobian(casadi.Callback):
     def get_n_in(self) -> int:
         return 2
 
-    def get_n_out(self) -> int:
-        return 1
-
     def get_sparsity_in(self, i: int) -> casadi.Sparsity:
         return self._function.sparsity_in(0) if i == 0 else self._function.sparsity_out(0)
 
@@ -179,8 +177,5 @@ class _Jacobian(casadi.Callback):
         return casadi.Sparsity.dense(1, self._function.size1_in(0))
 
     def eval(self, arg: Sequence[Any]) -> list[Any]:
-        try:
+        with self._function.kept_error():
             return [self._function.slope(np.array(arg[0])).reshape(1, -1)]
-        except BaseException as error:
-            self._function.error = error
-            raise

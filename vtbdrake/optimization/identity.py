@@ -36,7 +36,7 @@ def describe(problem: Problem) -> dict[str, Any]:
     task = problem.task
     described = {
         "scenario": problem.scenario.record(),
-        "parameters": [_dimension(parameter) for parameter in problem.parameters],
+        "parameters": [asdict(parameter) for parameter in problem.parameters],
         "qualities": [_measure(quality) for quality in problem.objectives],
         "constraints": [_measure(constraint) for constraint in problem.constraints],
         "conditions": [{key: np.asarray(value).tolist() for key, value in c.items()} for c in problem.conditions],
@@ -70,10 +70,6 @@ def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
             f"a study keeps {what}, which are numbers, words, lists and dicts, not {dict(values)}"
         ) from error
     return found
-
-
-def _dimension(dimension: Dimension) -> dict[str, Any]:
-    return asdict(dimension)
 
 
 def _measure(measure: Quality | Constraint) -> dict[str, Any]:

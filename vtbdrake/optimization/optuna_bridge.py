@@ -6,7 +6,7 @@ import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from vtbdrake.optimization.identity import differences
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, Trial, encode
+from vtbdrake.optimization.study_file import Outcome, StudyError, Trial, encode
 
 if TYPE_CHECKING:
     import optuna
@@ -45,7 +45,9 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
         opened = _open(optuna, storage, but=study.path)
         exported = _exported(optuna, opened, study, name)
         distributions = {parameter.address: _distribution(optuna, parameter) for parameter in study.parameters}
-        there = Counter(_key(t.user_attrs["batch"], t.params) for t in _ours(exported))
+        ours = [t for t in exported.get_trials(deepcopy=False) if "batch" in t.user_attrs]
+        there = Counter(_key(t.user_attrs["batch"], t.params) for t in ours)
+        conditions = range(len(study.record["problem"]["conditions"]))
         new = []
         for trial in trials:
             params = dict(trial.parameters)
@@ -53,7 +55,7 @@ def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.
             if there[key]:
                 there[key] -= 1
             else:
-                rows = [row for row in _rows(trial, study) if row in outcomes]
+                rows = [(trial.point, condition) for condition in conditions if (trial.point, condition) in outcomes]
                 rollouts = [outcomes[row] for row in rows]
                 frozen = _frozen(optuna, trial, params, distributions, rollouts, objectives=len(study.names))
                 _date(frozen, [(outcomes[row].wall_time, finished[row]) for row in rows if row in finished])
@@ -165,16 +167,8 @@ def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> opt
     return found
 
 
-def _ours(exported: optuna.Study) -> Iterator[FrozenTrial]:
-    return (trial for trial in exported.get_trials(deepcopy=False) if "batch" in trial.user_attrs)
-
-
 def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
     return batch, json.dumps(params, sort_keys=True)
-
-
-def _rows(trial: Trial, study: Study) -> Iterable[RolloutKey]:
-    return ((trial.point, condition) for condition in range(len(study.record["problem"]["conditions"])))
 
 
 def _frozen(

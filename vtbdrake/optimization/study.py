@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.solvers import Solver, make_solver
@@ -412,11 +413,9 @@ class Study:
         Raises:
             ModuleNotFoundError: Pandas is not installed.
         """
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("a DataFrame needs pandas: pip install 'vtbdrake[dataframe]'") from error
-        return pandas.DataFrame(self.to_dict(), index=pandas.RangeIndex(len(self.trials), name="number"))
+        pd = extra_module("pandas", purpose="a DataFrame", extra="dataframe")
+        frame: pandas.DataFrame = pd.DataFrame(self.to_dict(), index=pd.RangeIndex(len(self.trials), name="number"))
+        return frame
 
     def summary(self) -> str:
         """Return a text with the progress, the results and the errors."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import all_of, as_whole
+from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
@@ -200,11 +201,8 @@ class Sweep:
 
     def to_dataframe(self) -> DataFrame:
         """Return `to_dict` as a pandas DataFrame."""
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("this needs pandas: pip install 'vtbdrake[dataframe]'") from error
-        return pandas.DataFrame(self.to_dict())
+        frame: DataFrame = extra_module("pandas", purpose="a DataFrame", extra="dataframe").DataFrame(self.to_dict())
+        return frame
 
     def plot(self) -> Figure:
         """Plot h over the parameters (Figure 6); for one parameter also the quality trajectories with t* (Figure 5).

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.control.stepping import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.lazy import extra_module
 from vtbdrake.recording.log_reader import ControlLog
 from vtbdrake.state.archive import whole_file
 
@@ -69,11 +70,9 @@ def _write_csv(log: ControlLog, path: Path) -> None:
 
 
 def _write_parquet(log: ControlLog, path: Path) -> None:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("Parquet needs pyarrow: pip install 'vtbdrake[recording]'") from error
+    pyarrow, parquet = (
+        extra_module(name, purpose="Parquet", extra="recording") for name in ("pyarrow", "pyarrow.parquet")
+    )
     parquet.write_table(pyarrow.table(columns(log)), path)
 
 
@@ -114,12 +113,9 @@ _Entry = tuple[int, str, str, Mapping[str, Any]]  # time in nanoseconds, topic, 
 
 
 def _write_mcap(log: ControlLog, path: Path) -> None:
-    try:
-        from mcap.writer import Writer
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("MCAP needs mcap: pip install 'vtbdrake[recording]'") from error
+    mcap = extra_module("mcap.writer", purpose="MCAP", extra="recording")
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = mcap.Writer(file)
         writer.start(library="vtbdrake")
 
         @cache

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.lazy import extra_module
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, is_number, parse_request, to_json
@@ -320,10 +321,7 @@ class LiveWatch:
         Raises:
             ModuleNotFoundError: Pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("a frame needs pandas: pip install 'vtbdrake[dataframe]'") from error
+        pd = extra_module("pandas", purpose="a frame", extra="dataframe")
         arrays = self.arrays()
         time = arrays.pop("time")
         del arrays["since"]

@@ -49,7 +49,7 @@ def solver_type(method: str | type[Solver]) -> type[Solver]:
     """Return the class of a solver that is given by its name, or itself.
 
     Raises:
-        SolverError: there is no such solver.
+        SolverError: There is no such solver.
     """
     return method if isinstance(method, type) and issubclass(method, Solver) else CATALOGUE[_find(method)]
 
@@ -68,18 +68,18 @@ def make_solver(
     """Return a solver for a problem.
 
     Args:
-        name: one of `known_solvers`, or a class of your own, derived from `Solver`.
-        space: the parameters.
-        objectives: how many values an evaluation has.
-        constraints: how many violations an evaluation has.
-        seed: of the solver's random numbers, in [0, 2^32).
+        name: One of `known_solvers`, or a class of your own, derived from `Solver`.
+        space: The parameters.
+        objectives: How many values an evaluation has.
+        constraints: How many violations an evaluation has.
+        seed: Seed of the solver's random numbers, in [0, 2^32).
         budget: The largest number of evaluations; None: until the solver converges, if it does.
-        start: where a local method starts; None: in the middle of the ranges.
-        options: of the solver, as its class says.
+        start: Where a local method starts; None: in the middle of the ranges.
+        options: Options of the solver, as its class says.
 
     Raises:
-        SolverError: there is no such solver or option, or the solver cannot solve such a problem.
-        ModuleNotFoundError: the solver needs a package that is not installed.
+        SolverError: There is no such solver or option, or the solver cannot solve such a problem.
+        ModuleNotFoundError: The solver needs a package that is not installed.
     """
     factory = solver_type(name)
     canonical = _find(name) if isinstance(name, str) else name.__name__

@@ -223,10 +223,10 @@ class Auto(Solver):
         """Begin a method.
 
         Args:
-            method: its name, for the user.
-            solver: runs it.
-            generation: points per generation of a method that may stall; None: it cannot.
-            limit: the number of points after which it ends.
+            method: Its name, for the user.
+            solver: Runs it.
+            generation: Points per generation of a method that may stall; None: it cannot.
+            limit: The number of points after which it ends.
         """
         self._method = method
         self._held = None

@@ -41,12 +41,12 @@ class Bayesian(Solver):
     rollout takes less, CMA-ES may be the better choice.
 
     Args:
-        search: any parameters (20 at most are reasonable), objectives and constraints.
-        name: in the catalogue.
-        initial: points of the design; by default 2 (n + 1), and half of the budget at most. There is no design if as
+        search: Any parameters (20 at most are reasonable), objectives and constraints.
+        name: Name in the catalogue.
+        initial: Points of the design; by default 2 (n + 1), and half of the budget at most. There is no design if as
             many points were given by hand before.
-        batch: how many points it asks for at a time.
-        memory: how many points the model is fitted to at most: the best ones and the latest.
+        batch: How many points it asks for at a time.
+        memory: How many points the model is fitted to at most: the best ones and the latest.
 
     Jones, D. R., Schonlau, M. and Welch, W. J. (1998): Efficient global optimization of expensive black-box functions,
     J. Global Optimization 13. Knowles, J. (2006): ParEGO, IEEE Trans. Evolutionary Computation 10.

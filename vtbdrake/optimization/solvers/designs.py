@@ -19,9 +19,9 @@ class Design(Solver):
     """A fixed sequence of points, asked for in batches; any parameters, objectives and constraints.
 
     Args:
-        search: what is searched.
-        name: in the catalogue.
-        as_budgeted: whether it goes on until the budget is spent; otherwise it ends with its points.
+        search: What is searched.
+        name: Name in the catalogue.
+        as_budgeted: Whether it goes on until the budget is spent; otherwise it ends with its points.
     """
 
     takes_start = False
@@ -54,13 +54,13 @@ class Grid(Design):
     """All combinations of equally spaced values, both ends included; of integers and choices, all values.
 
     Args:
-        search: what is searched.
-        name: in the catalogue.
-        points: how many values a continuous parameter has: one number for all, one per parameter, or by address. By
+        search: What is searched.
+        name: Name in the catalogue.
+        points: How many values a continuous parameter has: one number for all, one per parameter, or by address. By
             default as many as the budget allows, and 11 without one. By address, it thins out integers too.
 
     Raises:
-        SolverError: the grid is larger than the budget, or ``points`` does not fit the parameters.
+        SolverError: The grid is larger than the budget, or ``points`` does not fit the parameters.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class Sobol(Design):
     Its first points do not depend on the number of points. Numbers of points that are a power of two are balanced.
 
     Args:
-        search: what is searched.
-        name: in the catalogue.
-        points: how many; by default until the budget is spent, or without one the first power of two >= 64 n.
+        search: What is searched.
+        name: Name in the catalogue.
+        points: How many; by default until the budget is spent, or without one the first power of two >= 64 n.
 
     Owen, A. B. (1998): Scrambling Sobol' and Niederreiter-Xing points. Journal of Complexity 14.
     """
@@ -121,8 +121,8 @@ class LatinHypercube(Design):
     """One point in each of N equal slices of every parameter's range, combined at random.
 
     Args:
-        search: what is searched.
-        name: in the catalogue.
+        search: What is searched.
+        name: Name in the catalogue.
         points: N; by default what the budget allows if no point is dropped, or without one the first power of two
             >= 64 n.
 
@@ -146,9 +146,9 @@ class RandomSearch(Design):
     """Independent uniform points: the baseline of every other solver.
 
     Args:
-        search: what is searched.
-        name: in the catalogue.
-        points: how many; by default until the budget is spent, or without one no end.
+        search: What is searched.
+        name: Name in the catalogue.
+        points: How many; by default until the budget is spent, or without one no end.
     """
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:

@@ -120,17 +120,17 @@ class ProgramSolver(BlockingSolver):
     keeps them exactly.
 
     Args:
-        search: continuous parameters, one objective.
-        name: in the catalogue.
+        search: Continuous parameters, one objective.
+        name: Name in the catalogue.
         gradient: ``central`` differences of second order (the default), a point and its 2 n neighbours in one batch;
             ``forward`` differences of first order, n neighbours, with a step that is often too coarse to detect
             convergence; or ``autodiff``: `Evaluation.gradient`, without constraints. None for derivative-free methods.
-        step: of the differences, as a part of each parameter's range; by default 1e-5 (central) or 1e-7 (forward).
+        step: Step of the differences, as a part of each parameter's range; by default 1e-5 (central) or 1e-7 (forward).
             At an end of the range they are taken inwards. Where a neighbour's simulation fails, the derivative in its
             direction counts as 0.
-        tolerance: of convergence, in the solver's own sense (optimality of SNOPT and IPOPT, change of x in NLopt).
-        feasibility: tolerance of the constraints, in their units.
-        solver_options: further options of the solver, by its own names.
+        tolerance: Of convergence, in the solver's own sense (optimality of SNOPT and IPOPT, change of x in NLopt).
+        feasibility: Tolerance of the constraints, in their units.
+        solver_options: Further options of the solver, by its own names.
     """
 
     def __init__(

@@ -29,10 +29,10 @@ class CmaEs(Solver):
     distribution has shrunk to a point or the values of many generations agree; `auto` restarts it.
 
     Args:
-        search: numbers, one objective.
-        name: in the catalogue.
-        population: points per generation, at least 3; by default 4 + floor(3 ln n).
-        sigma: the first standard deviation, as a part of the ranges.
+        search: Numbers, one objective.
+        name: Name in the catalogue.
+        population: Points per generation, at least 3; by default 4 + floor(3 ln n).
+        sigma: The first standard deviation, as a part of the ranges.
 
     Hansen, N. (2016): The CMA evolution strategy, a tutorial, arXiv:1604.00772. Hamano, R. et al. (2022): CMA-ES with
     margin, arXiv:2205.13482.
@@ -106,10 +106,10 @@ class DifferentialEvolution(BlockingSolver):
     violations wins.
 
     Args:
-        search: numbers, one objective.
-        name: in the catalogue.
-        population: points per generation and parameter.
-        tolerance: it ends when the standard deviation of the population's values is below this part of their mean.
+        search: Numbers, one objective.
+        name: Name in the catalogue.
+        population: Points per generation and parameter.
+        tolerance: It ends when the standard deviation of the population's values is below this part of their mean.
 
     Storn, R. and Price, K. (1997), Journal of Global Optimization 11.
     """

@@ -35,11 +35,11 @@ class OptunaSolver(Solver):
     hand are added to the study from which it learns.
 
     Args:
-        search: what is searched.
-        name: in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
-        batch: how many points it asks for at a time; by default 4 for TPE, a population for NSGA, 1 for GP, 16 for QMC.
+        search: What is searched.
+        name: Name in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
+        batch: How many points it asks for at a time; by default 4 for TPE, a population for NSGA, 1 for GP, 16 for QMC.
             Another batch is another search.
-        sampler_options: further options of Optuna's sampler (``n_startup_trials``, ``population_size``, ...).
+        sampler_options: Further options of Optuna's sampler (``n_startup_trials``, ``population_size``, ...).
 
     Raises:
         ModuleNotFoundError: Optuna is not installed (or, for GP, torch).

@@ -32,12 +32,12 @@ class SamplingSolver(Solver):
 
     Args:
         search: n numbers, one objective; mu begins at its start.
-        name: in the catalogue.
-        population: the number N of points per batch, at least 2; by default 2 (4 + floor(3 ln n)).
-        sigma: the standard deviation, as a part of the ranges; above 0.
+        name: Name in the catalogue.
+        population: The number N of points per batch, at least 2; by default 2 (4 + floor(3 ln n)).
+        sigma: The standard deviation, as a part of the ranges; above 0.
 
     Raises:
-        SolverError: an option is out of range, or the search has choices or several objectives.
+        SolverError: An option is out of range, or the search has choices or several objectives.
     """
 
     def __init__(self, search: Search, *, name: str, population: int | None, sigma: float) -> None:
@@ -70,8 +70,8 @@ class SamplingSolver(Solver):
         """Move the distribution.
 
         Args:
-            U: the batch in the unit cube, shape (N, n).
-            evaluations: those of the batch, N; at least one did not fail.
+            U: The batch in the unit cube, shape (N, n).
+            evaluations: Those of the batch, N; at least one did not fail.
         """
 
 
@@ -81,10 +81,10 @@ class PredictiveSampling(SamplingSolver):
     mu <- argmax of f over {mu, clip(mu + sigma e_1), ..., clip(mu + sigma e_(N-1))}, e_i ~ N(0, I).
 
     Args:
-        search: see `SamplingSolver`.
-        name: see `SamplingSolver`.
-        population: see `SamplingSolver`.
-        sigma: see `SamplingSolver`; it stays the same.
+        search: See `SamplingSolver`.
+        name: See `SamplingSolver`.
+        population: See `SamplingSolver`.
+        sigma: See `SamplingSolver`; it stays the same.
 
     Howell, T. et al. (2022): Predictive Sampling: Real-time Behaviour Synthesis with MuJoCo, arXiv:2212.00541.
     """
@@ -109,13 +109,13 @@ class Cem(SamplingSolver):
     sigma <- max((1 - a) sigma + a s, sigma_min).
 
     Args:
-        search: see `SamplingSolver`.
-        name: see `SamplingSolver`.
-        population: see `SamplingSolver`.
-        sigma: the first standard deviation, as a part of the ranges.
-        elites: the part K / N of a batch that is elite, in (0, 1]; at least 2 points.
-        smoothing: a, in (0, 1]; less is slower and more careful.
-        sigma_min: the least standard deviation, as a part of the ranges.
+        search: See `SamplingSolver`.
+        name: See `SamplingSolver`.
+        population: See `SamplingSolver`.
+        sigma: The first standard deviation, as a part of the ranges.
+        elites: The part K / N of a batch that is elite, in (0, 1]; at least 2 points.
+        smoothing: A, in (0, 1]; less is slower and more careful.
+        sigma_min: The least standard deviation, as a part of the ranges.
 
     Rubinstein, R. Y. and Kroese, D. P. (2004): The Cross-Entropy Method, Springer. Kobilarov, M. (2012): Cross-entropy
     motion planning, Int. J. of Robotics Research 31.
@@ -168,11 +168,11 @@ class Mppi(SamplingSolver):
     of Deb's rule; points that failed or were dropped have no weight.
 
     Args:
-        search: see `SamplingSolver`.
-        name: see `SamplingSolver`.
-        population: see `SamplingSolver`.
-        sigma: see `SamplingSolver`; it stays the same.
-        temperature: lambda, in standard deviations of the batch's costs; above 0. Towards 0 only the best point counts.
+        search: See `SamplingSolver`.
+        name: See `SamplingSolver`.
+        population: See `SamplingSolver`.
+        sigma: See `SamplingSolver`; it stays the same.
+        temperature: Lambda, in standard deviations of the batch's costs; above 0. Towards 0 only the best point counts.
 
     Williams, G. et al. (2017): Information theoretic MPC for model-based reinforcement learning, ICRA.
     """

@@ -58,12 +58,12 @@ class Evaluation(PointValues):
         point: s^0.
         values: One number per objective; larger is better in every case (a cost is negated). NaN if a
             simulation failed.
-        violations: one number per constraint, at most 0 where it holds; NaN if a simulation failed.
-        gradient: of the first value, shape (n,), if the solver wants it.
+        violations: One number per constraint, at most 0 where it holds; NaN if a simulation failed.
+        gradient: Gradient of the first value, shape (n,), if the solver wants it.
         exact: False if racing dropped the point before all its conditions had run. ``values`` is then an upper bound
             (infinite if the point was dropped for a violated constraint and nothing bounds its value), ``violations`` a
             lower bound.
-        effort: the rollouts that this evaluation took, divided by the number of conditions: 1 for a new point, less if
+        effort: The rollouts that this evaluation took, divided by the number of conditions: 1 for a new point, less if
             racing dropped it, 0 if it was known before.
     """
 
@@ -117,15 +117,15 @@ class Search:
     """The task of a solver: a search over the unit cube [0, 1]^n, one coordinate per parameter.
 
     Attributes:
-        space: the n parameters.
-        objectives: how many values an evaluation has.
-        constraints: how many violations an evaluation has.
-        seed: of all random numbers, in [0, 2^32).
-        budget: the number of evaluations that may be asked for; None: as many as the method needs.
-        start: where a local method starts; None: in the middle of the ranges.
+        space: The n parameters.
+        objectives: How many values an evaluation has.
+        constraints: How many violations an evaluation has.
+        seed: Seed of all random numbers, in [0, 2^32).
+        budget: The number of evaluations that may be asked for; None: as many as the method needs.
+        start: Where a local method starts; None: in the middle of the ranges.
 
     Raises:
-        SolverError: a number is out of range, or the start lies outside the space.
+        SolverError: A number is out of range, or the start lies outside the space.
     """
 
     space: tuple[Dimension, ...]
@@ -195,16 +195,16 @@ class Search:
         """Check that a method can do this search.
 
         Args:
-            name: the method's name, for the message.
-            continuous: it needs continuous parameters.
-            ordered: it needs numbers, continuous or whole.
-            one_objective: it takes one objective only.
-            no_constraints: it takes no constraints.
-            no_start: it does not start at a point.
-            several: it needs at least two parameters.
+            name: The method's name, for the message.
+            continuous: It needs continuous parameters.
+            ordered: It needs numbers, continuous or whole.
+            one_objective: It takes one objective only.
+            no_constraints: It takes no constraints.
+            no_start: It does not start at a point.
+            several: It needs at least two parameters.
 
         Raises:
-            SolverError: names what the method cannot do, and a solver that can.
+            SolverError: Names what the method cannot do, and a solver that can.
         """
         for parameter in self.space:
             if isinstance(parameter, Choice) and (continuous or ordered):
@@ -240,13 +240,13 @@ class Solver(ABC):
     A subclass implements `_next` and `_learn`.
 
     Attributes:
-        name: as the catalogue spells it.
-        search: what is searched.
-        wants_gradient: whether `Evaluation.gradient` is to be filled.
-        takes_start: whether it starts at a point (`Search.start`).
+        name: As the catalogue spells it.
+        search: What is searched.
+        wants_gradient: Whether `Evaluation.gradient` is to be filled.
+        takes_start: Whether it starts at a point (`Search.start`).
         reproducible: False for the few algorithms whose library seeds its random numbers from the clock.
-        success: whether it ended by its own criterion (converged, or its design is complete); None while it works.
-        message: how it ended, in its own words.
+        success: Whether it ended by its own criterion (converged, or its design is complete); None while it works.
+        message: How it ended, in its own words.
     """
 
     wants_gradient: bool = False
@@ -296,7 +296,7 @@ class Solver(ABC):
         """Return the points to be evaluated next; an empty list when the solver has ended.
 
         Raises:
-            SolverError: the solver was not told yet of the points that it asked for before.
+            SolverError: The solver was not told yet of the points that it asked for before.
             Exception: Any error of the method.
         """
         if self._asked:
@@ -320,7 +320,7 @@ class Solver(ABC):
         does `auto` when it begins a new method; local methods, designs and CMA-ES ignore them.
 
         Raises:
-            SolverError: the batch is incomplete or in another order, or has another number of values or violations than
+            SolverError: The batch is incomplete or in another order, or has another number of values or violations than
                 the problem.
         """
         count = len(self._asked)
@@ -354,13 +354,20 @@ def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
     """Return what a solver asks for; None if it is still thinking after ``seconds``: then it can only be closed.
 
     Raises:
-        Exception: any error of the method.
+        Exception: Any error of the method.
     """
     if seconds == math.inf:
         return solver.ask()
     answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
+
+    def think() -> None:
+        try:
+            answer.put(solver.ask())
+        except BaseException as error:
+            answer.put(error)
+
     # A daemon thread does not keep the program from ending if the solver never answers.
-    threading.Thread(target=_think, args=(solver, answer), name=f"{solver.name} thinks", daemon=True).start()
+    threading.Thread(target=think, name=f"{solver.name} thinks", daemon=True).start()
     try:
         points = answer.get(timeout=max(0.0, seconds))
     except Empty:
@@ -368,11 +375,3 @@ def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
     if isinstance(points, BaseException):
         raise points
     return points
-
-
-def _think(solver: Solver, answer: SimpleQueue[list[Point] | BaseException]) -> None:
-    """Put what a solver asks for, or the exception that it raises, into ``answer``."""
-    try:
-        answer.put(solver.ask())
-    except BaseException as error:
-        answer.put(error)
