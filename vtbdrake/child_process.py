@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import pickle
+import queue
 import select
 import signal
 import socket
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import PathFinder
+from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
@@ -23,6 +25,7 @@ from typing import Any, Self
 _log = logging.getLogger(__name__)
 
 _ANSWER_TIMEOUT = 10.0  # s for a service to answer, and to end
+_MAX_LOG = 1000  # log messages that wait to be written; further ones are dropped
 
 _BOOTSTRAP = """\
 import signal, sys
@@ -249,6 +252,28 @@ def ending_signals(handler: Callable[[int, FrameType | None], Any]) -> Iterator[
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
+
+
+@contextlib.contextmanager
+def logging_in_thread() -> Iterator[None]:
+    """Write log messages in another thread, so that a blocked terminal does not delay this one."""
+    root = logging.getLogger()
+    messages: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_LOG)
+    handlers = root.handlers[:] or [logging.StreamHandler()]
+    root.handlers[:] = [_DroppingHandler(messages)]
+    listener = QueueListener(messages, *handlers)
+    listener.start()
+    try:
+        yield
+    finally:
+        listener.stop()
+        root.handlers[:] = handlers
+
+
+class _DroppingHandler(QueueHandler):
+    def enqueue(self, record: logging.LogRecord) -> None:
+        with contextlib.suppress(queue.Full):
+            self.queue.put_nowait(record)
 
 
 def report_ready(connection: socket.socket) -> None:

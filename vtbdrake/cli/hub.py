@@ -74,7 +74,11 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
       vtbdrake hub --protect IIWA_COMMAND
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
-    channels = () if scenario is None else _command_channels(scenario)
+    channels: tuple[str, ...] = ()
+    if scenario is not None:
+        from vtbdrake.lcm.protocol import protocol_of
+
+        channels = tuple(map.channel for map in protocol_of(scenario).act)
     defaults = () if unprotected else (*channels, SET, RESET)
     sizes = {name: fields.pop(name) * _MEBIBYTE for name in _SIZES}
     config = HubConfig(protect=tuple(dict.fromkeys((*protect, *defaults))), **sizes, **fields)
@@ -91,9 +95,3 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
         f"{statistics.messages} messages relayed, {statistics.refused} rejected, "
         f"{statistics.dropped} dropped for slow clients"
     )
-
-
-def _command_channels(scenario: Scenario) -> tuple[str, ...]:
-    from vtbdrake.lcm.protocol import protocol_of
-
-    return tuple(map.channel for map in protocol_of(scenario).act)

@@ -77,6 +77,7 @@ executor_options: Callable[[F], F] = _all(
     option("--executor", "Where rollouts run.", type=click.Choice(NAMES), default=NAMES[0]),
     option("--workers N", "The number of threads or processes.  [default: one per core]", type=click.IntRange(min=1)),
 )
+_FILES = ("save", "csv", "plot")
 _file_options: Callable[[F], F] = _all(
     option("--save FILE", "Write the sweep for vtbdrake.optimization.Sweep.load.", parse=output()),
     option("--csv FILE", "Write the table.", parse=output(".csv")),
@@ -192,9 +193,6 @@ def sweep(
     vary: tuple[tuple[Parameter, int], ...],
     executor: str,
     workers: int | None,
-    save: Path | None,
-    csv: Path | None,
-    plot: Path | None,
     **problem: Any,
 ) -> None:
     """Simulate every point of a grid: which one is best?
@@ -207,10 +205,11 @@ def sweep(
       vtbdrake sweep vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
     """
+    files = {name: problem.pop(name) for name in _FILES}
     stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
     found = stated.sweep([points for _, points in vary], executor=executor, workers=workers)
     click.echo(_points_table(found))
-    _write_files(found, save=save, csv=csv, plot=plot)
+    _write_files(found, **files)
     _reject_failures(found)
     click.echo("\n" + _conclusion(found))
     if not found.complete:
@@ -246,9 +245,6 @@ def boundary(
     jitter: float,
     executor: str,
     workers: int | None,
-    save: Path | None,
-    csv: Path | None,
-    plot: Path | None,
     **problem: Any,
 ) -> None:
     """Find how far a parameter may go before f exceeds the threshold.
@@ -261,12 +257,13 @@ def boundary(
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
+    files = {name: problem.pop(name) for name in _FILES}
     stated = make_problem(scenario, [vary], **problem)
     found = stated.boundary(
         resolution=resolution, coarse=coarse, repeats=repeats, jitter=jitter, executor=executor, workers=workers
     )
     assert found.sweep is not None
-    _write_files(found.sweep, save=save, csv=csv, plot=plot, boundary=found)
+    _write_files(found.sweep, boundary=found, **files)
     _reject_failures(found.sweep)
     click.echo(_report(found, found.sweep))
 

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import queue
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
 
 import click
 
-from vtbdrake.child_process import ending_signals
+from vtbdrake.child_process import ending_signals, logging_in_thread
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
@@ -109,6 +105,9 @@ def run(
     Example:
       vtbdrake run vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
+    logging.basicConfig(format="%(asctime)s %(message)s")
+    for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
+        logger.setLevel(logging.INFO)
     scenario = scenario.with_fields(settings(fields))
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
@@ -117,7 +116,7 @@ def run(
     )
     try:
         # SIGTERM ends the loop as Ctrl-C does.
-        with ending_signals(signal.default_int_handler), _logs_in_a_thread(), loop as runtime:
+        with ending_signals(signal.default_int_handler), logging_in_thread(), loop as runtime:
             begin = runtime.clock.now()
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 click.echo(real_time)
@@ -152,22 +151,3 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
         raise FailedError(f"not switched to the machine {one_line(error)}") from error
     except KeyboardInterrupt:
         _log.info("interrupted")
-
-
-@contextmanager
-def _logs_in_a_thread() -> Iterator[None]:
-    """Write log messages to stderr in another thread, because a blocked terminal must not delay the loop."""
-    lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    listener = QueueListener(lines, handler)
-    ours, root = QueueHandler(lines), logging.getLogger()
-    root.addHandler(ours)
-    for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
-        logger.setLevel(logging.INFO)
-    listener.start()
-    try:
-        yield
-    finally:
-        root.removeHandler(ours)
-        listener.stop()

@@ -286,28 +286,18 @@ def _nan(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
         message = message_type.decode(data)
     except Exception:  # Another fault has corrupted it.
         return data
-    _fill_with_nan(message)
-    return bytes(message.encode())
+    return bytes(_with_nan(message, "").encode())
 
 
-def _fill_with_nan(message: Any) -> None:
-    for name, typename in zip(message.__slots__, message.__typenames__, strict=True):
-        value = getattr(message, name)
-        if typename in ("double", "float"):
-            setattr(message, name, _nan_like(value))
-        else:
-            for part in _messages_in(value):
-                _fill_with_nan(part)
-
-
-def _nan_like(value: Any) -> Any:
-    return [_nan_like(entry) for entry in value] if isinstance(value, list | tuple) else math.nan
-
-
-def _messages_in(value: Any) -> list[Any]:
+def _with_nan(value: Any, typename: str) -> Any:
+    """Return a message, a field of the type ``typename``, or a list of these, with NaN for floating-point numbers."""
     if isinstance(value, list | tuple):
-        return [part for entry in value for part in _messages_in(entry)]
-    return [value] if hasattr(value, "__typenames__") else []
+        return [_with_nan(entry, typename) for entry in value]
+    if hasattr(value, "__typenames__"):
+        for name, kind in zip(value.__slots__, value.__typenames__, strict=True):
+            setattr(value, name, _with_nan(getattr(value, name), kind))
+        return value
+    return math.nan if typename in ("double", "float") else value
 
 
 CORRUPTIONS: dict[str, Callable[[Any, bytes, np.random.Generator], bytes]] = {

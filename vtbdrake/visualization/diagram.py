@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
@@ -60,7 +61,12 @@ class Structure:
 def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Structure:
     """Return what Figure 4 shows of a testbed, with its switches as in ``context`` (by default, as it was built)."""
     positions = testbed.positions(context if context is not None else testbed.default_context())
-    ends = _Ends(testbed.diagram)
+    sources: dict[tuple[str, int], str] = {}
+    targets: dict[str, str] = {}
+    for (to, port), (origin, _) in testbed.diagram.connection_map().items():
+        source, target = str(origin.get_name()), str(to.get_name())
+        sources[target, int(port)] = "" if source == BOARD else source
+        targets[source] = target
     interface = testbed.interface
     dps = testbed.dps
     return Structure(
@@ -70,39 +76,14 @@ def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Str
         world=_world(testbed),
         sense=tuple(
             # Input 0 of a switch is its selector, input 1 its input in position sim.
-            Wire(s, positions["sense"][s.name], ends.source(f"{T_SENSE}{s.name}", 1))
+            Wire(s, positions["sense"][s.name], sources.get((f"{T_SENSE}{s.name}", 1), ""))
             for s in interface.sense
         ),
-        act=tuple(Wire(s, positions["act"][s.name], ends.target(f"{T_ACT}{s.name}.sim")) for s in interface.act),
+        act=tuple(Wire(s, positions["act"][s.name], targets.get(f"{T_ACT}{s.name}.sim", "")) for s in interface.act),
         commands=tuple(
-            Wire(s, "", ends.source("dps", int(dps.GetInputPort(s.name).get_index()))) for s in interface.commands
+            Wire(s, "", sources.get(("dps", int(dps.GetInputPort(s.name).get_index())), "")) for s in interface.commands
         ),
     )
-
-
-class _Ends:
-    """The names of the systems at the other ends of connections."""
-
-    def __init__(self, diagram: Diagram) -> None:
-        self._sources: dict[tuple[str, int], str] = {}
-        self._targets: dict[str, str] = {}
-        for (to, port), (origin, _) in diagram.connection_map().items():
-            source, target = str(origin.get_name()), str(to.get_name())
-            self._sources[target, int(port)] = source
-            self._targets[source] = target
-
-    def source(self, system: str, port: int) -> str:
-        name = self._sources.get((system, port), "")
-        return "" if name == BOARD else name
-
-    def target(self, system: str) -> str:
-        return self._targets.get(system, "")
-
-
-def short(name: str) -> str:
-    """Return the name of a simulated part without ``sim.<role>.``."""
-    parts = name.split(".", 2)
-    return parts[2] if len(parts) == 3 and parts[0] == "sim" and parts[1] in ROLES else name
 
 
 def _class_name(system: System) -> str:
@@ -117,9 +98,10 @@ def _world(testbed: VirtualTestbed) -> dict[str, tuple[str, ...]]:
         found[role].append(f"plant: {name}")
     for system in testbed.diagram.GetSystems():
         if not _is_framework(testbed, system):
-            parts = str(system.get_name()).split(".", 2)
-            known = len(parts) == 3 and parts[0] == "sim" and parts[1] in ROLES
-            found[parts[1] if known else "other"].append(short(str(system.get_name())))
+            name = str(system.get_name())
+            part = re.fullmatch(rf"sim\.({'|'.join(ROLES)})\.(.+)", name)
+            role, shown = part.groups() if part else ("other", name)
+            found[role].append(shown)
     return {role: tuple(names) for role, names in found.items() if names or role != "other"}
 
 

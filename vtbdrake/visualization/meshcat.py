@@ -108,7 +108,7 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
     """
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
-    _record(meshcat, [_Actor(motion, prefix)], rate)
+    _record(meshcat, [_Actor(motion=motion, path=prefix)], rate)
     return Scene(meshcat)
 
 
@@ -154,8 +154,8 @@ def show_motions(
         drawn = any(other.motion.scenario == motion.scenario for other in actors) and not step.any()
         actors.append(
             _Actor(
-                motion,
-                path,
+                motion=motion,
+                path=path,
                 tint=tints.get(name),
                 opacity=opacities.get(name, 1.0),
                 offset=number * step,
@@ -326,25 +326,16 @@ def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> None:
     meshcat.PublishRecording()
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Actor:
     """One motion in a recording."""
 
-    def __init__(
-        self,
-        motion: Motion,
-        path: str,
-        *,
-        tint: str | None = None,
-        opacity: float = 1.0,
-        offset: np.ndarray | None = None,
-        surroundings: bool = True,
-    ) -> None:
-        self.motion = motion
-        self.path = path
-        self._tint = tint
-        self._opacity = opacity
-        self._offset = offset if offset is not None else np.zeros(3)
-        self._surroundings = surroundings
+    motion: Motion
+    path: str
+    tint: str | None = None
+    opacity: float = 1.0
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    surroundings: bool = True
 
     def play(self, meshcat: Meshcat, end: float, rate: float) -> None:
         testbed = self.motion.scenario.build(meshcat=meshcat, prefix=self.path)
@@ -355,7 +346,7 @@ class _Actor:
         context = testbed.default_context()
         visualizer = next(s for s in testbed.diagram.GetSystems() if isinstance(s, MeshcatVisualizer))
         visible = visualizer.GetMyContextFromRoot(context)
-        meshcat.SetTransform(self.path, RigidTransform(self._offset))
+        meshcat.SetTransform(self.path, RigidTransform(self.offset))
         for time, sample in _keyframes(self.motion.times, end, rate):
             plant.SetPositions(plant.GetMyMutableContextFromRoot(context), states[sample, : plant.num_positions()])
             # Meshcat rounds the time of a keyframe down; the quarter keeps it off the edge.
@@ -369,11 +360,11 @@ class _Actor:
         inspector, source = scene_graph.model_inspector(), plant.get_source_id()
         for body, geometry in _visible(plant):
             if plant.IsAnchored(body):
-                if not self._surroundings:
+                if not self.surroundings:
                     scene_graph.RemoveRole(source, geometry, Role.kIllustration)
-            elif self._tint is not None or self._opacity < 1.0:
+            elif self.tint is not None or self.opacity < 1.0:
                 properties = IllustrationProperties(inspector.GetIllustrationProperties(geometry))
-                color = _tinted(_color(inspector, geometry), self._tint, self._opacity)
+                color = _tinted(_color(inspector, geometry), self.tint, self.opacity)
                 properties.UpdateProperty("phong", "diffuse", color)
                 scene_graph.RemoveRole(source, geometry, Role.kIllustration)
                 scene_graph.AssignRole(source, geometry, properties)

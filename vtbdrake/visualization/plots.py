@@ -24,7 +24,6 @@ from vtbdrake.rollout import RolloutResult
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Boundary, Sweep
-    from vtbdrake.rollout import RolloutResult
 
 
 class Picture(Figure):
@@ -80,8 +79,11 @@ THRESHOLD = "#555555"
 
 def is_two_valued(rollouts: Sequence[RolloutResult]) -> bool:
     """Return whether f' takes only two values (an event such as tipping over): their trajectories would overlap."""
-    values = np.unique(np.concatenate([rollout.quality for rollout in rollouts] or [np.empty(0)]))
-    return len(rollouts) > 1 and values.size <= 2
+    return len(rollouts) > 1 and np.unique(_qualities(rollouts)).size <= 2
+
+
+def _qualities(rollouts: Sequence[RolloutResult]) -> np.ndarray:
+    return np.concatenate([np.empty(0), *(rollout.quality for rollout in rollouts)])
 
 
 def draw_trajectory(
@@ -117,7 +119,8 @@ def draw_bars(
 
     t* is marked where h is the upper value. A failed rollout ends with a cross.
     """
-    lower, upper = levels(rollouts)
+    values = _qualities(rollouts)
+    lower, upper = (values.min(), values.max()) if values.size else (0.0, 0.0)
     for rollout, height, color, style in zip(rollouts, heights, colors, styles, strict=True):
         times, high = rollout.times[: rollout.quality.size], rollout.quality > lower
         if not times.size:
@@ -137,12 +140,6 @@ def draw_bars(
     handles += keys(failed=any(rollout.failed for rollout in rollouts))
     axes.legend(handles=handles, fontsize="small", loc="best")
     axes.set(xlabel="time t [s]", title="Quality trajectories f'(s⁰, t) of two values")
-
-
-def levels(rollouts: Sequence[RolloutResult]) -> tuple[float, float]:
-    """Return the least and the largest quality of all samples; (0, 0) if there are none."""
-    values = np.concatenate([np.empty(0), *(rollout.quality for rollout in rollouts)])
-    return (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
 
 
 def draw_threshold(axes: Axes, threshold: float) -> None:

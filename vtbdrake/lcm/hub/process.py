@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import queue
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
-from vtbdrake.child_process import ChildService, ending_signals, report_ready
+from vtbdrake.child_process import ChildService, ending_signals, logging_in_thread, report_ready
 from vtbdrake.control.realtime import RealTime
 from vtbdrake.lcm.hub.routing import HubStatistics
 from vtbdrake.lcm.hub.server import HubConfig, HubServer, listen
 from vtbdrake.lcm.hub.tcpq import address_name
 
 _log = logging.getLogger(__name__)
-
-_MAX_LOG = 1000
 
 
 class HubError(RuntimeError):
@@ -96,34 +92,12 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
         switch_interval=None,
         longest_step=None,
     )
-    with ending_signals(lambda *_: server.stop()), settings, _logging_in_thread():
+    with ending_signals(lambda *_: server.stop()), settings, logging_in_thread():
         for grant in settings.grants:
             if not grant.granted:
                 _log.warning("%s", grant)
         ready()
         server.serve_forever()
-
-
-@contextlib.contextmanager
-def _logging_in_thread() -> Iterator[None]:
-    """Write log messages in another thread, so that a blocked terminal does not delay the hub."""
-    root = logging.getLogger()
-    messages: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_LOG)
-    handlers = root.handlers[:] or [logging.StreamHandler()]
-    root.handlers[:] = [_DroppingHandler(messages)]
-    listener = QueueListener(messages, *handlers)
-    listener.start()
-    try:
-        yield
-    finally:
-        listener.stop()
-        root.handlers[:] = handlers
-
-
-class _DroppingHandler(QueueHandler):
-    def enqueue(self, record: logging.LogRecord) -> None:
-        with contextlib.suppress(queue.Full):
-            self.queue.put_nowait(record)
 
 
 def _serve_child(connection: socket.socket, config: HubConfig, *listeners: socket.socket) -> None:
