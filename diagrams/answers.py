@@ -34,15 +34,15 @@ class Answer:
     """The answer to the question of one application.
 
     Attributes:
-        id: of the application: O1 to O4, R1, R2, C1, C2.
-        question: in one sentence.
-        answer: a number in ``unit``, or words.
+        id: Name of the application: O1 to O4, R1, R2, C1, C2.
+        question: Question in one sentence.
+        answer: A number in ``unit``, or words.
         unit: SI; empty for words.
         interval: (lower, upper), in which the answer lies; an infinite end is open. None if it has no uncertainty.
-        paper: the paper's answer.
-        holds: whether the criterion of the application is met.
-        note: what is to be known besides.
-        seconds: of wall time; measured if left out.
+        paper: The paper's answer.
+        holds: Whether the criterion of the application is met.
+        note: What is to be known besides.
+        seconds: Seconds of wall time; measured if left out.
     """
 
     id: str
@@ -66,13 +66,13 @@ def answer_all(
     """Run the named applications, or all. One that raises becomes a `Crash`, and the others still run.
 
     Args:
-        only: the names of the applications; by default all.
-        full: run the long versions.
-        registry: name -> function ``(full) -> Answer``.
-        echo: gets a line when an application begins.
+        only: The names of the applications; by default all.
+        full: Run the long versions.
+        registry: Name -> function ``(full) -> Answer``.
+        echo: Gets a line when an application begins.
 
     Raises:
-        ValueError: a name is unknown.
+        ValueError: A name is unknown.
     """
     answers: list[Answer | Crash] = []
     for name in chosen(registry, only):

@@ -35,7 +35,7 @@ def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
     """Return the names to run, in the order of the registry; all of them if ``only`` is empty.
 
     Raises:
-        ValueError: a name is unknown.
+        ValueError: A name is unknown.
     """
     unknown = [name for name in only if name not in registry]
     if unknown:

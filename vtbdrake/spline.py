@@ -47,11 +47,11 @@ class Spline:
 
     Attributes:
         order: ``zero``, ``linear``, ``cubic`` or ``bspline``.
-        knots: their number n; a B-spline needs four.
+        knots: Their number n; a B-spline needs four.
         duration: T in seconds.
 
     Raises:
-        ValueError: there is no such order, there are too few knots, or the duration is not positive.
+        ValueError: There is no such order, there are too few knots, or the duration is not positive.
     """
 
     order: str
@@ -121,7 +121,7 @@ class Spline:
         """Return B at some times, or one of its derivatives, so that ``matrix(times) @ knots`` are values.
 
         Args:
-            times: shape (p,), in seconds from the beginning of the curve.
+            times: Shape (p,), in seconds from the beginning of the curve.
             derivative: 0, 1, 2 or 3.
 
         Returns:
@@ -147,7 +147,7 @@ class Spline:
         polynomials of third degree.
 
         Args:
-            knots: shape (n, m), of m curves.
+            knots: Shape (n, m), of m curves.
             derivative: 0, 1 or 2.
 
         Returns:

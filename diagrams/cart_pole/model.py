@@ -51,8 +51,8 @@ class CartPole:
         """Return the energy in J, zero at rest with the pole level.
 
         Args:
-            q: position of the cart (m) and angle of the pole (rad), 0 where it hangs.
-            v: their derivatives.
+            q: Position of the cart (m) and angle of the pole (rad), 0 where it hangs.
+            v: Their derivatives.
         """
         m_c, m_p, length = self.cart_mass, self.pole_mass, self.pole_length
         kinetic = 0.5 * (m_c + m_p) * v[0] ** 2 + m_p * length * v[0] * v[1] * np.cos(q[1])

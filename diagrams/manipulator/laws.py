@@ -49,8 +49,8 @@ class Law:
     """A control law.
 
     Attributes:
-        parameters: value, unit and bounds of its gains.
-        state: initial value and unit of what it remembers beside the motion.
+        parameters: Value, unit and bounds of its gains.
+        state: Initial value and unit of what it remembers beside the motion.
         torque: (ArmDynamics, q, v, wrench, Reference, state, parameters, period) -> torque, next state. The state has
             the joint ``reference`` of the last instant.
     """

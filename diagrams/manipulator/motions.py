@@ -48,13 +48,13 @@ class Reference:
 
     Attributes:
         in_joints: 1 while the motion is given in joint space.
-        q, v, a: joint reference (7); where the motion is Cartesian, where it started, at rest.
-        dp, dv, da: displacement of the tip (3) from its place at ``q``, in the world; 0 while the motion is in joint
+        q, v, a: Joint reference (7); where the motion is Cartesian, where it started, at rest.
+        dp, dv, da: Displacement of the tip (3) from its place at ``q``, in the world; 0 while the motion is in joint
             space.
         following: 1 during `follow`.
-        ease: of a Cartesian motion, 0 at its begin and end and at most 1 between, with its first derivative: when the
+        ease: 0 at the begin and end of a Cartesian motion and at most 1 between, with its first derivative: when the
             arm may do what the tip does not feel.
-        state: the next values of ``motion``, ``clock`` and ``start``.
+        state: The next values of ``motion``, ``clock`` and ``start``.
     """
 
     in_joints: Expression

@@ -90,11 +90,11 @@ class Track:
     """Reference and position of the tip, sample by sample.
 
     Attributes:
-        motion: the motion under way, shape (n,).
-        clock: since its begin, in s, (n,).
-        wanted: the reference of the tip, (n, 3), in m, in the world.
-        tip: where it was, by the measured joint positions, (n, 3).
-        force: that the environment exerts on the tip, as the DPS perceives it, (n, 3), in N.
+        motion: The motion under way, shape (n,).
+        clock: Since its begin, in s, (n,).
+        wanted: The reference of the tip, (n, 3), in m, in the world.
+        tip: Where it was, by the measured joint positions, (n, 3).
+        force: That the environment exerts on the tip, as the DPS perceives it, (n, 3), in N.
     """
 
     motion: NDArray[np.float64]
@@ -183,8 +183,8 @@ class Contact:
     """A press against the wall.
 
     Attributes:
-        clock: since the begin of the motion, in s, (n,).
-        predicted, felt: force on the wall, in N, (n,).
+        clock: Since the begin of the motion, in s, (n,).
+        predicted, felt: Force on the wall, in N, (n,).
     """
 
     clock: NDArray[np.float64]

@@ -79,8 +79,8 @@ class World:
     """A simulated reality, which differs from the robot's model of it.
 
     Attributes:
-        scenario: its crater, its roughness and its friction.
-        mass: factor of the torso's mass.
+        scenario: Its crater, its roughness and its friction.
+        mass: Factor of the torso's mass.
     """
 
     scenario: CraterScenario
@@ -102,11 +102,11 @@ def heading_reasoner(
     """Return the reasoner of the robot, which decides its heading.
 
     Args:
-        scenario: the robot's model.
+        scenario: The robot's model.
         method: ``grid`` for the discrete headings of the paper, or another method for a continuous search.
-        candidates: how many headings are tried, beside the plan in use.
-        samples: how many samples of the belief each is tried from; with more than one, pose and mass are uncertain.
-        options: of `Reasoner`.
+        candidates: How many headings are tried, beside the plan in use.
+        samples: How many samples of the belief each is tried from; with more than one, pose and mass are uncertain.
+        options: Options of `Reasoner`.
     """
     given: dict[str, Any] = {"horizon": HORIZON, "sample_period": SAMPLE_PERIOD}
     if method == "grid":
@@ -144,11 +144,11 @@ class Climb:
     """How a climb ended.
 
     Attributes:
-        heading: in rad.
-        reached: whether the robot has passed the rim.
-        elevation: of the torso at the end, in m.
-        duration: in s, from the command on.
-        distance: from the crater's axis at the end, in m.
+        heading: Heading in rad.
+        reached: Whether the robot has passed the rim.
+        elevation: Elevation of the torso at the end, in m.
+        duration: Duration in s, from the command on.
+        distance: Distance from the crater's axis at the end, in m.
     """
 
     heading: float
@@ -204,9 +204,9 @@ def explain(
     Single changes are tried first; where none suffices, pairs of them, and then all three.
 
     Args:
-        scenario: the robot's model.
-        headings: in rad.
-        executor: see `Problem.sweep`.
+        scenario: The robot's model.
+        headings: Headings in rad.
+        executor: See `Problem.sweep`.
 
     Returns:
         For each heading the reasons among `COUNTERFACTUALS`; several that count together are one, joined by "and". An
@@ -236,9 +236,9 @@ class Case:
     """One crater: what the robot decided, and what came of it.
 
     Attributes:
-        seed: of the crater.
-        decision: the robot's.
-        climb: what came of it in the world; None if the robot saw no way to the rim.
+        seed: Seed of the crater.
+        decision: The robot's.
+        climb: What came of it in the world; None if the robot saw no way to the rim.
     """
 
     seed: int
@@ -256,9 +256,9 @@ def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
     """Let the robot decide in the crater ``seed`` and walk in a world that differs.
 
     Args:
-        seed: of the crater.
-        difference: of the world, see `differing`.
-        options: of `heading_reasoner`.
+        seed: Seed of the crater.
+        difference: Difference of the world, see `differing`.
+        options: Options of `heading_reasoner`.
     """
     expedition = Expedition(differing(seed, difference))
     with heading_reasoner(model(seed), **options) as reasoner:

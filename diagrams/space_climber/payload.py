@@ -66,9 +66,9 @@ def payload_problem(*, phases: Sequence[float] = PHASES, stride: float = STRIDE,
     """State the question in the paper's five steps.
 
     Args:
-        phases: start phases of the gait, in cycles.
-        stride: period of the gait in seconds; the number of strides does not depend on it.
-        environment: fields of the scenario.
+        phases: Start phases of the gait, in cycles.
+        stride: Period of the gait in seconds; the number of strides does not depend on it.
+        environment: Fields of the scenario.
     """
     return vtb.Problem(
         scenario=SpaceClimberScenario(**environment),
@@ -88,9 +88,9 @@ def static_limit(testbed: VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: 
     m (x_a - x_e) = M (x_e - x_c) about the point x_e of the edge that lies straight ahead of the centre of mass.
 
     Args:
-        testbed: of the space climber, with its attachment.
-        legs: whose feet stand.
-        ahead: how far their feet stand ahead of their nominal place, in m.
+        testbed: Testbed of the space climber, with its attachment.
+        legs: Whose feet stand.
+        ahead: How far their feet stand ahead of their nominal place, in m.
     """
     plant = testbed.plant
     assert plant is not None

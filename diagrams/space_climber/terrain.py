@@ -108,9 +108,9 @@ class Boulder:
     """An angular block, half buried.
 
     Attributes:
-        x, y: of its centre, which lies on the ground, in m.
-        size: edges in m; half of the third is its height over level ground.
-        rpy: roll, pitch and yaw in rad.
+        x, y: Position of its centre, which lies on the ground, in m.
+        size: Edges in m; half of the third is its height over level ground.
+        rpy: Roll, pitch and yaw in rad.
     """
 
     x: float
@@ -124,11 +124,11 @@ class Crater:
     """A crater of a seed.
 
     Attributes:
-        seed: determines walls, gullies and boulders.
+        seed: Determines walls, gullies and boulders.
         gullies: False fills the gullies.
         boulders: False removes the boulders.
-        roughness: standard deviation of the mesh's vertices around the surface, in m.
-        roughness_seed: determines the roughness.
+        roughness: Standard deviation of the mesh's vertices around the surface, in m.
+        roughness_seed: Determines the roughness.
     """
 
     seed: int = 0
@@ -248,8 +248,8 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
     defaults, or each of about a thousand geometries would have a variable of its own.
 
     Args:
-        plant: a plant that is not finalized.
-        crater: what is added.
+        plant: A plant that is not finalized.
+        crater: What is added.
     """
     world, default = plant.world_body(), ProximityProperties()
     vertices, triangles = crater.mesh

@@ -89,10 +89,10 @@ def make_walking(
     """Build the subsystem ``gait`` with the input ports ``pose``, ``heading`` and ``walk``.
 
     Args:
-        gait: the gait.
-        period: sample period in s.
-        morphology: the robot's.
-        clearance: how high the gait lifts the feet by default, in m.
+        gait: The gait.
+        period: Sample period in s.
+        morphology: The robot's.
+        clearance: How high the gait lifts the feet by default, in m.
         navigator: True puts a `Navigator`, with the port ``visual_odometry``, between the commands and the gait.
     """
     builder = DiagramBuilder()

@@ -43,15 +43,15 @@ class SplineCommand(LeafSystem):
         """Declare the system.
 
         Args:
-            spline: the curve that the knots define.
-            period: sample period T in seconds.
-            size: entries m of the value.
-            after: the value after the end of the plan, a scalar or shape (m,), for example a force of 0 if nobody
+            spline: The curve that the knots define.
+            period: Sample period T in seconds.
+            size: Entries m of the value.
+            after: The value after the end of the plan, a scalar or shape (m,), for example a force of 0 if nobody
                 decides any more. None holds the last value of the plan.
-            unit: unit of the value.
+            unit: Unit of the value.
 
         Raises:
-            ValueError: the period or the size is not positive, or ``after`` is not finite or has another size.
+            ValueError: The period or the size is not positive, or ``after`` is not finite or has another size.
         """
         super().__init__()
         if not 0.0 < period < inf:

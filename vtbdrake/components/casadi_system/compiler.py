@@ -36,8 +36,8 @@ def compiled(function: casadi.Function) -> casadi.Function:
     compiled once per machine. Processes may do so at the same time.
 
     Raises:
-        ValueError: the function has no C code, such as a `casadi.Callback`.
-        CompilerError: the compiler is missing or fails; the environment variable CC names another one than ``cc``.
+        ValueError: The function has no C code, such as a `casadi.Callback`.
+        CompilerError: The compiler is missing or fails; the environment variable CC names another one than ``cc``.
     """
     generator = casadi.CodeGenerator(f"{function.name()}.c", {})
     generator.add(function)

@@ -46,12 +46,12 @@ class Model:
 
     Attributes:
         shapes: (rows, columns) of every argument and state.
-        period: of the updates (s), or None.
-        variables: state and parameters by address.
-        inputs: the names of the arguments that are input ports.
-        state, parameters: default values, by name; flat, row after row.
-        outputs: by name.
-        update: all next states, one after the other, from all states; or None.
+        period: Period of the updates (s), or None.
+        variables: State and parameters by address.
+        inputs: The names of the arguments that are input ports.
+        state, parameters: Default values, by name; flat, row after row.
+        outputs: Outputs by name.
+        update: All next states, one after the other, from all states; or None.
     """
 
     def __init__(

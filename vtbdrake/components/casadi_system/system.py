@@ -65,21 +65,21 @@ def CasadiSystem_(T: type) -> type:
         With AutoDiffXd the derivatives are CasADi's, by the chain rule.
 
         Args:
-            output: its results become output ports; its arguments are dense.
-            update: its results are the next values of all states, the one of ``x`` being named ``x_next``.
-            state: the initial values, by name.
-            period: of the updates (s).
-            parameters: the default values, by name.
-            time: the name of the argument that is the time (s).
-            units: of states and parameters, by name; "1" if left out.
+            output: Its results become output ports; its arguments are dense.
+            update: Its results are the next values of all states, the one of ``x`` being named ``x_next``.
+            state: The initial values, by name.
+            period: Period of the updates (s).
+            parameters: The default values, by name.
+            time: The name of the argument that is the time (s).
+            units: Units of states and parameters, by name; "1" if left out.
             bounds: (lower, upper) of the entries of states and parameters, by name; infinite if left out.
-            compile: evaluates machine code, which gives the same results. The first time, it is made by the C compiler
+            compile: Evaluates machine code, which gives the same results. The first time, it is made by the C compiler
                 ``cc`` (or CC, from the environment), and kept in ``~/.cache/vtbdrake`` (or XDG_CACHE_HOME). None does
                 so where it is possible.
 
         Raises:
-            ValueError: names, sizes or arguments that do not fit together.
-            CompilerError: there is no C compiler, or it fails.
+            ValueError: Names, sizes or arguments that do not fit together.
+            CompilerError: There is no C compiler, or it fails.
         """
 
         __slots__ = NO_DICT
