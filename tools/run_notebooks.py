@@ -17,13 +17,12 @@ FOLDER = ROOT / "notebooks"
 WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
-def run(path: Path) -> NotebookNode:
+def run(notebook: NotebookNode) -> NotebookNode:
     """Run a notebook from top to bottom in the root of the checkout, and return it with its outputs.
 
     Raises:
         nbclient.exceptions.CellExecutionError: a cell raised.
     """
-    notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
     return notebook
 
@@ -54,7 +53,7 @@ def main() -> None:
     """Run the notebooks that are named, or all, and store them."""
     for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
         path = FOLDER / f"{name}.ipynb"
-        notebook = run(path)
+        notebook = run(nbformat.read(path, as_version=4))
         strip(notebook)
         nbformat.write(notebook, path)
         print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")

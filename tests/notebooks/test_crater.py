@@ -10,5 +10,5 @@ def test_is_stored_with_text_and_plots() -> None:
 
 
 @pytest.mark.slow
-def test_runs_as_it_is_stored() -> None:
-    check_runs("crater")
+def test_runs_in_a_shorter_version() -> None:
+    check_runs("crater", shorter={"heading_reasoner(scenario)": "heading_reasoner(scenario, candidates=3)"})

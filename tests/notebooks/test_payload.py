@@ -10,5 +10,9 @@ def test_is_stored_with_text_and_plots() -> None:
 
 
 @pytest.mark.slow
-def test_runs_as_it_is_stored() -> None:
-    check_runs("payload")
+def test_runs_in_a_shorter_version() -> None:
+    shorter = {
+        "values=[0, 20, 30, 40, 60]": "values=[0, 60]",
+        "resolution=2.0, coarse=10.0": "resolution=5.0, coarse=15.0",
+    }
+    check_runs("payload", shorter=shorter)
