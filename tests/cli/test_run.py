@@ -225,7 +225,7 @@ def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:
     assert refused.stderr.startswith("Error: there is no variable") and "did you mean dps.gain" in refused.stderr
 
 
-def test_a_dps_that_stopped_is_let_on_when_the_machine_is_back(hub: Hub) -> None:
+def test_a_stopped_dps_goes_on_with_the_machine_back(hub: Hub) -> None:
     options = ("--url", hub.url, "--field", "max_age=0.2", "--pace", "", *FAR)
     patience = ("--url", hub.url, "--timeout", PATIENCE)
     with MachineProcess(ServoMachineScenario(), hub.url) as machine, start(SERVO, *options) as program:

@@ -151,7 +151,7 @@ def test_step_command_takes_the_time_of_full_acceleration_and_full_braking() -> 
     assert sent[-1] == 0.4
 
 
-def test_speed_at_a_distance_from_the_end_is_that_of_constant_braking() -> None:
+def test_speed_before_the_end_is_that_of_constant_braking() -> None:
     one = limiter(rate=inf, acceleration=10.0, upper=0.4)
     before = 0.0
     while (sent := one.limit([1.0]).item()) < 0.3:

@@ -218,7 +218,7 @@ def test_racing_saves_what_the_worst_condition_tells():
 
 
 @pytest.mark.parametrize("budget", [4, 10, 23, 40])
-def test_racing_finishes_points_within_a_budget_that_is_too_small_for_all(budget):
+def test_racing_finishes_points_within_a_small_budget(budget):
     class SpentError(Exception):
         pass
 

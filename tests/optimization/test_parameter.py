@@ -17,7 +17,7 @@ SPACE = [
 
 
 @given(st.sampled_from(SPACE), st.floats(0.0, 1.0))
-def test_every_place_of_the_unit_interval_is_a_value_that_leads_back(dimension, u):
+def test_every_place_of_the_unit_interval_leads_back(dimension, u):
     value = dimension.from_unit(u)
     assert dimension.check(value) == value
     again = dimension.from_unit(dimension.to_unit(value))

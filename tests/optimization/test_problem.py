@@ -65,7 +65,7 @@ def test_boundary_of_a_swing_is_that_of_its_energy():
     assert len(boundary.sweep) <= 2 * (9 + 2 * 19)
 
 
-def test_sweep_finds_the_best_point_and_stops_where_the_threshold_is_exceeded():
+def test_a_sweep_finds_the_best_and_stops_at_the_threshold():
     sweep = _problem().sweep(points=9, executor="serial", progress=False)
     speeds = sweep.points[:, 0]
     np.testing.assert_array_equal(speeds, np.arange(9.0))

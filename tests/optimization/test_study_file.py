@@ -27,7 +27,7 @@ def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
         assert len(again.trials) == finished + 5
 
 
-def test_a_study_in_a_folder_that_cannot_be_written_can_be_read():
+def test_a_study_in_a_read_only_folder_can_be_read():
     with open_folder() as folder:
         path = folder / "a study?.db"
         with pendulum_problem().study(path, solver="sobol") as study:

@@ -87,7 +87,7 @@ class Interrupted(Executor):
         raise KeyboardInterrupt
 
 
-def test_a_point_that_has_not_finished_its_conditions_is_not_the_best():
+def test_a_point_with_unfinished_conditions_is_not_the_best():
     problem = _problem(conditions=[{DAMPING: 0.0}, {DAMPING: 1.0}])
     speeds = [1.0, 2.0, 3.0]
     half = problem.sweep(values=speeds, executor=Interrupted(5), progress=False)

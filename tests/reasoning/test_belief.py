@@ -276,7 +276,7 @@ def test_an_uncertainty_that_does_not_fit_is_refused(tracked, uncertainty, why):
 # -- beliefs from which nothing can begin
 
 
-def test_a_belief_that_is_missing_or_out_of_bounds_is_refused_with_its_reason(tracked):
+def test_a_missing_belief_or_one_out_of_bounds_is_refused(tracked):
     testbed, context, _ = tracked
     belief = Belief.of(testbed, context)
     unknown = TrackedScenario(gain_of_rate=np.nan)
@@ -285,7 +285,7 @@ def test_a_belief_that_is_missing_or_out_of_bounds_is_refused_with_its_reason(tr
         belief.start(unknown.build())
 
 
-def test_an_estimate_a_little_past_a_stop_is_clipped_and_one_far_beyond_is_refused(tracked):
+def test_an_estimate_past_a_stop_is_clipped_or_refused(tracked):
     testbed, _, mental = tracked
     context, starter = testbed.default_context(), Starter(mental)
     for angle in (2.19, -2.19):

@@ -119,7 +119,7 @@ def test_receding_horizon_comes_to_the_goal_and_stays():
     assert testbed.read(context, STATE) == pytest.approx([GOAL, 0.0], abs=0.1)
 
 
-def test_without_an_eligible_candidate_the_plan_stays_and_the_dps_falls_back(caplog):
+def test_without_an_eligible_candidate_the_dps_falls_back(caplog):
     testbed, simulator, context = asked(PusherScenario(wall=-5.0))
     simulator.AdvanceTo(SAMPLED + HORIZON)
     shown = planner(testbed, context)

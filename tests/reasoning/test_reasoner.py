@@ -105,7 +105,7 @@ def test_swing_up_time_agrees_with_ode_solver():
     assert decision.quality > 1.8  # 2 is upright; either torque alone reaches 0.5.
 
 
-def test_what_is_left_to_decide_depends_on_the_state_in_which_it_is_asked(mass):
+def test_what_is_left_to_decide_depends_on_the_state(mass):
     # After 1 s with full force the mass is at 0.5 m: switching now stops it at 1 m, and nothing can stop it earlier.
     reasoner = make(method="grid", options={"points": 25})
     decision = decide(reasoner, mass, values={"u.switch": 3.0}, at=1.0)
@@ -141,14 +141,14 @@ def test_a_plan_in_use_that_is_best_is_kept(mass):
         assert decision.health.improvement == 0.0
 
 
-def test_a_plan_in_use_beyond_the_ranges_is_tried_all_the_same(mass):
+def test_a_plan_in_use_beyond_the_ranges_is_tried(mass):
     decision = decide(make(decision=[Parameter("u.switch", 2.0, 3.0)]), mass, values={"u.switch": 1.0})
     assert decision.keeps_plan
     assert decision.values == {"u.switch": 1.0}
     assert min(candidate.values["u.switch"] for candidate in decision.candidates[1:]) >= 2.0
 
 
-def test_a_given_plan_is_tried_beside_the_one_in_use_and_starts_the_method(mass):
+def test_a_given_plan_is_tried_and_starts_the_method(mass):
     reasoner = make(method="predictive-sampling", options={"sigma": 0.01, "population": 4}, budget=Budget(rollouts=6))
     decision = decide(reasoner, mass, plan={"u.switch": 1.05})
     values = [candidate.values["u.switch"] for candidate in decision.candidates]
@@ -396,7 +396,7 @@ def test_uncertain_beliefs_are_judged_by_the_risk(mass):
     assert worst.health.spread > 0.0
 
 
-def test_a_wrong_belief_costs_as_much_as_it_is_wrong_and_the_spread_warns_of_it(mass):
+def test_a_wrong_belief_costs_and_its_spread_warns_of_it(mass):
     context = mass.default_context()
     mass.write(context, {"dps.estimate": [0.36, 0.0]})  # It is at 0.
     settings = {"method": "grid", "options": {"points": 31}, "budget": Budget(rollouts=32 * 4)}
@@ -589,7 +589,7 @@ def test_a_plan_that_cannot_be_decided_is_refused(mass):
         decide(make(), mass, plan={"u.switch": 1.0, "u.other": 1.0})
 
 
-def test_a_second_decision_at_the_same_time_is_refused_and_the_first_is_finished(mass):
+def test_a_second_decision_at_the_same_time_is_refused(mass):
     begun, go_on, refused = threading.Event(), threading.Event(), []
 
     def slow(state):

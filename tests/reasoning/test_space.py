@@ -19,7 +19,7 @@ def test_a_search_varies_the_numbers_and_the_knots():
     assert [p.address for p in SPACE.parameters] == ["u.speed", *(f"u.plan[{k}]" for k in range(1, 5)), "dps.gait"]
 
 
-def test_a_plan_in_use_is_shifted_to_the_time_of_the_decision():
+def test_a_plan_in_use_is_shifted_to_the_decision():
     # One second later it begins at the second knot, and holds its last one.
     assert SPACE.point(HELD, 6.0) == pytest.approx((1.0, 2.0, 4.0, 4.0, 4.0, 3.0))
 
@@ -31,7 +31,7 @@ def test_a_point_becomes_values_by_address_and_a_trajectory_begins_now():
     np.testing.assert_allclose(values["u.plan"], [6.0, 1.0, 2.0, 3.0, 4.0])
 
 
-def test_a_plan_with_a_limited_rate_goes_on_from_the_plan_in_use():
+def test_a_rate_limited_plan_goes_on_from_the_one_in_use():
     limited = Trajectory("u.plan", 4, 3.0, "linear", lower=-10.0, upper=10.0, rate=2.0)
     space = DecisionSpace([limited])
     values = space.values((9.0, -9.0, 9.0, -9.0), {"u.plan": HELD["u.plan"]}, 5.5)

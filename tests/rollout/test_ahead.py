@@ -36,7 +36,7 @@ def _points(count):
     return [{THETA: 0.1 * i} for i in range(count)]
 
 
-def test_a_worker_has_its_next_rollout_before_it_has_finished_the_last(always):
+def test_a_worker_has_its_next_rollout_before_it_finishes(always):
     with ProcessExecutor(1) as executor:
         results, most = _watched(executor, TASK, _points(5))
     assert most == 2
@@ -85,7 +85,7 @@ def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, al
     assert all(results[i].identical(expected[i]) for i in (0, 2, 3, 4, 5))
 
 
-def test_rollouts_that_kill_their_workers_one_after_another_have_two_tries_each(always, tmp_path):
+def test_rollouts_that_kill_their_workers_have_two_tries_each(always, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))

@@ -56,7 +56,7 @@ def _future(task, testbed, simulator, address, t0):
     return np.array(found)
 
 
-def test_after_a_fork_forecast_and_future_are_equal_to_the_last_bit(running):
+def test_after_a_fork_forecast_and_future_are_equal(running):
     scenario, address, after, testbed, simulator = running
     t0 = simulator.get_context().get_time()
     start = testbed.fork(simulator)

@@ -131,7 +131,7 @@ class InterruptedBuild(PendulumScenario):
 
 
 @pytest.mark.parametrize("at", [1.0, -1.0])
-def test_ctrl_c_while_a_testbed_is_built_is_not_a_failed_build(at):
+def test_ctrl_c_during_a_build_is_no_failed_build(at):
     task = RolloutTask(InterruptedBuild(), 0.1, Quality(abs, THETA))
     with SerialExecutor() as executor, pytest.raises(KeyboardInterrupt):
         list(executor.run(task, [{"scenario.at": at}]))

@@ -45,14 +45,14 @@ def test_a_rollout_that_is_better_in_the_end_is_never_pruned(reading, minimize):
     assert ended > 20 or reading in ("best", "end")
 
 
-def test_a_cost_that_grows_is_pruned_as_soon_as_it_is_too_large():
+def test_a_growing_cost_is_pruned_once_it_is_too_large():
     cost = Quality(abs, "x", minimize=True, reading="integral")
     # Trapezoids of 0.2 s under 1: 0.2, 0.4, 0.6
     assert ending(cost, np.ones(6), to_beat=0.5)[:2] == (4, "pruned")
     assert ending(cost, np.ones(6), to_beat=np.nan)[:2] == (6, "")
 
 
-def test_a_bound_of_the_user_prunes_by_the_time_that_is_left():
+def test_a_users_bound_prunes_by_the_time_left():
     highest = Quality(abs, "x")
     pruning = Pruning(bound=lambda left: 2.0 * left)
     # 2 left falls to 1.2 at the third sample, and below 1 at the fourth.
@@ -74,7 +74,7 @@ def test_patience_counts_from_the_last_gain():
     assert ending(quality, [0.0, 1.0, 1.4, 1.4, 1.4, 9.0], to_beat=np.nan, pruning=pruning)[:2] == (4, "stalled")
 
 
-def test_a_pruned_rollout_agrees_with_the_whole_one_up_to_its_end():
+def test_a_pruned_rollout_agrees_with_the_whole_one():
     angle = "sim.sys.Pendulum.theta.position"
     cost = Quality(lambda q: abs(q - 1.0), angle, minimize=True, reading="integral")
     whole, pruned = (RolloutTask(PendulumScenario(), 2.0, cost, pruning=pruning) for pruning in (None, Pruning()))

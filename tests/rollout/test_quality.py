@@ -180,7 +180,7 @@ def test_samples_cost_no_steps_of_their_own_where_events_coincide(period, sample
     np.testing.assert_array_equal(instants[coincide][1:], events[coincide][1:])
 
 
-def test_a_rollout_takes_the_steps_of_a_simulation_that_stops_at_events():
+def test_a_rollout_steps_like_a_simulation_with_events():
     scenario = AcrobotScenario(simulator_config=SimulatorConfig(max_step_size=0.02, use_error_control=False))
     task = RolloutTask(scenario, 15.0, Quality(abs, SHOULDER), sample_period=0.1)
     runner = RolloutRunner(task)

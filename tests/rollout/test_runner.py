@@ -300,7 +300,7 @@ def test_what_is_set_in_a_restored_s0_is_not_initialized_away():
 
 
 @pytest.mark.parametrize("time_step", [0.0, 0.005])
-def test_hidden_variables_of_the_start_are_in_force_from_the_first_rollout(time_step):
+def test_hidden_variables_of_the_start_act_from_the_first_rollout(time_step):
     scenario = AcrobotScenario(time_step=time_step)
     testbed = scenario.build()
     context = testbed.default_context()
@@ -312,7 +312,7 @@ def test_hidden_variables_of_the_start_are_in_force_from_the_first_rollout(time_
     assert runner.run({}).record[FRICTION].tolist() == [0.123] * 3
 
 
-def test_a_discrete_plant_that_is_no_longer_finite_is_a_failed_outcome():
+def test_a_discrete_plant_gone_infinite_is_a_failed_outcome():
     # Neither the quality nor the recording would notice: they do not look at the plant.
     task = RolloutTask(
         AcrobotScenario(time_step=0.005), 0.015, Quality(lambda t: t, "time"), sample_period=0.005, record=("time",)

@@ -55,7 +55,7 @@ def _future(task, testbed, simulator, address):
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_rollouts_from_two_starts_are_the_true_future_to_the_last_bit(executor):
+def test_rollouts_from_two_starts_equal_the_true_future(executor):
     testbed, simulator = _running(DISCRETE, 0.5)
     task = RolloutTask(DISCRETE, 0.5, record=[ELBOW])
     starts, futures = [], []
@@ -83,7 +83,7 @@ def test_starts_reach_pools_and_the_processes_that_replace_a_broken_one():
     assert all(result.identical(expected) for result in results.values())
 
 
-def test_a_worker_that_takes_the_place_of_a_lost_one_begins_at_the_start_too(tmp_path):
+def test_a_worker_in_the_place_of_a_lost_one_begins_there(tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
     scenario = TreacherousScenario(fuse=str(fuse))
@@ -98,7 +98,7 @@ def test_a_worker_that_takes_the_place_of_a_lost_one_begins_at_the_start_too(tmp
     assert results[1].end == "horizon"
 
 
-def test_with_error_control_a_start_continues_where_both_sides_take_a_new_integrator():
+def test_with_error_control_both_sides_take_a_new_integrator():
     scenario = SpaceClimberScenario()
     testbed, simulator = _running(scenario, 0.61, {"u.walk": 0.7})
     task = RolloutTask(scenario, 0.6, record=["sim.sys.climber.base.pose", "u.walk"], sample_period=0.15)
@@ -110,7 +110,7 @@ def test_with_error_control_a_start_continues_where_both_sides_take_a_new_integr
     np.testing.assert_array_equal(found["u.walk"], 0.7)
 
 
-def test_a_start_and_a_snapshot_of_the_same_state_give_the_same_rollout():
+def test_a_start_and_its_snapshot_give_the_same_rollout():
     testbed, simulator = _running(DISCRETE, 0.53)
     context = simulator.get_mutable_context()
     testbed.write(context, {"sim.sys.Acrobot.elbow.locked": 1.0, "sim.sys.Acrobot.upper_link.mass": 1.25})
@@ -143,7 +143,7 @@ def test_what_a_start_does_not_hold_is_as_in_the_task():
     assert (record[ELBOW][0], record["dps.ticks"][0]) == (0.0, 25.0)
 
 
-def test_samples_of_a_start_lie_at_the_instants_of_the_testbeds_events():
+def test_samples_of_a_start_lie_at_the_testbeds_events():
     # 0.3 + 3 * 0.1 and 30 * 0.02 differ in the last bit: another step would be taken between them.
     testbed, simulator = _running(DISCRETE, 0.3)
     start = Start.of(testbed, simulator.get_context())

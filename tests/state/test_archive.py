@@ -83,7 +83,7 @@ def test_a_byte_that_is_changed_is_found_or_changes_nothing():
     assert refused > len(whole) / 3
 
 
-def test_a_file_that_is_cut_off_or_overwritten_in_part_is_found():
+def test_a_cut_off_or_partly_overwritten_file_is_found():
     whole = SNAPSHOT.to_bytes()
     for length in range(len(whole)):
         assert load(whole[:length]) is None, length

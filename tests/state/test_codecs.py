@@ -49,7 +49,7 @@ def test_texts_and_numbers_keep_their_type(value):
 
 
 @pytest.mark.parametrize("fields", [BaseField.kXYZs, BaseField.kXYZs | BaseField.kNormals | BaseField.kRGBs])
-def test_a_point_cloud_keeps_every_point_and_its_number_of_points_varies(fields):
+def test_a_point_cloud_of_any_size_keeps_every_point(fields):
     cloud = PointCloud(5, Fields(fields))
     cloud.mutable_xyzs()[:] = np.arange(15).reshape(3, 5) / 3
     if cloud.has_rgbs():

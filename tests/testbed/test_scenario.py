@@ -142,7 +142,7 @@ def test_what_is_spelt_right_at_every_level_is_read(tmp_path):
         ({"simulator_config": SimulatorConfig(start_time=1.0)}, "start_time must be 0, not 1.0 s"),
     ],
 )
-def test_a_value_of_another_type_is_refused_when_the_testbed_is_built(values, message):
+def test_a_value_of_another_type_is_refused_at_build(values, message):
     with pytest.raises(ScenarioError, match=message):
         AcrobotScenario(**values).build()
     AcrobotScenario(period=np.float64(0.02)).validate()
@@ -261,7 +261,7 @@ def test_the_pace_of_a_simulation_does_not_identify_it():
     assert paced.record()["simulator.accuracy"] == 1e-6
 
 
-def test_one_of_several_scenarios_in_a_file_is_chosen_by_its_key(tmp_path):
+def test_a_key_chooses_one_of_several_scenarios_in_a_file(tmp_path):
     (tmp_path / "s.yaml").write_text("Slow:\n  period: 0.1\nFast:\n  period: 0.01\n")
     assert load_scenario(f"{NAME}@{tmp_path / 's.yaml'}#Fast").period == 0.01
     with pytest.raises(ScenarioError, match="has no key 'Medium'; it has: Slow, Fast"):

@@ -401,7 +401,7 @@ def test_the_real_ports_carry_a_command_in_real_and_twin_only(mode):
 
 
 @pytest.mark.parametrize("mode", ["sim", "shadow", "real", "twin"])
-def test_the_simulated_actuators_get_the_command_unless_the_real_ones_alone_do(mode):
+def test_simulated_actuators_get_the_command_unless_real_ones_alone_do(mode):
     testbed, context = _pose_testbed(mode)
     look, speed = testbed.read(context, "sim.act.look.y"), testbed.read(context, "sim.act.speed.y")
     if mode == "real":

@@ -224,7 +224,7 @@ def test_landscape_of_one_parameter_is_a_line():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("dps.period [s]", "speed")
 
 
-def test_the_line_over_one_of_several_is_the_best_at_each_value():
+def test_the_line_over_one_of_several_is_the_best():
     study, h = grid()
     axes = plot_landscape(study, FRICTION.address).axes[0]
     np.testing.assert_array_equal(drawn(axes, "h"), np.column_stack([[0.001, 0.01, 0.1, 1.0], np.nanmax(h, axis=0)]))

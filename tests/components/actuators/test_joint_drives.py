@@ -106,7 +106,7 @@ def test_friction_does_not_pass_the_current_loop() -> None:
     )
 
 
-def test_spin_down_under_coulomb_friction_is_linear_and_of_the_reflected_inertia() -> None:
+def test_spin_down_under_coulomb_friction_is_linear() -> None:
     """Wheel b alone: I v' = -coulomb, with I = m r^2 / 2 + N^2 I_rotor."""
     builder, plant = two_joints()
     gear, rotor = 100.0, 2e-5
@@ -172,7 +172,7 @@ def test_joint_without_its_one_velocity_is_refused() -> None:
         JointDrives(plant, [plant.GetJointByName("free")], period=PERIOD)
 
 
-def test_drives_that_resume_stand_where_a_command_of_some_time_has_led_them() -> None:
+def test_resumed_drives_stand_where_an_old_command_led_them() -> None:
     drive = {"time_constant": 0.01, "delay": 3, "max_delay": 4, "rate": 500.0, "limit": 20.0}
     expected = torques(200, **drive)[-1]
     _, plant = two_joints()

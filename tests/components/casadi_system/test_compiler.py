@@ -100,7 +100,7 @@ def test_a_missing_compiler_is_named_with_the_remedy(cache, monkeypatch):
 
 
 @pytest.mark.parametrize("compiler", ["no-such-cc", "cc -no-such-flag"])
-def test_where_machine_code_is_only_wanted_a_function_without_it_is_interpreted(cache, monkeypatch, compiler):
+def test_a_function_without_machine_code_may_be_interpreted(cache, monkeypatch, compiler):
     machine = CasadiSystem(_function(), compile=None)
     assert _runs(cache) == 1
     monkeypatch.setenv("CC", compiler)

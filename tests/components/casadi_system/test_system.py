@@ -197,7 +197,7 @@ class _Counter(casadi.Callback):
         return [2 * arguments[0]]
 
 
-def test_an_output_of_the_state_alone_is_computed_when_the_state_changes():
+def test_an_output_of_the_state_follows_the_state_alone():
     counter, x, u = _Counter(), casadi.MX.sym("x", 2), casadi.MX.sym("u", 2)
     system = CasadiSystem(
         casadi.Function("output", [x, u], [counter(x), u], ["x", "u"], ["y", "seen"]),

@@ -17,7 +17,7 @@ from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner, swing_up, swing_
 UPRIGHT, HANGING = np.array([0.0, np.pi, 0.0, 0.0]), np.zeros(4)
 
 
-def test_the_cost_is_zero_where_the_pole_stands_still_in_the_middle() -> None:
+def test_the_cost_is_zero_upright_in_the_middle() -> None:
     assert cost(UPRIGHT) == pytest.approx(0.0, abs=1e-15)
     assert cost(HANGING) == pytest.approx(2.0)
     assert all(cost(UPRIGHT + step) > 0.0 for step in 1e-3 * np.eye(4))
@@ -50,7 +50,7 @@ def test_the_same_seed_decides_the_same_and_another_one_does_not() -> None:
     assert not np.array_equal(swings[0].states, swings[2].states)
 
 
-def test_the_chosen_plan_predicts_the_true_future_where_the_mental_copy_is_as_fine() -> None:
+def test_a_mental_copy_as_fine_predicts_the_true_future() -> None:
     scenario = CartPoleScenario(plant_config=MultibodyPlantConfig(time_step=0.02, use_sampled_output_ports=False))
     testbed = scenario.build()
     context = testbed.default_context()
@@ -74,7 +74,7 @@ def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
     assert np.abs(swing.states[:, 0]).max() < 3.0
 
 
-def test_over_lcm_the_dps_decides_for_a_machine_in_a_process_of_its_own(tmp_path: Path) -> None:
+def test_over_lcm_the_dps_decides_for_a_machine_process(tmp_path: Path) -> None:
     scenario = CartPoleScenario(onboard=True, rollouts=8)
     swing = swing_up_on_machine(scenario, seconds=0.8, record=tmp_path / "swing.lcm")
     assert swing.tilt[0] == pytest.approx(np.pi)

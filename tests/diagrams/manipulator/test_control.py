@@ -159,7 +159,7 @@ def test_force_on_the_wall_is_that_of_two_springs_in_series(law: str) -> None:
 
 
 @pytest.mark.parametrize("turn", [[0.0] * 7, [0.3, -0.2, 0.5, 0.4, -0.8, 0.6, 1.0]])
-def test_arm_at_rest_senses_the_weight_of_its_tool_and_no_contact(turn: list[float]) -> None:
+def test_resting_arm_senses_its_tools_weight_and_no_contact(turn: list[float]) -> None:
     q = np.array(ARM.home) + turn
     run = Run(TESTBEDS["joint_impedance"])
     positions = {f"sim.sys.arm.{name}.position": value for name, value in zip(JOINT_NAMES, q, strict=True)}
@@ -193,7 +193,7 @@ def test_work_of_the_drives_becomes_energy() -> None:
     assert abs(work) > 1.0
 
 
-def test_controllers_model_stays_as_it_is_when_the_simulated_arm_becomes_heavier() -> None:
+def test_controllers_model_stays_when_the_arm_becomes_heavier() -> None:
     """It sags by the weight that the DPS does not know of, over the stiffness."""
     run = Run(TESTBEDS["joint_impedance"], **SMOOTH)
     run.testbed.write(run.context, {"sim.sys.arm.link_4.mass": ARM.masses[3] + 1.0})

@@ -69,7 +69,7 @@ def test_pose_far_away_is_no_goal() -> None:
     np.testing.assert_allclose(torques[0], torques[1], atol=1e-9)
 
 
-def test_velocity_that_the_positions_do_not_bear_out_counts_to_the_disagreement() -> None:
+def test_velocity_against_the_positions_counts_as_disagreement() -> None:
     floating, honest = FloatInPlace(), FloatInPlace()
     for fallback in (floating, honest):
         torque(fallback, HOME)
@@ -228,7 +228,7 @@ def test_arm_that_really_is_elsewhere_is_believed_by_a_reset_only() -> None:
     assert arm.cycle().ok
 
 
-def test_arm_that_was_not_commanded_for_long_departs_from_the_measured_torque() -> None:
+def test_arm_idle_for_long_departs_from_the_measured_torque() -> None:
     arm = GuardedArm()
     arm.heard = lambda measured: {}
     arm.run(round(CARRY / T) + 100)

@@ -58,7 +58,7 @@ CONSTRAINED_NLOPT = sorted(name for name, algorithm in ALGORITHMS.items() if alg
 
 
 @pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *CONSTRAINED_NLOPT])
-def test_under_a_constraint_it_finds_the_kkt_point_and_keeps_the_constraint(name):
+def test_under_a_constraint_it_finds_the_kkt_point(name):
     options = {"tolerance": 1e-5} if name == "differential-evolution" else {}
     solver, best = solve(name, CONSTRAINED, violations=half_plane, limit=4000, **options)
     coarse = name in ("GN_ISRES", "GN_AGS")

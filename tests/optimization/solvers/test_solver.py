@@ -162,7 +162,7 @@ def test_a_failed_start_is_named():
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_points_given_by_hand_are_taken_and_change_nothing_that_was_asked(name):
+def test_points_given_by_hand_change_nothing_that_was_asked(name):
     solver = make_solver(name, SPHERE.space, budget=200)
     by_hand = evaluation((1.0, -0.5), SPHERE.cost)
     solver.tell([by_hand])
@@ -187,7 +187,7 @@ def test_it_learns_from_points_given_by_hand(name):
 
 
 @pytest.mark.parametrize("name", SEEDED)
-def test_it_refuses_to_be_told_of_other_points_than_it_asked_for(name):
+def test_it_refuses_to_be_told_of_other_points(name):
     solver = make_solver(name, SPHERE.space, budget=200)
     points = solver.ask()
     with pytest.raises(SolverError, match="not told yet"):
@@ -340,7 +340,7 @@ def test_an_exception_of_any_kind_reaches_ask_as_itself():
 
 
 @pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "LD_SLSQP"])
-def test_gradients_that_are_told_are_used_in_the_units_of_the_parameters(name):
+def test_told_gradients_are_in_units_of_the_parameters(name):
     space = (Parameter("gain", 1e-2, 1e3, log=True), Parameter("x", -3.0, 4.0))
     solver = make_solver(name, space, gradient="autodiff")
     asked = 0
