@@ -6,6 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -100,7 +101,8 @@ class MotionPlayer:
                 "a motion is recorded of a testbed without continuous state, from which rollouts continue exactly: "
                 "use a discrete plant (a positive time_step), and discrete systems"
             )
-        following = self._followers()
+        self._paths = tuple(path for path, _ in leaves(testbed.diagram))
+        self._following = following = self._followers()
         self._state = StateLayout(testbed.diagram, state=lambda path: path != BOARD, parameters=lambda path: False)
         self._world = StateLayout(
             testbed.diagram, state=lambda path: path != BOARD and path not in following, parameters=lambda path: False
@@ -111,8 +113,8 @@ class MotionPlayer:
         variables = self._testbed.variables()
         sources = {}
         for address in self.motion.varied:
-            owners = [path for path in systems if address.startswith(f"{path}.")]
-            if not owners or is_plant(systems[owners[0]]):
+            owner = self._owner(address)
+            if not owner or is_plant(systems[owner]):
                 raise MotionError(
                     f"{address} belongs to the plant, to the scene or to the switches, on which the motion depends: "
                     "vary it without motion="
@@ -122,7 +124,7 @@ class MotionPlayer:
                     f"{address} changes while time runs, so that it is forgotten: along a recorded motion, vary "
                     "parameters (of kind 'a')"
                 )
-            sources[owners[0]] = address
+            sources[owner] = address
         found = followers(self._testbed.diagram, sources)
         for path in found:
             if is_plant(systems[path]) or path.startswith(T_ACT):
@@ -132,6 +134,19 @@ class MotionPlayer:
                     "sensors that do not depend on it, or leave out motion="
                 )
         return found
+
+    def _owner(self, address: str) -> str:
+        """Return the path of the system that a variable belongs to; empty if it is the plant's, or no system's."""
+        return next((path for path in self._paths if address.startswith(f"{path}.")), "")
+
+    def fixed(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those of the values set in s0 on which the motion may depend: not the parameters of what follows."""
+        variables = self._testbed.variables()
+        return {
+            address: value
+            for address, value in parameters.items()
+            if self._owner(address) not in self._following or variables[address].kind != A
+        }
 
     def begins(self, instants: np.ndarray) -> list[float | None]:
         """Return when the window of each sample begins, in seconds; None if the rollout goes on from the one before.
@@ -156,7 +171,7 @@ class MotionPlayer:
             instants: The simulator's time at each sample, shape (n,).
         """
         known = _RECORDINGS.setdefault(self._testbed, {})
-        return known.setdefault((self.motion.memory, tuple(self.motion.varied), instants.tobytes()), {})
+        return known.setdefault((self.motion.memory, tuple(self._following), instants.tobytes()), {})
 
     def take(self, context: Context) -> FlatState:
         """Return the state from which a window begins."""
@@ -186,8 +201,3 @@ class MotionPlayer:
             f"t = {context.get_time():g} s, {self._world.name_at(index)} is not as recorded. A system has memory "
             "outside the Context, see Problem.check"
         )
-
-
-def fixed(motion: RecordedMotion, parameters: Mapping[str, object]) -> dict[str, object]:
-    """Return what is set in s0 beside the varied variables: each such choice has a motion of its own."""
-    return {address: value for address, value in parameters.items() if address not in motion.varied}

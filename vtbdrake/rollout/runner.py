@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
-from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording, fixed
+from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
@@ -209,14 +209,14 @@ class RolloutRunner:
             self._recordings = self._player.recordings(self._instants) if by_default else {}
 
     def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
-        """Return the motion with the varied variables as they are in s0, recorded when it is first asked for.
+        """Return the motion with the parameters of all that follows as they are in s0, recorded when it is first asked for.
 
         From default starts it is recorded once for all tasks on this testbed with the same samples. What fails or ends
         it early does the same to the rollouts along it, which go on by themselves from there.
         """
         if self._player is None:
             return Recording()
-        others = fixed(self._player.motion, parameters)
+        others = self._player.fixed(parameters)
         key = _key(others)
         if key not in self._recordings:
             recording = Recording()
