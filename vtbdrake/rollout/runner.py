@@ -209,7 +209,7 @@ class RolloutRunner:
             self._recordings = self._player.recordings(self._instants) if by_default else {}
 
     def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
-        """Return the motion with the parameters of all that follows as they are in s0, recorded when it is first asked for.
+        """Return the motion, with the parameters of all that follows as they are in s0; it is recorded at first.
 
         From default starts it is recorded once for all tasks on this testbed with the same samples. What fails or ends
         it early does the same to the rollouts along it, which go on by themselves from there.
