@@ -41,6 +41,7 @@ BENCHMARKS: Registry = {
     "study_against_optuna": "benchmarks.study:study_against_optuna",
     "auto_regret": "benchmarks.auto_regret:auto_regret",
     "racing_savings": "benchmarks.study:racing_savings",
+    "camera_study_speedup": "benchmarks.camera_study:camera_study_speedup",
     "time_to_target": "benchmarks.gait:time_to_target",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
 }

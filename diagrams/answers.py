@@ -20,6 +20,7 @@ from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
 
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
+    "O1": "vtbdrake_diagrams.satellite.mount:mount",
     "O4": "vtbdrake_diagrams.space_climber.answers:payload",
     "R1": "vtbdrake_diagrams.space_climber.answers:heading",
     "C1": "vtbdrake_diagrams.manipulator.answers:control",

@@ -1,0 +1,374 @@
+"""Application O1: where should the docking camera sit to see as many markers as possible during the capture?
+
+The capture is led by a pose sensor, and the camera looks on: so the motion does not depend on the camera, and is
+recorded once for every capture (`vtbdrake.RecordedMotion`). The camera sits on the front face of the base, on which the
+arm stands, too. Its position on the face and the direction of its view are decided.
+
+What could bend the answer was fixed before the first placement was judged:
+
+* the placements by hand, `BY_HAND`: above the arm, on either side, in a corner, and beside the foot of the arm, all but
+  the first aimed at the place where the bar is gripped;
+* the captures, `SEEDS`: the first start poses of the scenario, all of which succeed;
+* the time that counts: from the start until the base and the target rest against each other, `HORIZON`;
+* the light: the scenario's own;
+* what counts as a difference: `TELLING` markers. The count is a whole number, and moves by some tenths for no reason.
+
+``python -m vtbdrake_diagrams.satellite.mount [--full]`` prints the answer and draws it. The DPS keeps the pose of the
+camera that it knows: what it detects in an image does not depend on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import click
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import ArrayLike, NDArray
+
+import vtbdrake as vtb
+from vtbdrake.optimization import Sweep
+from vtbdrake.rollout import Executor, ProcessExecutor, RolloutResult
+from vtbdrake.state.systems import pose_to_array
+from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
+from vtbdrake.visualization.study_plots import BEST
+from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.satellite.bodies import Servicer, Target
+from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
+from vtbdrake_diagrams.satellite.start import random_start
+
+POSE = "sim.sense.docking_camera.pose"
+IMAGE = "sim.sense.docking_camera.color_image"
+COUNT = "dps.env.markers.count"
+MODE = "dps.impl.supervisor.mode"
+
+HORIZON = 24.0
+"""How long the markers count, in s: from the start until the relative motion has stopped."""
+SAMPLE_PERIOD = 2.0
+"""How often they are counted, in s."""
+SEEDS = tuple(range(8))
+"""The start poses over which the count is averaged; the short version takes the first `FEW`."""
+FEW = 3
+TELLING = 0.3
+"""The least difference of mean counts that means anything, in markers."""
+
+# On the front face, 2 cm before it, as far as the camera's housing fits.
+_X, _REACH = 0.62, 0.45
+# How far the view may turn away from straight ahead, in rad.
+_TURN = 0.5
+# How far the camera stays away from the axis of the arm's foot, in m.
+_FOOT = 0.18
+
+Array = NDArray[np.float64]
+
+
+def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
+    """Return [x, y, z, roll, pitch, yaw] of the camera in B, on the front face.
+
+    Args:
+        y: To the left, in m.
+        z: Up, in m.
+        tilt: How far it looks down, in rad.
+        pan: How far it looks to the left, in rad.
+    """
+    return np.array([_X, y, z, -np.pi / 2 - tilt, 0.0, -np.pi / 2 + pan])
+
+
+def aimed(y: float, z: float) -> Array:
+    """Return the pose of a camera on the front face that looks at the place where the bar is gripped."""
+    p_BH = np.array([SatelliteScenario().distance, 0.0, 0.0]) + Target().X_TH.translation()
+    ahead, left, up = p_BH - [_X, y, z]
+    return pose(y, z, tilt=float(np.arctan2(-up, np.hypot(ahead, left))), pan=float(np.arctan2(left, ahead)))
+
+
+BY_HAND: dict[str, Array] = {
+    "above the arm": pose_to_array(Servicer().X_BC),
+    "on the left": aimed(0.4, 0.0),
+    "on the right": aimed(-0.4, 0.0),
+    "in the upper left corner": aimed(0.4, 0.4),
+    "beside the foot of the arm": aimed(0.25, -0.35),
+}
+"""The placements by hand."""
+
+PARAMETERS = (
+    vtb.Parameter(f"{POSE}[1]", -_REACH, _REACH),
+    vtb.Parameter(f"{POSE}[2]", -_REACH, _REACH),
+    vtb.Parameter(f"{POSE}[3]", -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
+    vtb.Parameter(f"{POSE}[5]", -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
+)
+
+
+def markers_seen(count: float) -> float:
+    """Return f: the number of markers that the DPS has detected in the last image."""
+    return count
+
+
+def distance_from_foot(value: Array) -> float:
+    """Return how far a camera with this pose is from the axis of the arm's foot, in m."""
+    _, y, z = Servicer().shoulder
+    return float(np.hypot(value[1] - y, value[2] - z))
+
+
+def scenario() -> SatelliteScenario:
+    """Return the scenario: a capture that the pose sensor leads, while the docking camera looks on."""
+    return SatelliteScenario(perception="pose_sensor", onlookers="camera")
+
+
+def capture(seed: int) -> dict[str, Any]:
+    """Return what makes the capture start as that of a scenario with this seed does."""
+    own = scenario()
+    start = random_start(seed, tumble=np.radians(own.tumble_deg), distance=own.distance)
+    return {
+        "sim.sys.target.body.pose": pose_to_array(start.X_WT),
+        "sim.env.release.velocity": np.concatenate((start.w_WT, start.v_WT)),
+    }
+
+
+def mount_problem(
+    parameters: Sequence[vtb.Parameter] = PARAMETERS,
+    *,
+    seeds: Sequence[int] = SEEDS,
+    reading: str = "integral",
+    fixed: Mapping[str, float] | None = None,
+    recorded: bool = True,
+) -> vtb.Problem:
+    """State the question in the paper's five steps.
+
+    Args:
+        parameters: Entries of the camera's pose.
+        seeds: Of the captures over which the quality is averaged.
+        reading: Of the number of markers over time: ``integral``, in markers times s, or ``best``, the paper's maximum.
+        fixed: Values of other entries of the pose, by address.
+        recorded: Whether candidates are judged along recorded motions.
+    """
+    own = scenario()
+    upper = float(len(Target().tags))
+    # The count that f reads is of an image that is at most a period of the camera old.
+    memory = 1.0 / own.camera_rate + 0.02
+    return vtb.Problem(
+        scenario=own,
+        parameters=list(parameters),
+        quality=vtb.Quality(markers_seen, of=COUNT, reading=reading, upper=upper),
+        horizon=HORIZON,
+        sample_period=SAMPLE_PERIOD,
+        conditions=[{**capture(seed), **(fixed or {})} for seed in seeds],
+        risk="mean",
+        constraints=[vtb.Constraint(distance_from_foot, of=POSE, at_least=_FOOT)],
+        motion=vtb.RecordedMotion(memory) if recorded else None,
+    )
+
+
+def entries(value: ArrayLike) -> tuple[float, ...]:
+    """Return the values of `PARAMETERS` in a pose, shape (6,)."""
+    y, z, roll, yaw = np.asarray(value)[[1, 2, 3, 5]].tolist()
+    return y, z, roll, yaw
+
+
+def mean_count(rollout: RolloutResult) -> float:
+    """Return the mean number of markers over the capture."""
+    return float(np.trapezoid(rollout.quality, rollout.times)) / HORIZON if not rollout.failed else float("nan")
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A placement of the camera, and what it sees in each capture.
+
+    Attributes:
+        name: In words.
+        pose: [x, y, z, roll, pitch, yaw] in B, (6,), in m and rad.
+        rollouts: One per capture, with the images.
+    """
+
+    name: str
+    pose: Array
+    rollouts: tuple[RolloutResult, ...]
+
+    @property
+    def mean(self) -> float:
+        """Return the mean number of markers over all captures."""
+        return float(np.mean([mean_count(rollout) for rollout in self.rollouts]))
+
+    @property
+    def most(self) -> float:
+        """Return the mean over the captures of the maximum over time, the paper's quality."""
+        return float(np.mean([rollout.quality.max() for rollout in self.rollouts]))
+
+
+@dataclass(frozen=True)
+class MountAnswer:
+    """The answer to O1.
+
+    Attributes:
+        best: The placement that was found.
+        by_hand: The others.
+        landscape: Rollouts on a grid over the position, with the view as in the best placement.
+    """
+
+    best: Placement
+    by_hand: tuple[Placement, ...]
+    landscape: Sweep
+
+    @property
+    def gain(self) -> float:
+        """Return by how many markers the best placement sees more than the best by hand, in the mean."""
+        return self.best.mean - max(placement.mean for placement in self.by_hand)
+
+    @property
+    def best_on_grid(self) -> float:
+        """Return the mean number of markers at the best point of the grid that keeps off the arm."""
+        values = [e.values[0] for e in self.landscape.evaluations if e.violations[0] <= 0.0]
+        return float(np.nanmax(values)) / HORIZON
+
+    @property
+    def holds(self) -> bool:
+        """Return whether it sees more than each placement by hand, and no point of the grid sees more."""
+        return self.gain > TELLING and self.best_on_grid < self.best.mean + TELLING
+
+
+def find_mount(*, seeds: Sequence[int], candidates: int, grid: int, executor: Executor) -> MountAnswer:
+    """Search the best placement, compare it with those by hand, and with a grid over the position.
+
+    Args:
+        seeds: Of the captures.
+        candidates: How many placements the search tries.
+        grid: The number of points of the grid per side.
+        executor: Runs the rollouts.
+    """
+    problem = mount_problem(seeds=seeds)
+    with problem.study(solver="cmaes") as study:
+        study.run(rollouts=candidates * len(seeds), racing=False, executor=executor, progress=False)
+        best = study.best
+        assert best is not None
+        found = np.array(pose(0.0, 0.0))
+        found[[1, 2, 3, 5]] = best.point
+    poses = {"found": found, **BY_HAND}
+    turns = {PARAMETERS[2].address: float(found[3]), PARAMETERS[3].address: float(found[5])}
+    around = mount_problem(PARAMETERS[:2], seeds=seeds, fixed=turns)
+    landscape = around.sweep(grid, executor=executor, progress=False)
+    every = problem.sweep(
+        values=[entries(value) for value in poses.values()], record=[IMAGE, MODE], executor=executor, progress=False
+    )
+    rows = np.reshape(np.array(every.rollouts, dtype=object), (len(poses), len(seeds)))
+    placements = [Placement(name, value, tuple(row)) for (name, value), row in zip(poses.items(), rows, strict=True)]
+    return MountAnswer(placements[0], tuple(placements[1:]), landscape)
+
+
+def plot_answer(answer: MountAnswer, *, times: Sequence[float] = (2.0, 6.0, 10.0, 14.0, 18.0, 22.0)) -> Figure:
+    """Draw the landscape over the position, the counts over time, and the views of all placements.
+
+    Left above: the mean count over the position of the camera, with the placements; the view is turned as in the best.
+    Beside it the paper's quality, the maximum over time, which has plateaus. Right: the counts over time. Below: what
+    each placement sees in the first capture.
+
+    Args:
+        answer: The answer.
+        times: Of the images, in s.
+    """
+    placements = [answer.best, *answer.by_hand]
+    figure = Picture(14.0, 4.6 + 1.35 * len(placements))
+    above, below = figure.subfigures(2, 1, height_ratios=[4.6, 1.35 * len(placements)])
+    mean_axes, most_axes, time_axes = above.subplots(1, 3)
+    _draw_landscape(mean_axes, answer, _mean_at, "mean number of markers")
+    _draw_landscape(most_axes, answer, _most_at, "largest number of markers (the paper's)")
+    for k, placement in enumerate(placements):
+        counts = np.mean([rollout.quality for rollout in placement.rollouts], axis=0)
+        best = placement is answer.best
+        style = {"color": BEST, "lw": 2.5} if best else {"color": f"C{k - 1}", "lw": 1.2}
+        label = f"{placement.name}: {placement.mean:.2f}"
+        time_axes.plot(placement.rollouts[0].times, counts, drawstyle="steps-pre", label=label, **style)
+    time_axes.set(xlabel="time [s]", ylabel="markers detected", title=f"Mean of {len(answer.best.rollouts)} captures")
+    time_axes.legend(fontsize="x-small")
+    finish(time_axes)
+    grid = below.subplots(len(placements), len(times))
+    for row, placement in zip(grid, placements, strict=True):
+        first = placement.rollouts[0]
+        for axes, t in zip(row, times, strict=True):
+            index = int(np.argmin(np.abs(first.times - t)))
+            axes.imshow(first.record[IMAGE][index].data[..., :3])
+            axes.set(xticks=[], yticks=[])
+            axes.set_xlabel(f"{first.times[index]:g} s: {first.quality[index]:g}", fontsize="x-small", labelpad=1)
+        row[0].set_ylabel(placement.name.replace(" of ", "\nof ").replace(" corner", "\ncorner"), fontsize="x-small")
+    return figure
+
+
+def _mean_at(rollouts: Sequence[RolloutResult]) -> float:
+    return float(np.mean([mean_count(rollout) for rollout in rollouts]))
+
+
+def _most_at(rollouts: Sequence[RolloutResult]) -> float:
+    return float(np.mean([rollout.quality.max(initial=np.nan) for rollout in rollouts]))
+
+
+def _draw_landscape(
+    axes: Axes, answer: MountAnswer, number: Callable[[Sequence[RolloutResult]], float], title: str
+) -> None:
+    points, groups = np.unique(answer.landscape.points, axis=0, return_inverse=True)
+    rollouts = [[answer.landscape.rollouts[i] for i in np.flatnonzero(groups == k)] for k in range(len(points))]
+    y, z = np.unique(points[:, 0]), np.unique(points[:, 1])
+    values = np.array([number(group) for group in rollouts]).reshape(y.size, z.size).T
+    figure = axes.figure
+    figure.colorbar(draw_mesh(axes, y, z, values), ax=axes, pad=0.02)
+    for k, placement in enumerate(answer.by_hand):
+        axes.plot(*placement.pose[1:3], "o", color=f"C{k}", mec="white")
+    mark_best(axes, *answer.best.pose[1:3])
+    axes.add_patch(Circle(Servicer().shoulder[1:], _FOOT, fill=False, color="white", ls=":"))
+    axes.set(xlabel="y in B [m]", ylabel="z in B [m]", title=title)
+
+
+def answer_mount(*, full: bool = False) -> MountAnswer:
+    """Answer O1 with two worker processes; see `find_mount`."""
+    with ProcessExecutor(2) as executor:
+        return find_mount(
+            seeds=SEEDS if full else SEEDS[:FEW],
+            candidates=200 if full else 48,
+            grid=13 if full else 6,
+            executor=executor,
+        )
+
+
+def mount(full: bool) -> Answer:
+    """Answer O1: where should the docking camera sit?
+
+    The short version averages over the first `FEW` captures, the long one over all of `SEEDS`, with a finer grid.
+    """
+    found = answer_mount(full=full)
+    y, z, roll, yaw = entries(found.best.pose)
+    tilt, pan = np.degrees([-np.pi / 2 - roll, yaw + np.pi / 2])
+    others = "; ".join(f"{p.name} {p.mean:.2f} (largest {p.most:.1f})" for p in found.by_hand)
+    return Answer(
+        id="O1",
+        question="Where should the docking camera sit to see the most markers during the capture?",
+        answer=f"at y = {y:.2f} m, z = {z:.2f} m, {tilt:.0f} deg down, {pan:.0f} deg to the left: "
+        f"{found.best.mean:.2f} markers in the mean",
+        unit="",
+        interval=None,
+        paper="none given",
+        holds=found.holds,
+        note=f"By hand: {others}. Best: largest {found.best.most:.1f}. Best of the grid over the position: "
+        f"{found.best_on_grid:.2f}. Mean of {len(found.best.rollouts)} captures; differences under {TELLING} mean "
+        "nothing.",
+    )
+
+
+@click.command()
+@click.option("--full", is_flag=True, help="All captures, and a finer grid.")
+@click.option("--figure", default="mount.png", help="File of the picture.", show_default=True)
+def main(full: bool, figure: str) -> None:
+    """Answer O1, and draw the answer."""
+    found = answer_mount(full=full)
+    click.echo(f"{'placement':28} {'mean':>5} {'largest':>7}")
+    for placement in (found.best, *found.by_hand):
+        click.echo(f"{placement.name:28} {placement.mean:5.2f} {placement.most:7.1f}")
+    click.echo(f"best of the grid: {found.best_on_grid:.2f}; holds: {found.holds}")
+    plot_answer(found).savefig(figure, dpi=110)
+
+
+if __name__ == "__main__":
+    # Under its own name, so that worker processes find its functions.
+    from vtbdrake_diagrams.satellite.mount import main as program
+
+    program(prog_name="python -m vtbdrake_diagrams.satellite.mount")

@@ -1,0 +1,83 @@
+"""O1: the placements, and the capture along which they are judged."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+import vtbdrake as vtb
+from vtbdrake.components.rendering import RenderingError, check_rendering
+from vtbdrake.rollout import MotionError, RolloutRunner
+from vtbdrake.state.systems import pose_from_array
+from vtbdrake_diagrams.satellite import SatelliteScenario
+from vtbdrake_diagrams.satellite.bodies import Servicer, Target
+from vtbdrake_diagrams.satellite.mount import (
+    BY_HAND,
+    COUNT,
+    PARAMETERS,
+    distance_from_foot,
+    entries,
+    mount_problem,
+    pose,
+    scenario,
+)
+
+# The bar in B when the target faces the servicer, as in the scenario.
+BAR = RigidTransform([SatelliteScenario().distance, 0.0, 0.0]) @ Target().X_TH.translation()
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return mount_problem(seeds=(0,))
+
+
+def test_tilt_and_pan_are_those_of_the_model():
+    servicer = Servicer()
+    _, y, z = servicer.camera_position
+    X_BC = pose_from_array(pose(y, z, tilt=servicer.camera_tilt))
+    assert X_BC.IsNearlyEqualTo(servicer.X_BC, 1e-12)
+    left = pose_from_array(pose(0.0, 0.0, pan=0.2)).rotation() @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(left, [np.cos(0.2), np.sin(0.2), 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", list(BY_HAND)[1:])
+def test_placements_by_hand_look_at_the_bar(name):
+    p_CH = pose_from_array(BY_HAND[name]).inverse() @ BAR
+    np.testing.assert_allclose(p_CH[:2], 0.0, atol=1e-9)
+    assert p_CH[2] > 1.0
+
+
+def test_placements_by_hand_keep_the_limits():
+    for value in BY_HAND.values():
+        assert all(p.lower <= x <= p.upper for p, x in zip(PARAMETERS, entries(value), strict=True))
+        assert distance_from_foot(value) >= 0.18
+
+
+def test_a_capture_led_by_the_camera_is_refused():
+    with pytest.raises(MotionError, match=r"sim.sense.docking_camera -> .*markers.* -> .*T_act"):
+        vtb.Problem(
+            scenario=replace(scenario(), perception="camera", onlookers=""),
+            parameters=[PARAMETERS[0]],
+            quality=vtb.Quality(float, of=COUNT),
+            horizon=1.0,
+            motion=vtb.RecordedMotion(0.22),
+        )
+
+
+def test_the_supervisor_is_not_varied_along_a_recorded_motion():
+    with pytest.raises(MotionError, match="the motion depends on dps.impl.supervisor.standoff"):
+        mount_problem([vtb.Parameter("dps.impl.supervisor.standoff", 0.2, 0.3)], seeds=(0,))
+
+
+def test_along_the_recorded_capture_the_count_is_the_same(problem):
+    try:
+        check_rendering()
+    except RenderingError as error:
+        pytest.skip(str(error))
+    point = problem.values(entries(BY_HAND["on the right"]), condition=0)
+    task = replace(problem.task, horizon=3.0, sample_period=1.0)
+    along = RolloutRunner(task, problem.testbed).run(point)
+    whole = RolloutRunner(replace(task, motion=None), problem.testbed).run(point)
+    assert along.identical(whole)
+    assert whole.quality.max() >= 4.0
