@@ -43,6 +43,8 @@ BENCHMARKS: Registry = {
     "racing_savings": "benchmarks.study:racing_savings",
     "camera_study_speedup": "benchmarks.camera_study:camera_study_speedup",
     "time_to_target": "benchmarks.gait:time_to_target",
+    "capture_rtf": "benchmarks.satellite:capture_rtf",
+    "capture_rtf_images": "benchmarks.satellite:capture_rtf_images",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
 }
 
