@@ -98,11 +98,11 @@ class MotionModel:
         return replace(track, time=time, R=R, p=p, P=F @ track.P @ F.T + self._noise(dt))
 
     def _noise(self, dt: float) -> Array:
+        density = np.repeat([self.rate_noise**2, self.velocity_noise**2], 3)
+        pose, velocity = np.arange(6), np.arange(6, 12)
         Q = np.zeros((12, 12))
-        for place, density in ((0, self.rate_noise**2), (3, self.velocity_noise**2)):
-            a, b = slice(place, place + 3), slice(place + 6, place + 9)
-            Q[a, a], Q[b, b] = np.eye(3) * density * dt**3 / 3.0, np.eye(3) * density * dt
-            Q[a, b] = Q[b, a] = np.eye(3) * density * dt**2 / 2.0
+        Q[pose, pose], Q[velocity, velocity] = density * dt**3 / 3.0, density * dt
+        Q[pose, velocity] = Q[velocity, pose] = density * dt**2 / 2.0
         return Q
 
     def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
