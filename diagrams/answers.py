@@ -23,6 +23,7 @@ APPLICATIONS: Registry = {
     "O1": "vtbdrake_diagrams.satellite.mount:mount",
     "O4": "vtbdrake_diagrams.space_climber.answers:payload",
     "R1": "vtbdrake_diagrams.space_climber.answers:heading",
+    "R2": "vtbdrake_diagrams.satellite.trajectory:answer",
     "C1": "vtbdrake_diagrams.manipulator.answers:control",
 }
 

@@ -126,3 +126,10 @@ def test_a_plan_that_is_not_finite_is_an_error(begin: float, first: float) -> No
 def test_bad_declarations_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SplineCommand(Spline("cubic", KNOTS, DURATION), **options)
+
+
+def test_before_the_first_plan_it_is_the_initial_value() -> None:
+    run = Run(command("cubic", initial=[0.5, -0.5]))
+    run.plan(begin=5 * PERIOD)
+    np.testing.assert_array_equal(run.at(4), [0.5, -0.5])
+    np.testing.assert_allclose(run.at(5), W[0])

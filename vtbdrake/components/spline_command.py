@@ -38,7 +38,14 @@ class SplineCommand(LeafSystem):
     __slots__ = NO_DICT
 
     def __init__(
-        self, spline: Spline, *, period: float, size: int = 1, after: ArrayLike | None = None, unit: str = "1"
+        self,
+        spline: Spline,
+        *,
+        period: float,
+        size: int = 1,
+        after: ArrayLike | None = None,
+        initial: ArrayLike = 0.0,
+        unit: str = "1",
     ) -> None:
         """Declare the system.
 
@@ -48,10 +55,12 @@ class SplineCommand(LeafSystem):
             size: Entries m of the value.
             after: The value after the end of the plan, a scalar or shape (m,), for example a force of 0 if nobody
                 decides any more. None holds the last value of the plan.
+            initial: The value until the first plan begins, a scalar or shape (m,).
             unit: Unit of the value.
 
         Raises:
-            ValueError: The period or the size is not positive, or ``after`` is not finite or has another size.
+            ValueError: The period or the size is not positive, or ``after`` or ``initial`` is not finite or has another
+                size.
         """
         super().__init__()
         if not 0.0 < period < inf:
@@ -61,9 +70,9 @@ class SplineCommand(LeafSystem):
         self._spline, self._size = spline, int(size)
         # Computed here, since it takes longer than a cycle of a loop.
         _ = spline.pieces
-        self._after = None if after is None else _vector(after, self._size)
+        self._after = None if after is None else _vector("after", after, self._size)
         self._plan = self.DeclareVectorInputPort("plan", 1 + spline.knots * self._size)
-        value = self.DeclareDiscreteState(np.zeros(self._size))
+        value = self.DeclareDiscreteState(_vector("initial", initial, self._size))
         self.DeclareStateOutputPort("value", value)
         shape = () if self._size == 1 else (self._size,)
         self.variables = (discrete_state("value", int(value), shape=shape, unit=unit),)
@@ -83,8 +92,8 @@ class SplineCommand(LeafSystem):
         state.set_value(0, value)
 
 
-def _vector(value: ArrayLike, size: int) -> np.ndarray:
+def _vector(name: str, value: ArrayLike, size: int) -> np.ndarray:
     array = np.asarray(value, dtype=float)
     if array.shape not in ((), (size,)) or not np.isfinite(array).all():
-        raise ValueError(f"SplineCommand: after is one finite number, or {size} of them, not {value!r}")
+        raise ValueError(f"SplineCommand: {name} is one finite number, or {size} of them, not {value!r}")
     return np.array(np.broadcast_to(array, (size,)))

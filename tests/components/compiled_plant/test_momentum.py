@@ -8,10 +8,11 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, QuaternionFloatingJoint, RevoluteJoint
+from pydrake.systems.analysis import Simulator
 from scipy.integrate import solve_ivp
 
 from tests.components.compiled_plant.plants import cart_pole, floating, inertia
-from vtbdrake.components.compiled_plant import BaseReaction, MomentumModel, UnsupportedPlantError
+from vtbdrake.components.compiled_plant import BaseReaction, MomentumModel, UnsupportedPlantError, momentum_world
 from vtbdrake.spline import Spline
 
 SPLINE = Spline("bspline", 8, 3.0)
@@ -132,6 +133,22 @@ def test_machine_code_computes_the_same(model, reaction):
     expected, motion = reaction(knots()), BaseReaction(model, SPLINE, steps=STEPS)(knots().ravel())
     for name in ("rotation", "position", "torque"):
         np.testing.assert_allclose(getattr(motion, name), getattr(expected, name), atol=1e-11)
+
+
+def test_the_world_turns_as_the_base_of_the_plan(model, reaction):
+    w, period = knots(), 0.01
+    world = momentum_world(model, w[0], period=period)
+    simulator = Simulator(world)
+    context = simulator.get_mutable_context()
+    # At t = 0 the joints are at the start already.
+    for k in range(round(SPLINE.duration / period) + 1):
+        world.GetInputPort("position").FixValue(context, SPLINE.weights(min(k * period, SPLINE.duration)) @ w)
+        simulator.AdvanceTo((k + 0.5) * period)
+    state = world.GetOutputPort("state").Eval(context)
+    motion = reaction(w)
+    np.testing.assert_allclose(state[:7], [*motion.rotation[-1], *motion.position[-1]], atol=1e-5)
+    np.testing.assert_allclose(state[7:], w[-1], atol=1e-12)
+    assert [element.name for element in world.variables] == ["torso.position", "hinge.position", "slider.position"]
 
 
 def two_bodies() -> MultibodyPlant:

@@ -2,7 +2,13 @@
 
 from vtbdrake.components.compiled_plant.dynamics import FrameMotion, PlantDynamics, plant_dynamics, plant_step
 from vtbdrake.components.compiled_plant.links import UnsupportedPlantError
-from vtbdrake.components.compiled_plant.momentum import BaseMotion, BaseReaction, MomentumModel
+from vtbdrake.components.compiled_plant.momentum import (
+    BaseMotion,
+    BaseReaction,
+    MomentumModel,
+    momentum_world,
+    rotation_angle,
+)
 from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBatch
 from vtbdrake.components.compiled_plant.world import compiled_world
 
@@ -16,6 +22,8 @@ __all__ = [
     "RolloutBatch",
     "UnsupportedPlantError",
     "compiled_world",
+    "momentum_world",
     "plant_dynamics",
     "plant_step",
+    "rotation_angle",
 ]

@@ -15,16 +15,17 @@ along their path has no effect on where the base ends.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Joint
+from pydrake.multibody.tree import Frame, Joint
 from pydrake.systems.framework import Context
 
+from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
 from vtbdrake.components.compiled_plant.links import FLOATING, Expression, UnsupportedPlantError, skew
@@ -38,6 +39,11 @@ class MomentumModel(PlantDynamics):
 
     The other joints stay where the Context has them. Joint quantities have m entries, in the order of ``joints``.
     Positions and velocities of the base B, the body that floats, are relative to where it was at first, B0.
+
+    Attributes:
+        joints: The names of the joints that move.
+        damping: Of these joints, shape (m,), in N m s/rad (or N s/m).
+        base: The name of the body that floats.
     """
 
     def __init__(self, plant: MultibodyPlant, context: Context, *, joints: Sequence[Joint]) -> None:
@@ -66,6 +72,8 @@ class MomentumModel(PlantDynamics):
         self._held = np.array(plant.GetPositions(context))
         base = self._links[0]
         self._base = base.v
+        everything = (plant.get_joint(index) for index in plant.GetJointIndices())
+        (self.base,) = (joint.child_body().name() for joint in everything if joint.type_name() == FLOATING)
         # The base frame is that of its joint, and its axes are those of B0.
         self._held[base.q] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
@@ -112,6 +120,15 @@ class MomentumModel(PlantDynamics):
         v[self._base] = self.base_velocity(q, qdot)
         vdot[self._base] = self._free(at, self._momentum(at, v, vdot))
         return self.inverse_dynamics(at, v, vdot)[self._v] + self.damping * qdot
+
+    def point(self, frame: Frame, q: Expression) -> Expression:
+        """Return p_BoFo_B of a frame F, shape (3, 1), in m.
+
+        Args:
+            frame: Of the plant.
+            q: Positions of the joints, shape (m, 1).
+        """
+        return self.frame(frame, self._positions(q)).p
 
     def motion(self, spline: Spline, *, steps: int) -> casadi.Function:
         """Return the function (knots) -> rotation, position, torque of the joints' curve over its duration.
@@ -235,6 +252,43 @@ class BaseReaction:
         evaluate()
         found = result.reshape(len(self._times), -1).copy()
         return BaseMotion(self._times, found[:, :4], found[:, 4:7], found[:, 7:])
+
+
+def momentum_world(model: MomentumModel, positions: ArrayLike, *, period: float) -> CasadiSystem:
+    r"""Return a System in which the joints are always where they are told to be, and the base moves accordingly.
+
+    .. pydrake_system::
+
+        name: CasadiSystem
+        input_ports:
+        - position
+        output_ports:
+        - state
+
+    At t = 0, T, 2 T, ... the joints move to ``position`` (rad or m, shape (m,)), at a constant rate since the last
+    sample; the velocity of the base is that halfway. ``state`` is [quaternion of R_WB, p_WoBo_W; q], shape (7 + m,).
+    Its variables, ``<base>.position`` and ``<joint>.position``, are named as those of the plant, where that is added to
+    a testbed as ``sim.sys.<model instance>``: beliefs and qualities fit both.
+
+    Args:
+        model: The model.
+        positions: Of the joints at first, shape (m,); the base is at the origin of W.
+        period: T in seconds.
+    """
+    m = len(model.joints)
+    x, u = casadi.SX.sym("x", 7 + m), casadi.SX.sym("u", m)
+    q = x[7:]
+    velocity = model.base_velocity((q + u) / 2.0, (u - q) / period)
+    pose = _pose_step(period)(x[:7], velocity, velocity, velocity)
+    update = casadi.Function(
+        "momentum_world", [x, u], [casadi.vertcat(pose, u)], ["state", "position"], ["state_next"], {"cse": True}
+    )
+    start = np.concatenate([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], np.asarray(positions, dtype=float)])
+    world = CasadiSystem(update=update, state={"state": start}, period=period)
+    (state,) = world.variables
+    joints = (replace(state, name=f"{name}.position", shape=(), start=7 + k) for k, name in enumerate(model.joints))
+    world.variables = (replace(state, name=f"{model.base}.position", shape=(7,)), *joints)
+    return world
 
 
 def rotation_angle(quaternions: ArrayLike) -> Array:

@@ -1,0 +1,264 @@
+"""Solvers of application R2: plans of the arm by gradients on the momentum model, with CasADi and with Drake.
+
+They solve the same problem, see `vtbdrake_diagrams.satellite.arm_move`, with derivatives from CasADi, and from the same
+starts: near the straight path, but not on it, since there the cost may be stationary across it (a motion in a plane).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolverInterface, SolverOptions
+
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
+from vtbdrake_diagrams.satellite.arm_move import FEASIBILITY, RESTING, Move, move_space
+
+Array = NDArray[np.float64]
+
+GOOD_ENOUGH = 2e-3
+"""The deviation q in rad at which no further start is tried."""
+
+# The standard deviation of the starts from the straight path, in rad.
+_SPREAD = 0.2
+# The cost in the solvers' eyes, and their tolerance and patience.
+_SCALE, _TOLERANCE, _ITERATIONS = 1e2, 1e-4, 60
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan of the arm, and how it was found.
+
+    Attributes:
+        knots: In rad, shape (n, 7).
+        deviation: q in rad by the momentum model; infinite if no plan within the limits was found.
+        history: The best q so far in rad over the wall time in s: (time, q), each better than the one before.
+        message: How the solver ended, in its own words.
+    """
+
+    knots: Array
+    deviation: float
+    history: tuple[tuple[float, float], ...]
+    message: str
+
+    def time_to(self, deviation: float) -> float:
+        """Return the wall time until q was at most ``deviation`` in rad; infinite if it never was."""
+        return next((seconds for seconds, q in self.history if q <= deviation), inf)
+
+
+class _Best:
+    """The best point within the limits among those that a solver has looked at."""
+
+    def __init__(self, move: Move) -> None:
+        self._begin = time.perf_counter()
+        self._lower, self._upper = move.space.bounds(move.largest)
+        self.z: Array | None = None
+        self.deviation = inf
+        self.history: list[tuple[float, float]] = []
+
+    def look(self, z: Array, cost: float, g: Array) -> None:
+        """Take note of a point with its cost 4 sin^2(q / 2) and its constraints."""
+        beyond = max(np.max(self._lower - g), np.max(g - self._upper))
+        q = 2.0 * np.arcsin(min(np.sqrt(max(cost, 0.0)) / 2.0, 1.0))
+        if beyond <= FEASIBILITY and q < self.deviation:
+            self.z, self.deviation = np.array(z), float(q)
+            self.history.append((time.perf_counter() - self._begin, self.deviation))
+
+
+# Looks for the best plan from a start z, shape (7 k,), and returns how it ended.
+_Method = Callable[[Move, Array, _Best], str]
+
+
+def plan_by_casadi(move: Move, *, attempts: int = 4) -> Plan:
+    """Return a plan by IPOPT, called by CasADi.
+
+    Args:
+        move: The move.
+        attempts: The most starts that are tried, until one leads to `GOOD_ENOUGH`.
+    """
+    return _plan(move, _by_casadi, attempts)
+
+
+def plan_by_drake(move: Move, solver: str = "SNOPT", *, attempts: int = 4) -> Plan:
+    """Return a plan by a solver of Drake's MathematicalProgram.
+
+    Args:
+        move: The move.
+        solver: ``SNOPT`` or ``IPOPT``.
+        attempts: See `plan_by_casadi`.
+
+    Raises:
+        ValueError: There is no such solver.
+    """
+    if solver not in _DRAKE:
+        raise ValueError(f"the solver is one of {', '.join(_DRAKE)}, not {solver!r}")
+    kind, options = _DRAKE[solver]
+    return _plan(move, lambda *arguments: _by_drake(kind(), options, *arguments), attempts)
+
+
+def _plan(move: Move, method: _Method, attempts: int) -> Plan:
+    best, message = _Best(move), "no attempt was made"
+    for attempt in range(attempts):
+        message = method(move, start_of(move, attempt), best)
+        if best.deviation <= GOOD_ENOUGH:
+            break
+    z = move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
+    return Plan(move.knots(z), best.deviation, tuple(best.history), message)
+
+
+def start_of(move: Move, attempt: int) -> Array:
+    """Return where a solver starts, shape (7 k,), in rad: near the straight path, the same for all solvers."""
+    straight = move.straight[RESTING:-RESTING].ravel()
+    noise = np.random.default_rng(attempt).standard_normal(straight.size)
+    return np.clip(straight + _SPREAD * noise, *move.search_range)
+
+
+def _by_casadi(move: Move, start: Array, best: _Best) -> str:
+    z = casadi.MX.sym("z", start.size)
+    cost, g = move.space.functions[0].call([z, casadi.MX(casadi.DM(move.ends))], True, False)
+    watch = _Watch(best, start.size, g.numel())
+    options = {
+        "ipopt.hessian_approximation": "limited-memory",
+        "ipopt.tol": _TOLERANCE,
+        "ipopt.constr_viol_tol": FEASIBILITY,
+        "ipopt.max_iter": _ITERATIONS,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "print_time": False,
+        "iteration_callback": watch,
+    }
+    solver = casadi.nlpsol("arm_plan", "ipopt", {"x": z, "f": _SCALE * cost, "g": g}, options)
+    lower, upper = move.search_range
+    least, most = move.space.bounds(move.largest)
+    found = solver(x0=start, lbx=lower, ubx=upper, lbg=least, ubg=most)
+    best.look(found["x"].full().ravel(), float(found["f"]) / _SCALE, found["g"].full().ravel())
+    return str(solver.stats()["return_status"])
+
+
+class _Watch(casadi.Callback):
+    """Is shown each iterate of CasADi's solver."""
+
+    def __init__(self, best: _Best, variables: int, constraints: int) -> None:
+        super().__init__()
+        self._best = best
+        self._sizes = {"x": variables, "f": 1, "g": constraints, "lam_x": variables, "lam_g": constraints, "lam_p": 0}
+        self.construct("watch", {})
+
+    def get_n_in(self) -> int:
+        return int(casadi.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> casadi.Sparsity:
+        return casadi.Sparsity.dense(self._sizes[casadi.nlpsol_out(i)], 1)
+
+    def eval(self, arg: Sequence[Any]) -> list[Any]:
+        x, f, g = (arg[i].full().ravel() for i in range(3))
+        self._best.look(x, float(f[0]) / _SCALE, g)
+        return [0]
+
+
+_DRAKE: dict[str, tuple[type[SolverInterface], dict[str, float]]] = {
+    "SNOPT": (
+        SnoptSolver,
+        {
+            "Major optimality tolerance": _TOLERANCE,
+            "Major feasibility tolerance": FEASIBILITY,
+            "Major iterations limit": _ITERATIONS,
+            "Verify level": -1,
+        },
+    ),
+    "IPOPT": (IpoptSolver, {"tol": _TOLERANCE, "constr_viol_tol": FEASIBILITY, "max_iter": _ITERATIONS}),
+}
+
+
+def _by_drake(solver: SolverInterface, options: dict[str, float], move: Move, start: Array, best: _Best) -> str:
+    slopes = move.space.functions[1]
+    known: dict[bytes, tuple[float, Array, Array, Array]] = {}
+
+    def at(z: Array) -> tuple[float, Array, Array, Array]:
+        key = z.tobytes()
+        if key not in known:
+            known.clear()
+            cost, gradient, g, jacobian = (value.full() for value in slopes(z, move.ends))
+            best.look(z, float(cost[0, 0]), g.ravel())
+            known[key] = _SCALE * float(cost[0, 0]), _SCALE * gradient.ravel(), g.ravel(), jacobian
+        return known[key]
+
+    def with_slopes(x: NDArray[Any], value: Callable[[Array], tuple[Array, Array]]) -> NDArray[Any]:
+        if x.dtype != object:
+            return value(np.array(x, dtype=float))[0]
+        z, dz = ExtractValue(x).ravel(), ExtractGradient(x)
+        found, slope = value(z)
+        return InitializeAutoDiff(found, slope @ dz).ravel()
+
+    def cost(x: NDArray[Any]) -> Any:
+        return with_slopes(x, lambda z: (np.array([at(z)[0]]), at(z)[1][None]))[0]
+
+    program = MathematicalProgram()
+    z = program.NewContinuousVariables(start.size, "z")
+    program.AddBoundingBoxConstraint(*move.search_range, z)
+    least, most = move.space.bounds(move.largest)
+    program.AddCost(cost, vars=z)
+    program.AddConstraint(lambda x: with_slopes(x, lambda z: at(z)[2:]), lb=least, ub=most, vars=z)
+    chosen = SolverOptions()
+    for key, value in options.items():
+        chosen.SetOption(solver.solver_id(), key, value)
+    return str(solver.Solve(program, start, chosen).get_solution_result().name)
+
+
+class MomentumDescent(Solver):
+    """A method of a reasoner: its candidates are the plans that gradients on the momentum model lead to.
+
+    One candidate is proposed at a time, from the next start. The reasoner tries each in its mental testbed.
+
+    Args:
+        search: The free knots.
+        name: In the catalogue.
+        origin: Joint positions at the begin, in rad.
+        goal: Joint positions at the end, in rad.
+        duration: Of the move in seconds.
+        knots: Of a plan.
+        attempts: The most starts that are tried, until one leads to `GOOD_ENOUGH`.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        *,
+        name: str,
+        origin: Sequence[float],
+        goal: Sequence[float],
+        duration: float,
+        knots: int,
+        attempts: int = 4,
+    ) -> None:
+        search.require(name, continuous=True, one_objective=True)
+        super().__init__(search, name=name)
+        self._move = Move(move_space(duration, knots), np.array(origin), np.array(goal))
+        if search.size != 7 * self._move.space.free:
+            raise SolverError(f"{name} searches {7 * self._move.space.free} free knots, not {search.size} parameters")
+        self._attempts, self._attempt = attempts, 0
+
+    def _next(self) -> list[Point]:
+        if self._attempt == self._attempts:
+            self._end(False, f"none of {self._attempts} starts led to {GOOD_ENOUGH:g} rad")
+            return []
+        best = _Best(self._move)
+        _by_casadi(self._move, start_of(self._move, self._attempt), best)
+        self._attempt += 1
+        z = self._move.straight[RESTING:-RESTING].ravel() if best.z is None else best.z
+        ends = [parameter.ends for parameter in self.search.space]
+        return [tuple(float(np.clip(value, *pair)) for value, pair in zip(z, ends, strict=True))]
+
+    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+        if any(evaluation.feasible and -evaluation.values[0] <= GOOD_ENOUGH for evaluation in asked):
+            self._end(True, f"q is at most {GOOD_ENOUGH:g} rad")
