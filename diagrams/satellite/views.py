@@ -40,7 +40,7 @@ def looking(eye: ArrayLike, at: ArrayLike) -> RigidTransform:
 
 
 def pictures(testbed: VirtualTestbed, context: Context) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the scene from `VIEWPOINT`, and what the docking camera sees now, as arrays (h, w, 3); all stays as it is."""
+    """Return the scene from `VIEWPOINT`, and what the docking camera sees now, as arrays (h, w, 3)."""
     camera = testbed.diagram.GetSubsystemByName(CAMERA)
     own = camera.GetMyContextFromRoot(context)
     mounted = np.array(testbed.read(context, f"{CAMERA}.pose"))
