@@ -8,7 +8,7 @@ then is that of the sensor's instant, and the tracker's state is one period newe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetector, detect_markers, pose_from_markers
-from vtbdrake.components.perception.registration import Faces, Registration, deskew, register_points
+from vtbdrake.components.perception.registration import Faces, Registration, deskew, misfit, register_points
 from vtbdrake.components.perception.tracking import (
     STATE_SIZE,
     STATUS_SIZE,
@@ -75,13 +75,22 @@ class TrackedTarget:
 
     Attributes:
         state: The tracker's ``state``, (13,).
-        valid: Whether the tracker follows the target.
+        status: The tracker's ``status``, (4,).
         time: The time that the state is for, in s.
     """
 
     state: Array
-    valid: bool
+    status: Array
     time: float
+
+    @property
+    def valid(self) -> bool:
+        """Whether the tracker follows the target."""
+        return bool(self.status[0])
+
+    def deviation(self) -> tuple[float, float]:
+        """Return three standard deviations of the attitude (rad) and of the position (m), and a little more."""
+        return 3.0 * float(self.status[2]) + 0.005, 3.0 * float(self.status[3]) + 0.01
 
     def at(self, time: float) -> RigidTransform:
         """Return X_IT at another time, with constant velocities."""
@@ -120,7 +129,7 @@ class MarkerPose:
         newest = float(history[0])
         time = newest - self.latency
         X_IC = pose_at(history, time) @ self.X_BC
-        tracked = TrackedTarget(target, bool(status[0]), newest + self.period)
+        tracked = TrackedTarget(target, status, newest + self.period)
         prediction = X_IC.inverse() @ tracked.at(time) if tracked.valid else None
         X_CT = pose_from_markers(found, self.board, self.intrinsics, time=time, prediction=prediction)
         return {"estimate": X_CT.seen_from(X_IC), "count": np.array([len(found.ids)], dtype=float)}
@@ -151,7 +160,7 @@ class ScanPose:
     ) -> tuple[PoseEstimate, PoseEstimate]:
         """Return the estimate of X_IT twice: to be shown, and to be remembered, as each scan is registered once."""
         if scan.stamp > memory.time:
-            tracked = TrackedTarget(target, bool(status[0]), float(history[0]) + self.period)
+            tracked = TrackedTarget(target, status, float(history[0]) + self.period)
             memory = self._register(scan, history, tracked)
         return memory, memory
 
@@ -162,18 +171,35 @@ class ScanPose:
         p_BQ = scan.points() @ self.X_BL.rotation().matrix().T + self.X_BL.translation()
         fired = scan.stamp + (scan.times if self.deskew else np.zeros_like(scan.times))
         points = in_inertial_frame(p_BQ, fired, history)
-        if tracked.valid:
-            starts = [tracked.at(scan.stamp)]
-            if self.deskew:
-                rate, velocity = tracked.state[7:10], tracked.state[10:13]
-                points = deskew(points, scan.times, origin=starts[0].translation(), velocity=velocity, rate=rate)
-        else:
-            starts = self._guesses(points, eye)
+        settings = self.registration
+        if not tracked.valid:
+            return self._begin(points, eye, scan.stamp)
+        start = tracked.at(scan.stamp)
+        if self.deskew:
+            rate, velocity = tracked.state[7:10], tracked.state[10:13]
+            points = deskew(points, scan.times, origin=start.translation(), velocity=velocity, rate=rate)
+        attitude, position = tracked.deviation()
+        # What is too far from the predicted pose is not the target.
+        basin = min(settings.basin, position + attitude * _EXTENT + 6.0 * settings.range_noise)
+        return register_points(
+            points,
+            self.faces,
+            start,
+            eye=eye,
+            time=scan.stamp,
+            registration=replace(settings, basin=basin),
+            deviation=(attitude, position),
+        )
+
+    def _begin(self, points: Array, eye: Array, time: float) -> PoseEstimate:
+        """Return the best estimate from several starts, as nothing is tracked."""
+        settings, guesses = self.registration, self._guesses(points, eye)
         found = [
-            register_points(points, self.faces, start, eye=eye, time=scan.stamp, registration=self.registration)
-            for start in starts
+            register_points(points, self.faces, guess, eye=eye, time=time, registration=settings) for guess in guesses
         ]
-        return min(found, key=lambda estimate: float(np.trace(estimate.covariance)))
+        limit = 4.0 * settings.range_noise
+        scores = [misfit(points, self.faces, e.X, eye=eye, limit=limit) if e.valid else np.inf for e in found]
+        return found[int(np.argmin(scores))]
 
     def _guesses(self, points: Array, eye: Array) -> list[RigidTransform]:
         """Return poses behind the nearest points, in attitudes about the one to begin with."""
@@ -186,6 +212,7 @@ class ScanPose:
         return [RigidTransform(RotationMatrix(rotation_matrix(turn)) @ self.attitude, p_IT) for turn in turns]
 
 
+_EXTENT = 1.5  # How far the target's panels reach, in m.
 _BASIN = np.radians(25.0)  # How far apart the attitudes are in which a scan is registered at first.
 
 

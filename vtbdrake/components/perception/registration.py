@@ -102,10 +102,11 @@ class Faces:
                 continue
             local = (points - pose[:, 3]) @ pose[:, :3]
             on = local[(np.abs(local[:, 2]) < thickness) & (np.abs(local[:, :2]) < half + thickness).all(axis=1), :2]
-            s = float(np.sqrt(4.0 * np.prod(half) / max(len(on), 1)))
+            # Where a face is hidden in part, the distance follows from the part that is seen.
+            s = float(np.sqrt(np.prod(np.ptp(on, axis=0)) / len(on))) if len(on) > 10 else np.inf
             for k in range(2):
-                count = int(2.0 * half[1 - k] / (1.5 * s))
-                if count < 3:
+                count = int(2.0 * half[1 - k] / max(1.5 * s, 1e-6))
+                if count < 3 or s > 0.2 * half[k]:
                     continue
                 strip = ((on[:, 1 - k] / half[1 - k] + 1.0) * 0.5 * count).astype(int).clip(0, count - 1)
                 low, high = np.full(count, np.inf), np.full(count, -np.inf)
@@ -175,9 +176,8 @@ class Registration:
 
 # So many steps at least minimize the offsets along the faces, too.
 _LAST_STEPS = 6
-# The start counts as a measurement with these standard deviations, so that what the points leave open (the motion
-# along a plane, if only one is seen) stays as predicted, with a covariance that tells so.
-_PRIOR = np.concatenate([np.full(3, 0.3**-2), np.full(3, 0.3**-2)])
+# The covariance of an estimate counts a start with these deviations, so that it is finite.
+_PRIOR = np.full(6, 0.3**-2)
 
 
 def register_points(
@@ -188,6 +188,7 @@ def register_points(
     eye: ArrayLike,
     time: float,
     registration: Registration | None = None,
+    deviation: tuple[float, float] = (0.3, 0.3),
 ) -> PoseEstimate:
     r"""Estimate the pose X_AT of a body from points on its surface, by the iterated closest point algorithm.
 
@@ -205,6 +206,9 @@ def register_points(
         eye: Where the points were seen from, in A, (3,) in m.
         time: The instant that the points belong to, in s.
         registration: Noise and limits.
+        deviation: The standard deviations of the start in rad and m. What the points leave open stays as it is at the
+            start, and offsets along a face are not believed if they are four times as large. The covariance of the
+            estimate does not count the start: it is that of a start with 0.3 rad and 0.3 m.
 
     Returns:
         An estimate of X_AT; a missing one if too few points lie on the body.
@@ -217,6 +221,7 @@ def register_points(
         near = near[np.linspace(0, len(near) - 1, settings.most_points).astype(int)]
     limit, least = settings.basin, 4.0 * settings.range_noise
     offset, settled = np.zeros(6), False
+    prior = np.repeat(np.array(deviation) ** -2, 3)
     for k in range(settings.steps):
         if len(near) < settings.fewest_points:
             return PoseEstimate.missing(time=time)
@@ -230,9 +235,11 @@ def register_points(
         # A motion [θ; d] of T changes r by -n·(θ × (p - p_AT) + d).
         J = _jacobian(near - p, n_T @ R.T)
         edges, beside, deviations = _edges(faces, in_T, R, eye_T, least) if settled else _NO_EDGES
-        information = np.diag(_PRIOR) + (edges / deviations[:, None] ** 2).T @ edges
-        H = (weight[:, None] * J).T @ J / settings.range_noise**2 + information
-        b = J.T @ (weight * r) / settings.range_noise**2 + edges.T @ (beside / deviations**2) - _PRIOR * offset
+        believed = np.abs(beside + edges @ offset) < 4.0 * deviation[1]
+        edges, beside, deviations = edges[believed], beside[believed], deviations[believed]
+        information = (edges / deviations[:, None] ** 2).T @ edges
+        H = (weight[:, None] * J).T @ J / settings.range_noise**2 + information + np.diag(prior)
+        b = J.T @ (weight * r) / settings.range_noise**2 + edges.T @ (beside / deviations**2) - prior * offset
         step = np.linalg.solve(H, b)
         step *= min(1.0, 0.3 / max(float(np.linalg.norm(step[:3])), 1e-12))
         R, p, offset = rotation_matrix(step[:3]) @ R, p + step[3:], offset + step
@@ -246,10 +253,28 @@ def register_points(
     if count < settings.fewest_points or count < settings.share * close:
         return PoseEstimate.missing(time=time)
     variance = max(settings.range_noise**2, float(np.mean(r[on_body] ** 2)))
-    covariance = np.linalg.inv(J[on_body].T @ J[on_body] / variance + information)
+    covariance = np.linalg.inv(J[on_body].T @ J[on_body] / variance + information + np.diag(_PRIOR))
     covariance += settings.systematic**2 * np.eye(6)
     X_AT = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
     return PoseEstimate.of(X_AT, 0.5 * (covariance + covariance.T), time=time)
+
+
+def misfit(points: ArrayLike, faces: Faces, X_AT: RigidTransform, *, eye: ArrayLike, limit: float) -> float:
+    """Return the mean of min(d, limit)² over points with the distances d to the body at X_AT, in m².
+
+    It tells which of several registrations explains most points, and best.
+
+    Args:
+        points: In A, (n, 3) in m.
+        faces: The model.
+        X_AT: The pose of the body.
+        eye: Where the points were seen from, in A, (3,) in m.
+        limit: The distance beyond which a point is none of the body, in m.
+    """
+    X_TA = X_AT.inverse()
+    in_T = np.asarray(points, dtype=float) @ X_TA.rotation().matrix().T + X_TA.translation()
+    nearest, _, _ = faces.nearest(in_T, eye=X_TA @ np.asarray(eye, dtype=float))
+    return float(np.mean(np.minimum(np.sum((in_T - nearest) ** 2, axis=1), limit**2)))
 
 
 def _jacobian(arms: Array, directions: Array) -> Array:
