@@ -30,6 +30,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+from scipy.ndimage import minimum_filter
 
 from vtbdrake.components.environment.haze import hazed
 from vtbdrake.components.environment.light import LIGHT_SIZE
@@ -409,6 +410,8 @@ def _shade(
     reach: float,
 ) -> None:
     """Darken the pixels of ``color`` that are in shadow, in place."""
+    # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
+    depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
     bright = np.isfinite(depth) & (depth > 0.0) & color[..., :3].any(axis=2)
     points_C = camera.rays_C[bright] * depth[bright][:, np.newaxis]
     points_W = points_C @ camera.X_WC.rotation().matrix().T + camera.X_WC.translation()
