@@ -46,6 +46,7 @@ BENCHMARKS: Registry = {
     "capture_rtf": "benchmarks.satellite:capture_rtf",
     "capture_rtf_images": "benchmarks.satellite:capture_rtf_images",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
+    "scanner_cost": "benchmarks.scanner:scanner_cost",
 }
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")

@@ -52,8 +52,8 @@ class _Group:
 
     body: int
     scene: Any  # embreex has no types
-    # Center and radius of a sphere around it.
-    sphere: Array
+    # Center and radius of a sphere, lower and upper corner of a box around it, in m.
+    bounds: Array
 
 
 class RayCaster:
@@ -95,7 +95,7 @@ class RayCaster:
             from embreex.rtcore import EmbreeDevice
         except ImportError as error:
             raise ImportError("casting rays takes Embree: pip install 'vtbdrake[perception]'") from error
-        surfaces = _surfaces(plant, scene_graph, role, {int(body.index()) for body in without})
+        surfaces = body_surfaces(plant, scene_graph, role=role, without=without)
         device = EmbreeDevice()
         self._groups = tuple(_group(body, surfaces[body], device) for body in sorted(surfaces))
         self.bodies = tuple(group.body for group in self._groups)
@@ -130,7 +130,7 @@ class RayCaster:
         origins_W, directions_W = to_world(np.ascontiguousarray(directions_L), times, _motion(X_WL, V_WL))
         for group in self._groups:
             motion = _motion(X_WB[group.body], V_WB[group.body])
-            origins, directions, limits, rays = to_body(origins_W, directions_W, times, motion, group.sphere, nearest)
+            origins, directions, limits, rays = to_body(origins_W, directions_W, times, motion, group.bounds, nearest)
             if not len(rays):
                 continue
             hit = group.scene.run(origins, directions, limits, output=True)
@@ -149,10 +149,16 @@ def _motion(X_WB: RigidTransform, V_WB: SpatialVelocity) -> Array:
     )
 
 
-def _surfaces(
-    plant: MultibodyPlant, scene_graph: SceneGraph, role: Role | None, without: set[int]
+def body_surfaces(
+    plant: MultibodyPlant, scene_graph: SceneGraph, *, role: Role | None = None, without: Sequence[RigidBody] = ()
 ) -> dict[int, list[Surface]]:
-    """Return the surfaces of every rigid group, in the frame of the body whose index names it.
+    """Return the surfaces of every rigid group, by the index of the body in whose frame they are.
+
+    Args:
+        plant: The finalized plant.
+        scene_graph: The SceneGraph that it is registered with.
+        role: The role of the geometry; by default the perception role.
+        without: Bodies to leave out.
 
     Raises:
         ValueError: A geometry cannot be cast, or moves and does not belong to the plant.
@@ -160,6 +166,7 @@ def _surfaces(
     from pydrake.geometry import GeometrySet, Role
 
     role = Role.kPerception if role is None else role
+    left_out = {int(body.index()) for body in without}
     inspector = scene_graph.model_inspector()
     context = plant.CreateDefaultContext()
     surfaces: dict[int, list[Surface]] = {}
@@ -173,7 +180,7 @@ def _surfaces(
                 f"the geometry '{name}' moves with the frame '{inspector.GetName(frame)}', which does not belong to "
                 "the plant: rays are cast at bodies of the plant and at the world"
             )
-        if int(body.index()) in without:
+        if int(body.index()) in left_out:
             continue
         group = min(plant.GetBodiesWeldedTo(body), key=lambda welded: int(welded.index()))
         X_GB = plant.CalcRelativeTransform(context, group.body_frame(), body.body_frame())
@@ -191,12 +198,14 @@ def _group(body: int, surfaces: Sequence[Surface], device: Any) -> _Group:
     for vertices, triangles in surfaces:
         TriangleMesh(scene, vertices.astype(np.float32), triangles)
     corners = np.concatenate([vertices for vertices, _ in surfaces])
-    center = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
     # Embree rounds the corners.
-    radius = 1e-4 + 1.000001 * float(np.linalg.norm(corners - center, axis=1).max())
+    margin = 1e-4 + 1e-6 * np.abs(corners).max()
+    lower, upper = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+    center = (lower + upper) / 2.0
+    radius = margin + float(np.linalg.norm(corners - center, axis=1).max())
     # The first run builds the scene: afterwards nothing changes it, and threads can share it.
     scene.run(np.zeros((1, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32))
-    return _Group(body, scene, np.array([*center, radius]))
+    return _Group(body, scene, np.concatenate([center, [radius], lower, upper]))
 
 
 def _surface(shape: Shape, name: str) -> Surface:
@@ -206,9 +215,9 @@ def _surface(shape: Shape, name: str) -> Surface:
         ValueError: Rays cannot be cast at such a shape.
     """
     kind = type(shape).__name__
-    if kind not in _SURFACES:
-        raise ValueError(f"rays cannot be cast at the geometry '{name}', a {kind}: use {', '.join(_SURFACES)}")
-    return _SURFACES[kind](shape, name)
+    if kind not in _KINDS:
+        raise ValueError(f"rays cannot be cast at the geometry '{name}', a {kind}: use {', '.join(_KINDS)}")
+    return _KINDS[kind](shape, name)
 
 
 def _box(box: Any, name: str) -> Surface:
@@ -272,7 +281,7 @@ def _read(path: Path, scale: Array) -> Surface:
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.int32)
 
 
-_SURFACES: dict[str, Callable[[Any, str], Surface]] = {
+_KINDS: dict[str, Callable[[Any, str], Surface]] = {
     "Box": _box,
     "Capsule": _capsule,
     "Convex": _convex,

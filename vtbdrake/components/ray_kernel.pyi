@@ -19,7 +19,7 @@ def to_body(
     directions_W: Doubles,
     times: Doubles,
     motion_WB: Doubles,
-    sphere_B: Doubles,
+    bounds_B: Doubles,
     nearest: Doubles,
 ) -> tuple[Singles, Singles, Singles, Indices]:
     """Return origins, directions, largest distances and numbers of the rays that may hit what moves with B, in B.
@@ -29,7 +29,8 @@ def to_body(
         directions_W: Their unit vectors, shape (n, 3).
         times: Firing times in s, shape (n,).
         motion_WB: The motion of B in W, as in `to_world`.
-        sphere_B: Center and radius of a sphere around all that moves with B, in m, shape (4,).
+        bounds_B: Center and radius of a sphere, and lower and upper corner of a box along B's axes, around all that moves
+            with B, in m, shape (10,).
         nearest: How far the rays reach, in m, shape (n,).
     """
 

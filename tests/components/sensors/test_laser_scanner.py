@@ -202,6 +202,15 @@ def test_noise_is_that_of_the_error_model_and_repeatable() -> None:
         assert not np.allclose(first.ranges, third.ranges, atol=1e-4)
 
 
+def test_outliers_are_as_many_and_as_large_as_declared() -> None:
+    of = world(wall(), errors=ErrorModel(outlier_probability=0.2, outlier_size=0.3))
+    scans = of.scans(1.0, X_WT=at(4.5))
+    errors = np.concatenate([scan.ranges - 4.0 / scan.directions_L[:, 0] for scan in scans])
+    off = np.abs(errors) > 1e-3
+    assert off.mean() == pytest.approx(0.2, abs=4 * sqrt(0.16 / len(errors)) + 0.001)
+    assert errors[off].std() == pytest.approx(0.3, rel=4 / sqrt(2 * off.sum()))
+
+
 def test_quantization_rounds_and_dropout_takes_rays_away() -> None:
     of = world(wall(), errors=ErrorModel(quantization=0.25, dropout=0.3))
     scans = of.scans(1.0, X_WT=at(4.5))

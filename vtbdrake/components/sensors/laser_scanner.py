@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 # Of two instants that are equal but for rounding, in s.
 _ROUNDING = 1e-9
 # The fields of an `ErrorModel` that ranges have.
-_ERRORS = ("noise", "bias", "quantization", "dropout", "seed")
+_ERRORS = ("noise", "outlier_probability", "outlier_size", "bias", "quantization", "dropout", "seed")
 # The channel of the scanner's stream of random numbers.
 _CHANNEL = 0
 
@@ -170,11 +170,11 @@ class LaserScanner(LeafSystem):
     recording", 2004). So the error of a range grows with distance and incidence, r tan(a) divergence / 4, and a ray
     beside an edge may hit either side. Ranges between the two sides (mixed pixels) do not occur.
 
-    An `ErrorModel` adds noise and bias (m), quantization (m) and drop-out (of single rays) to the ranges. A range that
-    is then below min_range is not reported.
+    An `ErrorModel` adds noise, outliers, bias, quantization (all in m) and drop-out to the ranges, ray by ray. A range
+    that is then below min_range is not reported.
 
-    The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``bias``, ``quantization``, ``dropout`` and ``seed`` are
-    parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns`` and ``fired`` (rays) of the present scan are
+    The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
+    ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns`` and ``fired`` (rays) of the present scan are
     state.
     """
 
@@ -244,6 +244,8 @@ class LaserScanner(LeafSystem):
             "reflectivity": ("1", (0.0, 1.0)),
             "divergence": ("rad", (0.0, 0.5)),
             "noise": ("m", (0.0, inf)),
+            "outlier_probability": ("1", (0.0, 1.0)),
+            "outlier_size": ("m", (0.0, inf)),
             "bias": ("m", (-inf, inf)),
             "quantization": ("m", (0.0, inf)),
             "dropout": ("1", (0.0, 1.0)),
@@ -409,6 +411,9 @@ def _with_errors(ranges: Array, errors: ErrorModel, generator: np.random.Generat
     """Return the ranges (m) with their errors; 0 for those that drop out."""
     if errors.noise:
         ranges = ranges + errors.noise * generator.standard_normal(len(ranges))
+    if errors.outlier_probability:
+        outliers = generator.random(len(ranges)) < errors.outlier_probability
+        ranges = ranges + outliers * errors.outlier_size * generator.standard_normal(len(ranges))
     if errors.bias:
         ranges = ranges + errors.bias
     if errors.quantization:
