@@ -8,6 +8,7 @@ then is that of the sensor's instant, and the tracker's state is one period newe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -157,28 +158,44 @@ class ScanPose:
 
     def __call__(
         self, *, scan: Scan, history: Array, target: Array, status: Array, memory: PoseEstimate
-    ) -> tuple[PoseEstimate, PoseEstimate]:
-        """Return the estimate of X_IT twice: to be shown, and to be remembered, as each scan is registered once."""
-        if scan.stamp > memory.time:
-            tracked = TrackedTarget(target, status, float(history[0]) + self.period)
-            memory = self._register(scan, history, tracked)
-        return memory, memory
+    ) -> tuple[PoseEstimate | None, PoseEstimate]:
+        """Return the estimate of X_IT if the scan is a new one, and what is remembered: the last one that was shown.
 
-    def _register(self, scan: Scan, history: Array, tracked: TrackedTarget) -> PoseEstimate:
+        While nothing is tracked, what is remembered is the estimate before de-skewing. Then a scan is de-skewed by the
+        motion since the last one: both are skewed alike, so that the difference of their poses is not. The first scan
+        alone says nothing of the motion, and is not shown.
+        """
+        if scan.stamp <= memory.time:
+            return None, memory
+        tracked = TrackedTarget(target, status, float(history[0]) + self.period)
         if not len(scan.ranges) or not (tracked.valid or self.attitude):
-            return PoseEstimate.missing(time=scan.stamp)
+            nothing = PoseEstimate.missing(time=scan.stamp)
+            return nothing, nothing
         eye = (pose_at(history, scan.stamp) @ self.X_BL).translation()
         p_BQ = scan.points() @ self.X_BL.rotation().matrix().T + self.X_BL.translation()
         fired = scan.stamp + (scan.times if self.deskew else np.zeros_like(scan.times))
         points = in_inertial_frame(p_BQ, fired, history)
-        settings = self.registration
-        if not tracked.valid:
-            return self._begin(points, eye, scan.stamp)
+        if tracked.valid:
+            found = self._follow(points, scan, eye, tracked)
+            return found, found
+        is_recent = memory.valid and scan.stamp - memory.time < _RECENT
+        skewed = self._best(points, eye, scan.stamp, [memory.X] if is_recent else self._guesses(points, eye))
+        if not (self.deskew and skewed.valid):
+            return skewed, skewed
+        if not is_recent:
+            return PoseEstimate.missing(time=scan.stamp), skewed
+        motion = skewed.error_to(memory.X) / (memory.time - scan.stamp)
+        points = deskew(points, scan.times, origin=skewed.matrix[:, 3], velocity=motion[3:], rate=motion[:3])
+        return self._best(points, eye, scan.stamp, [skewed.X]), skewed
+
+    def _follow(self, points: Array, scan: Scan, eye: Array, tracked: TrackedTarget) -> PoseEstimate:
+        """Return the estimate that begins at the predicted pose."""
         start = tracked.at(scan.stamp)
         if self.deskew:
             rate, velocity = tracked.state[7:10], tracked.state[10:13]
             points = deskew(points, scan.times, origin=start.translation(), velocity=velocity, rate=rate)
         attitude, position = tracked.deviation()
+        settings = self.registration
         # What is too far from the predicted pose is not the target.
         basin = min(settings.basin, position + attitude * _EXTENT + 6.0 * settings.range_noise)
         return register_points(
@@ -191,11 +208,11 @@ class ScanPose:
             deviation=(attitude, position),
         )
 
-    def _begin(self, points: Array, eye: Array, time: float) -> PoseEstimate:
-        """Return the best estimate from several starts, as nothing is tracked."""
-        settings, guesses = self.registration, self._guesses(points, eye)
+    def _best(self, points: Array, eye: Array, time: float, starts: Sequence[RigidTransform]) -> PoseEstimate:
+        """Return the best of the estimates that begin at ``starts``."""
+        settings = self.registration
         found = [
-            register_points(points, self.faces, guess, eye=eye, time=time, registration=settings) for guess in guesses
+            register_points(points, self.faces, start, eye=eye, time=time, registration=settings) for start in starts
         ]
         limit = 4.0 * settings.range_noise
         scores = [misfit(points, self.faces, e.X, eye=eye, limit=limit) if e.valid else np.inf for e in found]
@@ -212,6 +229,7 @@ class ScanPose:
         return [RigidTransform(RotationMatrix(rotation_matrix(turn)) @ self.attitude, p_IT) for turn in turns]
 
 
+_RECENT = 3.0  # Until when a scan begins where the last one was registered, in s.
 _EXTENT = 1.5  # How far the target's panels reach, in m.
 _BASIN = np.radians(25.0)  # How far apart the attitudes are in which a scan is registered at first.
 
