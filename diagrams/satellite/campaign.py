@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import casadi
 import numpy as np
@@ -91,8 +92,12 @@ class Capture:
 def capture_task(scenario: SatelliteScenario) -> RolloutTask:
     """Return the rollouts of a capture, which end when it has succeeded or is aborted."""
     quality = Quality(lambda mode: mode, of=MODE)
-    record = [MODE, REASON, BASE, TARGET, *_JOINTS]
-    return RolloutTask(scenario, HORIZON, quality, HOLD - 0.5, sample_period=_SAMPLE_PERIOD, record=record)
+    return RolloutTask(scenario, HORIZON, quality, HOLD - 0.5, sample_period=_SAMPLE_PERIOD, record=capture_record())
+
+
+def capture_record() -> list[str]:
+    """Return the addresses of what a capture is judged by: mode and reason, and the true poses of bodies and joints."""
+    return [MODE, REASON, BASE, TARGET, *_JOINTS]
 
 
 def judge(result: RolloutResult) -> Capture:
@@ -101,7 +106,7 @@ def judge(result: RolloutResult) -> Capture:
     tumble = float(np.linalg.norm(np.asarray(result.parameters["sim.env.release.velocity"])[:3]))
     if result.end == "failed" or len(result.times) < 2:
         return Capture(tumble, "failed", result.message, np.nan, np.full(3, np.nan), np.nan, np.nan, np.nan)
-    before, after = _fixture_in_gripper(record, -2), _fixture_in_gripper(record, -1)
+    before, after = fixture_in_gripper(record, -2), fixture_in_gripper(record, -1)
     arm = np.array([[record[address][k] for address in _JOINTS[:ARM_JOINTS]] for k in (-2, -1)])
     return Capture(
         tumble=tumble,
@@ -151,8 +156,8 @@ def report(found: Sequence[Capture]) -> str:
     return f"{table(header, rows)}\n{caught} of {len(found)} captured{reasons}"
 
 
-def _fixture_in_gripper(record: dict[str, np.ndarray], k: int) -> RigidTransform:
-    """Return X_GH at a sample."""
+def fixture_in_gripper(record: Mapping[str, Any], k: int) -> RigidTransform:
+    """Return X_GH, of the bar in the gripper, in truth, at sample ``k`` of a record with `capture_record`."""
     pose = _gripper().value([np.array([record[address][k] for address in _JOINTS[:ARM_JOINTS]])])
     X_BG = RigidTransform(RotationMatrix(pose[:9].reshape(3, 3)), pose[9:])
     X_BT = pose_from_array(record[BASE][k]).InvertAndCompose(pose_from_array(record[TARGET][k]))
