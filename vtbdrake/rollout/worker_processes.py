@@ -6,13 +6,14 @@ import logging
 import os
 import pickle
 import resource
+import select
 import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
-from math import inf
-from multiprocessing.connection import Connection, wait
+from math import ceil, inf
+from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from vtbdrake.argument_checks import as_number
@@ -191,11 +192,15 @@ class ProcessExecutor(Executor):
         if not busy:
             return []
         first = min(worker.deadline for worker in busy.values())
-        ready = wait(list(busy), None if first == inf else max(0.0, first - time.monotonic()))
+        poll = select.poll()
+        for connection in busy:
+            poll.register(connection, select.POLLIN)
+        timeout = None if first == inf else ceil(1e3 * max(0.0, first - time.monotonic()))  # In milliseconds.
+        ready = {descriptor for descriptor, _ in poll.poll(timeout)}
         replies: list[tuple[_Worker, int, Any]] = []
         for connection, worker in busy.items():
             index = worker.jobs[0]
-            if connection in ready:
+            if connection.fileno() in ready:
                 try:
                     message = connection.recv_bytes()
                     if message == _BEGUN:
