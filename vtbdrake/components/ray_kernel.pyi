@@ -29,8 +29,8 @@ def to_body(
         directions_W: Their unit vectors, shape (n, 3).
         times: Firing times in s, shape (n,).
         motion_WB: The motion of B in W, as in `to_world`.
-        bounds_B: Center and radius of a sphere, and lower and upper corner of a box along B's axes, around all that moves
-            with B, in m, shape (10,).
+        bounds_B: Center and radius of a sphere, and lower and upper corner of a box along B's axes, around all that
+            moves with B, in m, shape (10,).
         nearest: How far the rays reach, in m, shape (n,).
     """
 
