@@ -174,8 +174,8 @@ class LaserScanner(LeafSystem):
     that is then below min_range is not reported.
 
     The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
-    ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns`` and
-    ``fired`` (rays) of the present scan are state.
+    ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns``
+    and ``fired`` (rays) of the present scan are state.
     """
 
     __slots__ = NO_DICT
