@@ -45,6 +45,7 @@ BENCHMARKS: Registry = {
     "time_to_target": "benchmarks.gait:time_to_target",
     "capture_rtf": "benchmarks.satellite:capture_rtf",
     "capture_rtf_images": "benchmarks.satellite:capture_rtf_images",
+    "arm_trajectory": "benchmarks.arm_trajectory:arm_trajectory",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
     "scanner_cost": "benchmarks.scanner:scanner_cost",
 }
