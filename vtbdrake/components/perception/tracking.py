@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import Value
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from vtbdrake.components.perception.estimate import (
@@ -20,7 +20,8 @@ from vtbdrake.components.perception.estimate import (
     rotation_vector,
 )
 from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state.systems import POSE_UNIT, pose_to_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +46,10 @@ class Track:
     v: Array
     P: Array
 
-    @property
-    def X(self) -> RigidTransform:
-        """The pose X_IT."""
-        return RigidTransform(RotationMatrix.ProjectToRotationMatrix(self.R), self.p)
+    def at(self, time: float) -> RigidTransform:
+        """Return X_IT at ``time`` (s), with constant velocities."""
+        R, p = _moved(self, time - self.time)
+        return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
     def numbers(self) -> Array:
         """Return the track as one vector, (`TRACK_SIZE`,)."""
@@ -104,6 +105,19 @@ class MotionModel:
         Q[pose, pose], Q[velocity, velocity] = density * dt**3 / 3.0, density * dt
         Q[pose, velocity] = Q[velocity, pose] = density * dt**2 / 2.0
         return Q
+
+    def deviations(self, track: Track, time: float) -> tuple[float, float]:
+        """Return the standard deviations of attitude (rad) and position (m) at a later time.
+
+        They are the roots of the mean variances, of first order in the angle turned since.
+        """
+        dt = time - track.time
+        found = []
+        for place, density in ((0, self.rate_noise**2), (3, self.velocity_noise**2)):
+            P, a, b = track.P, slice(place, place + 3), slice(place + 6, place + 9)
+            total = P[a, a].trace() + 2.0 * dt * P[a, b].trace() + dt**2 * P[b, b].trace()
+            found.append(float(total / 3.0 + density * dt**3 / 3.0) ** 0.5)
+        return found[0], found[1]
 
     def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
         r"""Return the track with a measured pose, and the normalized innovation squared (six degrees of freedom).
@@ -237,14 +251,16 @@ class TargetTracker(LeafSystem):
         }
         self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
         self._pose = int(self.DeclareDiscreteState(6))
-        self._velocity = int(self.DeclareDiscreteState(6))
+        self._state = int(self.DeclareDiscreteState(body_state(RigidTransform(), np.zeros(3), np.zeros(3))))
         self._status = int(self.DeclareDiscreteState([0.0, inf, inf, inf]))
         # Estimates fused, left out in succession, left out in all, and when the last one of each source held.
         self._counts = int(self.DeclareDiscreteState([0.0, 0.0, 0.0, *(-inf for _ in sources)]))
         self._track = int(self.DeclareDiscreteState(TRACK_SIZE))
         self.variables = (
-            discrete_state("pose", self._pose, shape=(6,), unit="m, rad"),
-            discrete_state("velocity", self._velocity, shape=(6,), unit="rad/s, m/s"),
+            discrete_state("pose", self._pose, shape=(6,), unit=POSE_UNIT),
+            discrete_state("orientation", self._state, shape=(4,)),
+            discrete_state("position", self._state, start=4, shape=(3,), unit="m"),
+            discrete_state("velocity", self._state, start=7, shape=(6,), unit="rad/s, m/s"),
             discrete_state("valid", self._status, bounds=(0.0, 1.0)),
             discrete_state("age", self._status, start=1, unit="s"),
             discrete_state("attitude_deviation", self._status, start=2, unit="rad"),
@@ -259,21 +275,9 @@ class TargetTracker(LeafSystem):
                 for k, (name, (_, unit, bounds)) in enumerate(declared.items())
             ),
         )
-        self.DeclareVectorOutputPort(
-            "state",
-            STATE_SIZE,
-            weakly(self, TargetTracker._calc_state),
-            prerequisites_of_calc={
-                self.discrete_state_ticket(DiscreteStateIndex(group)) for group in (self._pose, self._velocity)
-            },
-        )
+        self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
         self.DeclareStateOutputPort("status", DiscreteStateIndex(self._status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        pose, velocity = (context.get_discrete_state(group).value() for group in (self._pose, self._velocity))
-        X_IT = RigidTransform(RollPitchYaw(pose[3:]), pose[:3])
-        output.SetFromVector(body_state(X_IT, velocity[:3], velocity[3:]))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         *noises, gate, patience, fewest, lost_after = context.get_numeric_parameter(0).value().tolist()
@@ -302,10 +306,9 @@ class TargetTracker(LeafSystem):
             return
         if fresh:
             state.set_value(self._track, track.numbers())
-        now = model.predict(track, max(context.get_time(), track.time))
-        age = context.get_time() - track.time
-        variances = now.P.diagonal()
-        status = [fused >= fewest and age <= lost_after, age, *np.sqrt([variances[:3].mean(), variances[3:6].mean()])]
-        state.set_value(self._pose, np.concatenate([now.p, RollPitchYaw(now.X.rotation()).vector()]))
-        state.set_value(self._velocity, np.concatenate([now.w, now.v]))
+        now, age = max(context.get_time(), track.time), context.get_time() - track.time
+        X_IT = track.at(now)
+        status = [fused >= fewest and age <= lost_after, age, *model.deviations(track, now)]
+        state.set_value(self._state, body_state(X_IT, track.w, track.v))
+        state.set_value(self._pose, pose_to_array(X_IT))
         state.set_value(self._status, np.array(status, dtype=float))
