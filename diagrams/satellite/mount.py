@@ -189,12 +189,12 @@ class Placement:
     @property
     def mean(self) -> float:
         """Return the mean number of markers over all captures."""
-        return float(np.mean([mean_count(rollout) for rollout in self.rollouts]))
+        return _mean_at(self.rollouts)
 
     @property
     def most(self) -> float:
         """Return the mean over the captures of the maximum over time, the paper's quality."""
-        return float(np.mean([rollout.quality.max() for rollout in self.rollouts]))
+        return _most_at(self.rollouts)
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,8 @@ def plot_answer(answer: MountAnswer, *, times: Sequence[float] = (2.0, 6.0, 10.0
         label = f"{placement.name}: {placement.mean:.2f}"
         time_axes.plot(placement.rollouts[0].times, counts, drawstyle="steps-pre", label=label, **style)
     time_axes.set(xlabel="time [s]", ylabel="markers detected", title=f"Mean of {len(answer.best.rollouts)} captures")
-    time_axes.legend(fontsize="x-small")
+    time_axes.set_ylim(0.0, 1.0 + 1.4 * max(placement.most for placement in placements))
+    time_axes.legend(fontsize="x-small", loc="upper right")
     finish(time_axes)
     grid = below.subplots(len(placements), len(times))
     images = views([placement.pose for placement in placements])
@@ -304,7 +305,7 @@ def _mean_at(rollouts: Sequence[RolloutResult]) -> float:
 
 
 def _most_at(rollouts: Sequence[RolloutResult]) -> float:
-    return float(np.mean([rollout.quality.max(initial=np.nan) for rollout in rollouts]))
+    return float(np.mean([rollout.quality.max() if not rollout.failed else np.nan for rollout in rollouts]))
 
 
 def _draw_landscape(
