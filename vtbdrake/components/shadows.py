@@ -45,8 +45,8 @@ def sunlit(
         return np.zeros(0)
     # The sun's camera S looks along the light.
     R_WS = RotationMatrix.MakeFromOneVector(np.asarray(direction, dtype=float), 2)
-    p_S = points_W @ R_WS.matrix()
-    low, high = p_S.min(axis=0), p_S.max(axis=0)
+    p_S = R_WS.matrix().T @ points_W.T
+    low, high = p_S.min(axis=1), p_S.max(axis=1)
     center, radius = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-3)
     distance = max(_FAR * radius, reach)
     focal = 0.49 * _SIZE * (distance - radius) / radius
@@ -60,8 +60,7 @@ def sunlit(
     X_WS = RigidTransform(R_WS, R_WS @ (center - [0.0, 0.0, distance]))
     nearest = query.RenderDepthImage(camera, query.inspector().world_frame_id(), X_WS).data[..., 0]
     nearest = np.where(np.isinf(nearest), distance + 10.0 * radius, nearest)
-    x, y, z = (p_S - center).T
-    z = z + distance
+    x, y, z = p_S - (center - [0.0, 0.0, distance])[:, np.newaxis]
     seen = _interpolated(nearest, _SIZE / 2.0 + focal * x / z - 0.5, _SIZE / 2.0 + focal * y / z - 0.5)
     pixel = 2.0 * radius / _SIZE
     # Over one more pixel, light becomes shadow.

@@ -412,8 +412,12 @@ def _shade(
     """Darken the pixels of ``color`` that are in shadow, in place."""
     # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
     depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
-    bright = np.isfinite(depth) & (depth > 0.0) & color[..., :3].any(axis=2)
-    points_C = camera.rays_C[bright] * depth[bright][:, np.newaxis]
+    # All four bytes of a pixel at once; the last is its opacity.
+    visible = color.view(np.uint32)[..., 0] & np.frombuffer(b"\xff\xff\xff\x00", np.uint32) != 0
+    bright = np.flatnonzero(visible & np.isfinite(depth) & (depth > 0.0))
+    points_C = camera.rays_C.reshape(-1, 3)[bright] * depth.ravel()[bright, np.newaxis]
     points_W = points_C @ camera.X_WC.rotation().matrix().T + camera.X_WC.translation()
     share = sunlit(camera.view, renderer=FILL, points_W=points_W, direction=direction, reach=reach)
-    color[bright, :3] = np.rint(color[bright, :3] * share[:, np.newaxis])
+    shaded = bright[share < 1.0]
+    pixels = color.reshape(-1, 4)
+    pixels[shaded, :3] = np.rint(pixels[shaded, :3] * share[share < 1.0, np.newaxis])
