@@ -5,8 +5,8 @@ gains), its filter (how much the target's motion may change) and its detector of
 the sun in front of the target, where the servicer throws its shadow on it; the sun beside it, and grazing its face; and
 the sun behind it, where only a lamp on the camera helps. The cost is the time until the fingers hold the bar.
 
-What could bend the answer was fixed before the candidates were judged; the grid was laid once more after the first look,
-at the starts 0 and 100, which do not count any more:
+What could bend the answer was fixed before the candidates were judged. (The grid was laid anew after a first look at
+the starts 0 and 100, which therefore do not count.)
 
 * the lights, `LIGHTS`;
 * the candidates: the grid `GRID`, in which the defaults of the robot are; the short version takes those of `SHORT`;
