@@ -18,6 +18,9 @@ from vtbdrake_diagrams.satellite.supervisor import ABORT, GUIDANCE, HOLD, RETREA
 
 Array = NDArray[np.float64]
 
+# Share of their opening from which on the fingers release the bar.
+_OPEN = 0.9
+
 
 class ArmController(LeafSystem):
     r"""Resolved-rate control of the gripper, with the base's motion subtracted, and of the fingers.
@@ -42,9 +45,9 @@ class ArmController(LeafSystem):
     are scaled down together if one exceeds ``joint_rate``. The output integrates qdot, and stays within ``lead`` of the
     measured positions.
 
-    Otherwise the rates decay (time constant ``brake_time``), and after an abort the gripper backs off along its z axis
-    for ``back_off`` seconds, and the arm returns to where it was stowed. The fingers follow the guidance's opening with
-    ``finger_rate``.
+    Otherwise the rates decay (time constant ``brake_time``). After an abort, when the fingers are open, the gripper
+    backs off along its z axis for ``back_off`` seconds, and the arm returns to where it was stowed. The fingers follow
+    the guidance's opening with ``finger_rate``.
     """
 
     __slots__ = NO_DICT
@@ -102,7 +105,7 @@ class ArmController(LeafSystem):
         command, memory = context.get_discrete_state(self._command).value(), context.get_discrete_state(1).value()
         q, rates, aborted = measured[:ARM_JOINTS], memory[:ARM_JOINTS], memory[ARM_JOINTS]
         mode = guidance.mode
-        if mode == ABORT:
+        if mode == ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
             aborted += T
             if aborted < back_off:
                 away = np.concatenate((np.zeros(3), -back_speed * relative.R_BG[:, 2]))
@@ -112,7 +115,7 @@ class ArmController(LeafSystem):
         elif guidance.follows:
             twist = self._twist(relative, guidance, k_p, k_R, speed, turn)
             rates = self._rates.value((q, twist, [posture, damping])).copy()
-        elif mode in (RETREAT, HOLD):
+        elif mode in (RETREAT, HOLD, ABORT):
             rates = rates * np.exp(-T / max(brake, T))
         else:
             rates = np.zeros(ARM_JOINTS)

@@ -124,7 +124,8 @@ class Supervisor(LeafSystem):
 
     Approach, track and grip are aborted on command, when there has been no estimate for ``lost_after``, when the
     fixture leaves the reach, when it moves against the base faster than ``largest_speed``, and after ``time_limit``;
-    retreat and hold when the bar slips out. While the newest estimate is older than ``hold_after``, all holds.
+    retreat and hold on command, and when the bar slips out. While the newest estimate is older than ``hold_after``,
+    all holds.
 
     The variables ``mode`` and ``reason`` are numbers: positions in `MODES` and `REASONS`.
     """
@@ -249,7 +250,7 @@ class Supervisor(LeafSystem):
     def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: dict[str, float]) -> float:
         """Return the reason for an abort, or 0."""
         if mode not in (APPROACH, TRACK, GRIP):
-            return COMMANDED if go < -0.5 and mode == RETREAT else 0.0
+            return COMMANDED if go < -0.5 and mode in (RETREAT, HOLD) else 0.0
         checks = {
             COMMANDED: go < -0.5,
             LOST: relative.age > p["lost_after"] or not relative.valid,

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.satellite import SatelliteScenario
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.supervisor import MODES, REASONS
 
 
@@ -87,6 +88,22 @@ def test_abort_says_why(values: dict[str, float], expected: str) -> None:
     built().write(context, {address.replace("__", "."): value for address, value in values.items()})
     simulator.AdvanceTo(6.0)
     assert (mode(context), reason(context)) == ("abort", expected)
+
+
+def test_abort_releases_the_bar_and_backs_off() -> None:
+    context = advanced(13.0)
+    assert mode(context) == "retreat"
+    built().write(context, {"u.capture": -1.0})
+    simulator = built().simulator(context, restored=True)
+    before = built().read(context, "sim.sys.target.body.velocity")
+    simulator.AdvanceTo(19.0)
+    assert mode(context) == "abort"
+    # The arm, which is still braking, no longer drags the target.
+    np.testing.assert_allclose(built().read(context, "sim.sys.target.body.velocity"), before, atol=0.01)
+    assert fixture_in_gripper(context).translation()[2] > 0.15
+    simulator.AdvanceTo(30.0)
+    stowed = [built().read(context, f"sim.sys.servicer.{name}.position") for name in ARM_JOINT_NAMES]
+    assert np.abs(np.array(stowed) - Servicer().stowed).max() < 0.01
 
 
 def test_lost_target_is_no_start() -> None:
