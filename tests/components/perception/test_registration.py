@@ -26,6 +26,7 @@ def rays(count: int) -> np.ndarray:
 def cast(X: RigidTransform, directions: np.ndarray) -> np.ndarray:
     """Return the distances at which rays from the eye hit the boxes, by the slab method; infinite if they do not."""
     origin, inside = X.inverse() @ EYE, directions @ X.rotation().matrix()
+    inside = np.where(np.abs(inside) < 1e-12, 1e-12, inside)
     nearest = np.full(len(directions), np.inf)
     for edges, center in BOXES:
         first, second = ((sign * np.array(edges) / 2 + center - origin) / inside for sign in (-1.0, 1.0))
@@ -111,6 +112,18 @@ def test_motion_along_a_single_face_stays_as_predicted() -> None:
     assert deviations[3] < 0.01
     assert deviations[4:].min() > 0.1
     assert np.abs(estimate.error_to(X)[:3]).max() < 1e-4
+
+
+def test_edges_of_a_covered_face_tell_where_it_is() -> None:
+    errors = []
+    for height in (0.24, 0.27, 0.29, 0.31):
+        X = RigidTransform([2.5, 0.0, height])
+        points = measure(0.002, seed=1, count=32, X=X)  # 4 cm apart.
+        start = RigidTransform(X.rotation(), X.translation() + np.array([0.0, 0.03, -0.03]))
+        estimate = register(points, start, noise=0.002)
+        errors.append(estimate.error_to(X)[4:])
+        assert np.sqrt(estimate.covariance.diagonal()).max() < 0.02
+    assert np.abs(errors).max() < 0.015
 
 
 @pytest.mark.parametrize(

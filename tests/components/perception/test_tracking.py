@@ -83,6 +83,15 @@ def test_late_estimate_counts_as_if_it_had_been_in_time() -> None:
     assert np.concatenate([other.w, other.v]) == pytest.approx(np.concatenate([one.w, one.v]), abs=2e-5)
 
 
+def test_deviations_are_those_of_the_predicted_covariance() -> None:
+    generator, model = np.random.default_rng(0), MotionModel()
+    track = model.begin(measured(truth(0.0), 0.0, generator))
+    for k in range(1, 6):
+        track, _ = model.fuse(track, measured(truth(0.2 * k), 0.2 * k, generator))
+    variances = model.predict(track, 2.0).P.diagonal().reshape(4, 3).mean(axis=1)
+    assert model.deviations(track, 2.0) == pytest.approx(np.sqrt(variances[:2]), rel=0.02)
+
+
 class Source(LeafSystem):
     """Poses of a body that turns about z, measured every 0.2 s and told 0.15 s later; none after ``until``."""
 

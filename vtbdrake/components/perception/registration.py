@@ -83,9 +83,9 @@ class Faces:
         """Measure how far points lie beside the faces that they cover from one edge to the other.
 
         Points say where their plane is, but not where in it. On a face that is cut into strips, the first and the last
-        point of a strip end within the points' mean distance s of the edges. So their middle is that of the face, with
-        a standard deviation of s / √24 if the ends are uniformly distributed. The offset is the mean over the strips;
-        as neighbouring strips often end alike, they do not count as independent.
+        point of a strip end within the mean distance s of points from the edges; their middle is that of the face to
+        ± s / 2. The offset is the mean over the strips. If the rows of points are parallel to an edge, all strips end
+        alike: so the standard deviation is that of one strip, s / √12 for a uniform distribution.
 
         Args:
             points: In T, (n, 3) in m.
@@ -115,7 +115,7 @@ class Faces:
                 whole = (high > half[k] - 2.0 * s) & (low < 2.0 * s - half[k])
                 if whole.sum() >= 3:
                     offset = float(np.mean(0.5 * (low[whole] + high[whole])))
-                    found.append((pose[:, 3], pose[:, k], offset, s / 24.0**0.5))
+                    found.append((pose[:, 3], pose[:, k], offset, s / 12.0**0.5))
         centres, directions, offsets, deviations = zip(*found, strict=True) if found else ((), (), (), ())
         return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(offsets), np.array(deviations)
 
