@@ -45,7 +45,7 @@ def _scanner() -> LaserScannerConfig:
 
 def _light() -> LightConfig:
     """Return the sun from behind the servicer, 45 deg off the normal of the front face, and the Earth below."""
-    return LightConfig(direction=(0.7, 0.5, -0.5), earth_shine=0.1)
+    return LightConfig(direction=[0.7, 0.5, -0.5], earth_shine=0.1)
 
 
 @dataclass

@@ -33,7 +33,7 @@ INFO = CameraInfo(160, 120, 150.0, 140.0, 83.0, 57.0)
 DISTANCE = 2.0
 # The camera at the origin looks along x_W.
 X_WC = RigidTransform(RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2), [0.0, 0.0, 0.0])
-FRONT = LightConfig(direction=(1.0, 0.0, 0.0), shadows=False)
+FRONT = LightConfig(direction=[1.0, 0.0, 0.0], shadows=False)
 
 
 class Scene:
@@ -120,7 +120,7 @@ def test_depth_is_along_the_optical_axis() -> None:
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0, 70.0])
 def test_brightness_follows_lambert_and_is_linear(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
-    scene = Scene(LightConfig(direction=(np.cos(angle), np.sin(angle), 0.0), intensity=0.8, shadows=False))
+    scene = Scene(LightConfig(direction=[np.cos(angle), np.sin(angle), 0.0], intensity=0.8, shadows=False))
     context = scene.context()
     expected = 255.0 * 0.5 * 0.8 * np.cos(angle)
     assert abs(scene.render(context)[57, 83] - expected) <= 1.0
@@ -199,7 +199,7 @@ def test_dropped_images_hold_the_last_one() -> None:
 
 
 def test_noise_has_the_variance_of_a_linear_camera() -> None:
-    light = LightConfig(direction=(1.0, 0.0, 0.0), intensity=0.5, shadows=False)
+    light = LightConfig(direction=[1.0, 0.0, 0.0], intensity=0.5, shadows=False)
     scene = Scene(light, size=20.0, photon_noise=8.0, errors=ErrorModel(noise=2.0, seed=1))
     context = scene.context()
     scene.set(context, "gain", 2.0)
@@ -221,7 +221,7 @@ def test_black_stays_black_without_noise_sources() -> None:
 
 
 def noisy(seed: int = 5) -> Scene:
-    return Scene(LightConfig(direction=(1.0, 0.5, -0.3)), photon_noise=5.0, errors=ErrorModel(noise=1.0, seed=seed))
+    return Scene(LightConfig(direction=[1.0, 0.5, -0.3]), photon_noise=5.0, errors=ErrorModel(noise=1.0, seed=seed))
 
 
 def noisy_images(scene: Scene) -> bytes:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from vtbdrake.testbed import ScenarioError, VirtualTestbed
+from vtbdrake.components.environment import LightConfig
+from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.supervisor import MODES, REASONS
@@ -115,3 +117,9 @@ def test_lost_target_is_no_start() -> None:
 def test_bad_fields_are_refused(field: str, value: object) -> None:
     with pytest.raises(ScenarioError, match=field):
         SatelliteScenario(**{field: value}).build()
+
+
+def test_scenario_survives_a_file(tmp_path: Path) -> None:
+    scenario = SatelliteScenario(seed=3, light=LightConfig(direction=[1.0, 0.0, 0.2]))
+    scenario.save(tmp_path / "satellite.yaml")
+    assert load_scenario(tmp_path / "satellite.yaml") == scenario

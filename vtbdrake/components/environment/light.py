@@ -7,7 +7,7 @@ that faces it. A camera with exposure 1 and gain 1 shows such a surface at full 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isfinite, sqrt
 from typing import TYPE_CHECKING
 
@@ -50,17 +50,17 @@ class LightConfig:
     """The light of a scene."""
 
     # Direction in which the sunlight travels, in W; of any length. By default from straight above.
-    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    direction: list[float] = field(default_factory=lambda: [0.0, 0.0, -1.0])
     # Brightness of a white surface that faces the sun.
     intensity: float = 1.0
     # Red, green and blue of the sunlight, between 0 and 1.
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
     # Direction in which light from the Earth travels, in W; of any length.
-    earth_direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    earth_direction: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])
     # Brightness of a white surface that faces the Earth, see `earth_shine`.
     earth_shine: float = 0.0
     # Red, green and blue of what is seen where nothing is, between 0 and 1.
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     # Whether bodies shade each other from the sun.
     shadows: bool = True
 

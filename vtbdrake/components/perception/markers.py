@@ -198,7 +198,7 @@ def _aruco() -> Any:
 REFINEMENTS = ("lines", "subpixel", "none")
 
 
-@dataclass(frozen=True)
+@dataclass
 class MarkerDetector:
     """How markers are found in an image.
 

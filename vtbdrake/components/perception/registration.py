@@ -142,7 +142,7 @@ def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: 
     return fixed
 
 
-@dataclass(frozen=True)
+@dataclass
 class Registration:
     """How laser points are registered.
 

@@ -65,7 +65,7 @@ class Track:
 TRACK_SIZE = 1 + 9 + 9 + 144
 
 
-@dataclass(frozen=True)
+@dataclass
 class MotionModel:
     """How a body in free fall is assumed to move: with constant velocity and angular velocity, but for white noise.
 
