@@ -28,12 +28,12 @@ SOLVERS: dict[str, Callable[..., Plan]] = {
 }
 
 
-def arm_trajectory(repeats: int = 10, seconds: float = 20.0) -> list[Benchmark]:
+def arm_trajectory(repeats: int = 10, searched: int = 60) -> list[Benchmark]:
     """Time of the momentum model beside that of a rollout, and times to 1 deg by solver.
 
     Args:
         repeats: Rollouts that are measured.
-        seconds: Of black-box search in the full testbed.
+        searched: Rollouts of black-box search in the full testbed.
     """
     move, problem = SCENARIO.move(), search_problem(SCENARIO)
     point = dict(
@@ -66,14 +66,13 @@ def arm_trajectory(repeats: int = 10, seconds: float = 20.0) -> list[Benchmark]:
     # It is told of the straight path, but does not begin there.
     begin, history = time.perf_counter(), [(0.0, inf)]
     study = problem.study(solver="CMA-ES", options={"sigma": _SPREAD})
-
     study.add(point)
 
     def look(_: Study, trial: Trial) -> None:
         if max(trial.violations) <= 0.0 and trial.value < history[-1][1]:
             history.append((time.perf_counter() - begin, trial.value))
 
-    study.run(seconds=seconds, executor="serial", callbacks=[look], progress=False)
+    study.run(rollouts=searched, executor="serial", callbacks=[look], progress=False)
     found = Plan(move.straight, history[-1][1], tuple(history), "")
     rows.append(_row("cma_es_testbed", found, time.perf_counter() - begin, straight))
     return rows
