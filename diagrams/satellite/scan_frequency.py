@@ -234,16 +234,17 @@ class FrequencyAnswer:
 
     @property
     def explained(self) -> bool:
-        """Return whether the raw errors follow `skew` where it exceeds all else, and de-skewing takes it away.
+        """Return whether the errors have the two causes that are expected.
 
-        Where the skew alone is twice the tolerance and there are enough scans for a track (from 1 Hz), the raw error is
-        between the skew and twice the skew, and de-skewed scans have less than half of it.
+        Where the `skew` is larger than the tolerance and there are enough scans for a track (from 1 Hz), the raw error
+        is between once and twice the skew; and without it, by de-skewing, a lower frequency suffices. With most scans
+        per second, which have the fewest points, the error of de-skewed ones is not the smallest.
         """
-        told = (self.frequencies >= 1.0) & (skew(self.frequencies) > 2.0 * TOLERANCE)
-        expected = skew(self.frequencies[told])
-        raw, deskewed = self.raw[:, told], self.deskewed[:, told]
-        follows = (raw > expected) & (raw < 2.0 * expected)
-        return bool(told.any() and follows.all() and (deskewed < 0.5 * raw).all())
+        told = (self.frequencies >= 1.0) & (skew(self.frequencies) > TOLERANCE)
+        relative = self.raw[:, told] / skew(self.frequencies[told])
+        follows = bool(told.any() and ((relative > 1.0) & (relative < 2.0)).all())
+        lower = all(d < r for (_, d), (_, r) in zip(self.least(self.deskewed), self.least(self.raw), strict=True))
+        return follows and lower and bool((self.deskewed[:, -1] > self.deskewed.min(axis=1)).all())
 
     @property
     def holds(self) -> bool:
@@ -269,7 +270,7 @@ def find_frequencies(
     for deskew in (False, True):
         problem = frequency_problem(deskew=deskew, starts=starts)
         sweep = problem.sweep(values=points, executor=executor, progress=False)
-        errors[deskew] = sweep.h.reshape(shape).max(axis=2)
+        errors[deskew] = np.reshape([rollout.value for rollout in sweep.rollouts], shape).max(axis=2)
     return FrequencyAnswer(np.array(tumbles), np.array(FREQUENCIES), errors[False], errors[True])
 
 

@@ -61,10 +61,12 @@ def test_least_frequency_is_the_first_below_the_tolerance() -> None:
 
 
 def test_trend_is_explained_only_where_errors_follow_the_skew() -> None:
-    good, at_1_hz = 0.5 * TOLERANCE, float(skew(1.0))
-    assert answer([0.3, 1.2 * at_1_hz, good], [0.3, good, good]).holds
-    assert not answer([0.3, 0.2 * at_1_hz, good], [0.3, 0.1 * at_1_hz, good]).explained
-    assert not answer([0.3, 1.2 * at_1_hz, good], [0.3, 1.2 * at_1_hz, good]).explained
+    at_1_hz = float(skew(1.0))
+    raw, deskewed = [0.3, 1.2 * at_1_hz, 0.5 * TOLERANCE], [0.3, 0.4 * TOLERANCE, 0.5 * TOLERANCE]
+    assert answer(raw, deskewed).holds
+    assert not answer([0.3, 0.9 * at_1_hz, 0.5 * TOLERANCE], deskewed).explained
+    assert not answer(raw, raw).explained
+    assert not answer(raw, [0.3, 0.4 * TOLERANCE, 0.3 * TOLERANCE]).explained
 
 
 def test_tumbles_that_hide_the_front_are_refused() -> None:
