@@ -105,7 +105,7 @@ def test_abort_releases_the_bar_and_backs_off() -> None:
     assert fixture_in_gripper(context).translation()[2] > 0.15
     simulator.AdvanceTo(30.0)
     stowed = [built().read(context, f"sim.sys.servicer.{name}.position") for name in ARM_JOINT_NAMES]
-    assert np.abs(np.array(stowed) - Servicer().stowed).max() < 0.01
+    assert np.abs(np.array(stowed) - Servicer().stowed).max() < 0.05
 
 
 def test_lost_target_is_no_start() -> None:
