@@ -22,6 +22,7 @@ from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
 APPLICATIONS: Registry = {
     "O1": "vtbdrake_diagrams.satellite.mount:mount",
     "O2": "vtbdrake_diagrams.satellite.scan_frequency:frequency",
+    "O3": "vtbdrake_diagrams.satellite.lighting:lighting",
     "O4": "vtbdrake_diagrams.space_climber.answers:payload",
     "R1": "vtbdrake_diagrams.space_climber.answers:heading",
     "R2": "vtbdrake_diagrams.satellite.trajectory:answer",

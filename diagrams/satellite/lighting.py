@@ -241,9 +241,9 @@ def plot_answer(answer: LightingAnswer) -> Figure:
     for costs, (name, (_, color)) in zip(answer.checked, named.items(), strict=True):
         checked_axes.plot(lights, costs.mean(axis=1), "o-", color=color, label=name)
         checked_axes.plot(np.repeat(lights, costs.shape[1]), costs.ravel(), ".", color=color, alpha=0.5)
-    for axes, title in ((chosen_axes, "chosen on"), (checked_axes, "compared on other")):
-        starts = (answer.costs if axes is chosen_axes else answer.checked).shape[2]
-        axes.set(ylabel="time to grip [s]", title=f"{title} {starts} start{'s' if starts > 1 else ''}")
+    titles = f"start poses for the choice: {answer.costs.shape[2]}", f"other start poses: {answer.checked.shape[2]}"
+    for axes, title in zip((chosen_axes, checked_axes), titles, strict=True):
+        axes.set(ylabel="time to grip [s]", title=title)
         axes.set_xticks(lights, [light.replace(", ", ",\n") for light in LIGHTS])
         axes.axhline(FAILURE, color="0.5", ls=":", lw=1.0)
         axes.legend(fontsize="x-small")
