@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from pydrake.geometry import (
@@ -170,3 +172,9 @@ def test_impossible_board_is_rejected(ids: list[int], size: float, message: str)
 def test_impossible_detector_is_rejected() -> None:
     with pytest.raises(ValueError, match="refinement is one of lines, subpixel, none, not 'apriltag'"):
         MarkerDetector(refinement="apriltag")
+
+
+def test_missing_opencv_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ImportError, match=r"pip install vtbdrake\[perception\]"):
+        detect_markers(np.zeros((8, 8), dtype=np.uint8))
