@@ -42,7 +42,8 @@ class RecordedMotion:
     refused. At each sample, the state of all systems that do not follow is compared with the recorded one.
     `Problem.check` compares whole rollouts with those along the motion, and finds a memory that is too short. The
     testbed must have no continuous state: a discrete plant continues exactly from a recorded state, an integrator with
-    error control does not.
+    error control does not. What fails only between the windows (a camera that is inside a link for a moment) is not
+    noticed.
 
     Attributes:
         memory: In seconds. Of a camera of period T and latency L, and a detector of latency D that samples at an offset
