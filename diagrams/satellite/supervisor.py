@@ -127,6 +127,9 @@ class Supervisor(LeafSystem):
     retreat and hold on command, and when the bar slips out. While the newest estimate is older than ``hold_after``,
     all holds.
 
+    The open fingers' lips leave 25 mm of room on each side of the bar. The grip tolerance takes half of it; the other
+    half is for what the target does while the fingers close.
+
     The variables ``mode`` and ``reason`` are numbers: positions in `MODES` and `REASONS`.
     """
 
