@@ -46,8 +46,9 @@ class RecordedMotion:
     noticed.
 
     Attributes:
-        memory: In seconds. Of a camera of period T and latency L, and a detector of latency D that samples at an offset
-            above L, it is T + D at most. A filter never forgets: let it not follow, or read f before it.
+        memory: In seconds. Of a camera of period T and a detector of latency D that samples its images s seconds after
+            they were taken, it is T + s + D at most, and less where f is sampled right after a result. A filter never
+            forgets: read f before it.
         varied: Addresses of the variables that are varied, parameters of systems that are no part of the motion; a
             `Problem` sets them to those of its parameters.
 
