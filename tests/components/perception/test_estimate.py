@@ -17,12 +17,18 @@ ROOT = np.random.default_rng(0).standard_normal((6, 6))
 ESTIMATE = PoseEstimate.of(X_AB, ROOT @ ROOT.T, time=2.5)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-200, 1e-8, 0.3, 3.1, 7.0])
+def test_rotation_of_a_vector_is_that_of_drake(angle: float) -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    expected = RotationMatrix(AngleAxis(angle, axis)).matrix()
+    np.testing.assert_allclose(rotation_matrix(angle * axis), expected, atol=1e-15)
+    np.testing.assert_allclose(rotation_matrix(np.tile(angle * axis, (2, 1))), [expected, expected], atol=1e-15)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 3.1])
 def test_rotation_vector_is_axis_times_angle(angle: float) -> None:
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    R = RotationMatrix(AngleAxis(angle, axis)).matrix()
-    np.testing.assert_allclose(rotation_matrix(angle * axis), R, atol=1e-14)
-    np.testing.assert_allclose(rotation_vector(R), angle * axis, atol=1e-12)
+    theta = angle * np.array([2.0, -1.0, 2.0]) / 3.0
+    np.testing.assert_allclose(rotation_vector(rotation_matrix(theta)), theta, atol=1e-12)
 
 
 def test_cross_matrix_multiplies_like_the_cross_product() -> None:
