@@ -158,10 +158,10 @@ def test_loop_does_not_wait_for_a_function_that_hangs(gate):
         assert np.array_equal(real.read("estimate"), [0.0, 0.0])
         missing = [cycle.time for cycle in real.cycles for change in cycle.changes if change.kind == RESULT]
         assert missing == pytest.approx([0.01, 0.03, 0.05, 0.07, 0.09])
-        # 20 latencies later, another process is started.
+        # 20 latencies later, another process is started; on a busy computer that one may have been replaced already.
         assert real.wait()
         real.run(1)
-        assert real.counts.restarts == 1 and real.wait()
+        assert real.counts.restarts >= 1 and real.wait()
         with opened(gate):
             real.run_patiently(50)
         assert real.counts.results >= 1 and real.read("valid") == 1.0
