@@ -1,0 +1,145 @@
+"""Tests of objects, queries, relations and the codec of world models."""
+
+import copy
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.world_model import (
+    WORLD_MODEL_CODEC,
+    Quantity,
+    Relation,
+    WorldModel,
+    WorldObject,
+    position_estimate,
+)
+
+
+def tree(identity: str, xyz: list[float], *, diameter: float = 0.3, **fields: object) -> WorldObject:
+    attributes = {"trunk_diameter": Quantity(diameter, "m", 0.02), "species": Quantity("spruce")}
+    return WorldObject(identity, "tree", position_estimate(xyz, deviation=0.1), attributes=attributes, **fields)
+
+
+@pytest.fixture(scope="module")
+def stand() -> WorldModel:
+    rng = np.random.default_rng(3)
+    places = np.column_stack([rng.uniform(0.0, 100.0, (300, 2)), rng.uniform(-2.0, 2.0, 300)])
+    trees = [tree(f"t{k}", list(place), diameter=rng.uniform(0.06, 0.41)) for k, place in enumerate(places)]
+    rock = WorldObject("boulder", "rock", position_estimate([50.0, 50.0, 0.0]))
+    return WorldModel([*trees, rock])
+
+
+def test_queries_equal_a_search_of_all_objects(stand: WorldModel) -> None:
+    point = np.array([40.0, 60.0])
+    found = stand.find("tree", near=(point, 15.0), attributes={"trunk_diameter": (0.2, 0.3), "species": "spruce"})
+    expected = [
+        one.identity
+        for one in stand
+        if one.kind == "tree"
+        and np.hypot(*(one.p_WoOo_W[:2] - point)) <= 15.0
+        and 0.2 <= one.number("trunk_diameter", unit="m") <= 0.3
+    ]
+    assert [one.identity for one in found] == expected
+    assert len(expected) > 2
+
+
+def test_region_in_space_and_in_the_plane(stand: WorldModel) -> None:
+    places = stand.positions()
+    near = np.linalg.norm(places - [50.0, 50.0, 1.0], axis=1) <= 8.0
+    assert len(stand.find(near=([50.0, 50.0, 1.0], 8.0))) == near.sum()
+    inside = ((places[:, :2] >= [10.0, 20.0]) & (places[:, :2] <= [30.0, 50.0])).all(axis=1)
+    assert len(stand.find(box=([10.0, 20.0], [30.0, 50.0]))) == inside.sum() > 0
+
+
+def test_nearest_objects_come_first(stand: WorldModel) -> None:
+    distances = np.linalg.norm(stand.positions() - [20.0, 20.0, 0.0], axis=1)
+    order = [tuple(stand)[row].identity for row in np.argsort(distances)[:5]]
+    assert [one.identity for one in stand.nearest([20.0, 20.0, 0.0], 5)] == order
+    assert WorldModel().nearest([0.0, 0.0, 0.0]) == () == WorldModel().find(near=([0.0, 0.0], 1.0))
+
+
+def test_status_selects(stand: WorldModel) -> None:
+    model = WorldModel([tree("a", [0, 0, 0]), tree("b", [1, 0, 0], status="retired")])
+    assert [one.identity for one in model.find(status="retired")] == ["b"]
+    assert [one.identity for one in model.known()] == ["a"]
+
+
+def test_changes_leave_the_model_as_it_was() -> None:
+    model = WorldModel([tree("a", [0, 0, 0])])
+    larger = model.with_objects(tree("b", [1, 0, 0]), tree("a", [5, 0, 0]))
+    assert len(model) == 1 and model["a"].p_WoOo_W[0] == 0.0
+    assert [one.p_WoOo_W[0] for one in larger] == [5.0, 1.0]
+    assert copy.deepcopy(model) is model
+    with pytest.raises(ValueError):
+        model["a"].pose.matrix[0, 3] = 1.0
+    with pytest.raises(TypeError):
+        model["a"].attributes["height"] = Quantity(3.0, "m")
+
+
+def test_relations_lead_to_objects_of_the_model() -> None:
+    rock, satellite = tree("rock", [0, 0, 0]), tree("t", [0, 0, 1], relations=(Relation("leans_on", "rock"),))
+    model = WorldModel([rock, satellite])
+    assert model.related("t", "leans_on") == (rock,) and model.related("t", "stands_on") == ()
+    assert model.without(["rock"])["t"].relations == ()
+    with pytest.raises(ValueError, match="t leans_on 'rock', which is not an object"):
+        WorldModel([satellite])
+
+
+def test_codec_is_exact() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(6, 6))
+    pose = PoseEstimate.of(
+        RigidTransform(RollPitchYaw(rng.normal(size=3)), rng.normal(size=3)), root @ root.T, time=0.1
+    )
+    model = WorldModel(
+        [
+            WorldObject("sat", "satellite", pose, source="käse", hits=3, misses=1, conflicts=2),
+            tree("t", [0.1, 0.2, 0.3], status="tentative", relations=(Relation("near", "sat"),)),
+        ],
+        created=17,
+    )
+    arrays = WORLD_MODEL_CODEC.encode(model)
+    for again in (WORLD_MODEL_CODEC.decode(arrays), pickle.loads(pickle.dumps(model))):
+        assert again.created == 17
+        for one, other in zip(model, again, strict=True):
+            assert np.array_equal(one.pose.matrix, other.pose.matrix)
+            assert np.array_equal(one.pose.covariance, other.pose.covariance)
+            assert replace(one, pose=other.pose).__getstate__() == other.__getstate__()
+    assert len(WORLD_MODEL_CODEC.decode(WORLD_MODEL_CODEC.encode(WorldModel()))) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: WorldModel([tree("a", [0, 0, 0]), tree("a", [1, 0, 0])]), "two objects have the identity 'a'"),
+        (lambda: tree("", [0, 0, 0]), "identity of an object is a text"),
+        (lambda: tree("a", [0, np.nan, 0]), "finite numbers"),
+        (lambda: tree("a", [0, 0, 0], status="gone"), "tentative, confirmed, revised, retired"),
+        (lambda: Quantity(31.0, "cm"), "convert the value"),
+        (lambda: Quantity(np.nan, "m"), "finite number or a text"),
+        (lambda: Quantity("spruce", "m"), "has no unit"),
+        (lambda: WorldObject("a", "tree", PoseEstimate.missing()), "is missing"),
+        (
+            lambda: WorldObject("a", "tree", PoseEstimate.of(RigidTransform(), -np.eye(6), time=0.0)),
+            "variances of at least 0",
+        ),
+        (
+            lambda: WorldObject("a", "tree", PoseEstimate.of(RigidTransform(), np.diag([np.inf, *[1] * 5]), time=0.0)),
+            "all finite or all infinite",
+        ),
+        (lambda: tree("a", [0, 0, 0]).number("height", unit="m"), "has no attribute height"),
+        (lambda: tree("a", [0, 0, 0]).number("species", unit="1"), "is not a number"),
+    ],
+)
+def test_what_is_no_object_is_refused(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("unit", ["m", "kg/m^3", "1", "1/s", "N*m", "rad", "m/s^2"])
+def test_si_units_are_accepted(unit: str) -> None:
+    assert Quantity(1.0, unit).unit == unit

@@ -1,0 +1,134 @@
+"""Which observation is of which object: innovations, gates, and the best one-to-one assignment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.optimize import linear_sum_assignment
+from scipy.special import gammaincinv
+
+from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.world_model.objects import (
+    Array,
+    Quantity,
+    WorldObject,
+    check_pose,
+    checked_attributes,
+    finite_part,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One observation of an object, in the world frame of the model.
+
+    Attributes:
+        kind: The class of what was seen, such as ``"tree"``.
+        pose: The measured pose. Its covariance, (6, 6), is positive definite in what was measured, and infinite in
+            the rest: in all rotations, or in single translations.
+        attributes: Measured attributes by name. Numbers with a deviation take part in the association.
+        source: The name of the sensor or function.
+
+    Raises:
+        ValueError: No translation was measured, or the covariance is not as described.
+    """
+
+    kind: str
+    pose: PoseEstimate
+    attributes: Mapping[str, Quantity] = field(default_factory=dict)
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        owner = f"a sighting of a {self.kind}"
+        check_pose(owner, self.pose)
+        known = finite_part(self.pose.covariance)
+        if not known[3:].any() or np.linalg.eigvalsh(self.pose.covariance[np.ix_(known, known)])[0] <= 0.0:
+            raise ValueError(
+                f"the covariance of {owner} is positive definite in what was measured, a position at least"
+            )
+        object.__setattr__(self, "attributes", checked_attributes(owner, self.attributes))
+
+
+def chi_square_quantile(probability: float, degrees: int) -> float:
+    """Return the value below which a chi-square variable of ``degrees`` of freedom lies with ``probability``."""
+    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
+
+
+def mahalanobis(one: WorldObject, sighting: Sighting) -> tuple[float, int]:
+    """Return the squared Mahalanobis distance d² of a sighting from an object, and its degrees of freedom.
+
+    With the innovation ν in all that both know (components of the pose, measured attributes) and its covariance S,
+    d² = νᵀ S⁻¹ ν. If the sighting is of the object, d² is chi-square distributed, to first order in the rotation.
+    """
+    part = finite_part(one.pose.covariance) & finite_part(sighting.pose.covariance)
+    delta = one.pose.error_to(sighting.pose.X)[part]
+    S = (one.pose.covariance + sighting.pose.covariance)[np.ix_(part, part)]
+    innovation, spread = [delta], [S]
+    for name, seen in sighting.attributes.items():
+        known = one.attributes.get(name)
+        if known is not None and known.is_measured and seen.is_measured:
+            check_units(one, name, known, seen)
+            innovation.append(np.array([float(seen.value) - float(known.value)]))
+            spread.append(np.array([[known.deviation**2 + seen.deviation**2]]))
+    nu = np.concatenate(innovation)
+    return float(nu @ np.linalg.solve(block_diag(*spread), nu)), nu.size
+
+
+def check_units(one: WorldObject, name: str, known: Quantity, seen: Quantity) -> None:
+    """Raise a ValueError if a seen attribute has another unit than the known one."""
+    if known.unit != seen.unit:
+        raise ValueError(f"{name} of {one.identity} is in {known.unit}, but was seen in {seen.unit}: use one unit")
+
+
+def associate(
+    objects: Sequence[WorldObject], sightings: Sequence[Sighting], *, probability: float = 0.997
+) -> dict[int, int]:
+    """Return which object each sighting is of, as sighting -> object by their places; those of none are left out.
+
+    Each object is seen once at most, and classes agree. Among all one-to-one assignments within the gate, this is the
+    one with the least sum of d² over the pairs plus the gate for each sighting that is left over (global nearest
+    neighbours). The gate is the quantile of the chi-square distribution with the pair's degrees of freedom.
+
+    Args:
+        objects: The objects that may have been seen.
+        sightings: What was seen at one instant.
+        probability: The share of right pairs that the gate lets pass.
+    """
+    gain = np.zeros((len(sightings), len(objects)))
+    for i, j in np.argwhere(_within_reach(objects, sightings, probability)):
+        distance, degrees = mahalanobis(objects[j], sightings[i])
+        if degrees:
+            gain[i, j] = max(0.0, chi_square_quantile(probability, degrees) - distance)
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0.0}
+
+
+def _within_reach(
+    objects: Sequence[WorldObject], sightings: Sequence[Sighting], probability: float
+) -> NDArray[np.bool_]:
+    """Return which pairs, (sightings, objects), can be within the gate at all.
+
+    |ν|² / tr S is at most the d² of the translation, so that most pairs need no d². A coordinate that one of them does
+    not know makes the trace infinite, and would let all pairs pass; so it is left out.
+    """
+    widest = max((len(sighting.attributes) for sighting in sightings), default=0)
+    gate = chi_square_quantile(probability, 6 + widest)
+    reach = np.array([[one.kind == s.kind for one in objects] for s in sightings], dtype=bool)
+    reach = reach.reshape(len(sightings), len(objects))
+    delta2, trace = np.zeros(reach.shape), np.zeros(reach.shape)
+    for axis in range(3):
+        there, seen = (_coordinate([one.pose for one in group], axis) for group in (objects, sightings))
+        variance = seen[1][:, np.newaxis] + there[1]
+        shared = np.isfinite(variance)
+        delta2 += np.where(shared, seen[0][:, np.newaxis] - there[0], 0.0) ** 2
+        trace += np.where(shared, variance, 0.0)
+    return reach & (delta2 <= gate * trace)
+
+
+def _coordinate(poses: Sequence[PoseEstimate], axis: int) -> tuple[Array, Array]:
+    """Return one coordinate of each position, and its variance."""
+    return np.array([p.matrix[axis, 3] for p in poses]), np.array([p.covariance[3 + axis, 3 + axis] for p in poses])

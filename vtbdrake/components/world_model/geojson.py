@@ -1,0 +1,310 @@
+"""World models as GeoJSON files (RFC 7946), which QGIS and geopandas read.
+
+Every object is a Feature with a Point: its origin as longitude, latitude and height over the ellipsoid, all of WGS84.
+Its `id` is the identity; its properties are flat, so that a table shows them:
+
+* ``class``, ``status``, ``source``, ``time`` (s), ``hits``, ``misses``, ``conflicts``;
+* every attribute by its name, and ``<name>_deviation`` beside it, unless the deviation is 0;
+* ``orientation`` (the quaternion w, x, y, z of R_WO) and ``covariance`` (six rows; null is an infinite variance), both
+  in the frame W of the model; ``relations``, a list of ``{"kind": ..., "other": ...}``. These three are texts of JSON,
+  because tables of other programs round or lose lists; lists are read, too.
+
+Two foreign members of the FeatureCollection tell what GeoJSON has no place for: ``local_frame`` is the `LocalFrame` of
+W, and ``units`` the unit of every numeric attribute. Other programs drop both when they write; then the reader is told.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from math import isfinite
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.world_model.local_frame import LocalFrame
+from vtbdrake.components.world_model.model import WorldModel
+from vtbdrake.components.world_model.objects import CONFIRMED, Array, Quantity, Relation, WorldObject
+from vtbdrake.state.archive import whole_file
+
+_DEVIATION = "_deviation"
+_OWN = (
+    *("class", "status", "source", "time", "hits", "misses", "conflicts"),
+    *("orientation", "covariance", "relations", "id"),
+)
+# The names that GDAL gives to WGS84 in GeoJSON, without and with heights.
+_WGS84 = ("CRS84", "EPSG::4326", "EPSG::4979")
+# A tangent plane is no map of what is farther away than this, in m: such a place is a mistake.
+_FARTHEST = 100e3
+
+
+class GeoJsonError(ValueError):
+    """A file that is no world model in GeoJSON; the error names the feature."""
+
+
+def save_geojson(model: WorldModel, path: str | os.PathLike[str], *, frame: LocalFrame) -> None:
+    """Write a world model as a GeoJSON file, whole or not at all.
+
+    Args:
+        model: What is written.
+        path: The file.
+        frame: Where the world frame of the model lies on Earth.
+
+    Raises:
+        ValueError: An attribute has the name of another property, or one attribute is in several units.
+    """
+    units: dict[str, str] = {}
+    for one in model:
+        for name, quantity in one.attributes.items():
+            if name in _OWN or name.endswith(_DEVIATION):
+                raise ValueError(f"the attribute {name} of {one.identity} has the name of another property in GeoJSON")
+            if not isinstance(quantity.value, str) and units.setdefault(name, quantity.unit) != quantity.unit:
+                raise ValueError(f"{name} of {one.identity} is in {quantity.unit}, of others in {units[name]}")
+    places = frame.to_geographic(model.positions())
+    collection = {
+        "type": "FeatureCollection",
+        "local_frame": asdict(frame),
+        "units": units,
+        "features": [_feature(one, place) for one, place in zip(model, places, strict=True)],
+    }
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(collection, indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _feature(one: WorldObject, place: Array) -> dict[str, Any]:
+    properties: dict[str, Any] = {
+        "class": one.kind,
+        "status": one.status,
+        "source": one.source,
+        "time": one.pose.time,
+        "hits": one.hits,
+        "misses": one.misses,
+        "conflicts": one.conflicts,
+    }
+    for name, quantity in one.attributes.items():
+        properties[name] = quantity.value
+        if quantity.is_measured:
+            properties[name + _DEVIATION] = quantity.deviation
+    covariance = [[value if isfinite(value) else None for value in row] for row in one.pose.covariance.tolist()]
+    properties |= {
+        "orientation": json.dumps(one.X_WO.rotation().ToQuaternion().wxyz().tolist()),
+        "covariance": json.dumps(covariance),
+        "relations": json.dumps([asdict(relation) for relation in one.relations]),
+    }
+    geometry = {"type": "Point", "coordinates": place.tolist()}
+    return {"type": "Feature", "id": one.identity, "geometry": geometry, "properties": properties}
+
+
+def load_geojson(
+    path: str | os.PathLike[str],
+    *,
+    frame: LocalFrame | None = None,
+    units: Mapping[str, str] | None = None,
+) -> WorldModel:
+    """Read a world model from a GeoJSON file.
+
+    Of the properties, only ``class`` is needed: others have the defaults of `WorldObject`, an orientation along W, and
+    a covariance that is infinite for the rotation and zero for the position. A property that is null is left out.
+
+    Args:
+        path: The file.
+        frame: The frame W of the model, for a file that does not declare it.
+        units: Units of numeric attributes that the file does not declare, by name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        GeoJsonError: The file is not such a GeoJSON file.
+    """
+    try:
+        data = json.loads(Path(path).read_text("utf-8"), parse_constant=_reject, object_pairs_hook=_unique)
+        return _Reader(data, frame, units or {}).model()
+    except (ValueError, RecursionError) as error:
+        raise GeoJsonError(f"{path}: {error}") from error
+
+
+def _reject(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not a number of JSON")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"one of the members {', '.join(name for name, _ in pairs)} is there twice")
+    return found
+
+
+class _Reader:
+    """Makes a model of what JSON gave."""
+
+    def __init__(self, data: Any, frame: LocalFrame | None, units: Mapping[str, str]) -> None:
+        if not isinstance(data, dict) or data.get("type") != "FeatureCollection":
+            raise ValueError("the file is a GeoJSON FeatureCollection")
+        # Programs write this member, which is obsolete since RFC 7946, also for WGS84.
+        if "crs" in data and not any(name in json.dumps(data["crs"]) for name in _WGS84):
+            raise ValueError("coordinates are longitude and latitude of WGS84 (RFC 7946): convert them, and remove crs")
+        if not isinstance(data.get("features"), list):
+            raise ValueError("the FeatureCollection has a list of features")
+        self._features: list[Any] = data["features"]
+        declared = data.get("units", {})
+        if not isinstance(declared, dict) or not all(isinstance(unit, str) for unit in declared.values()):
+            raise ValueError("units is an object: attribute -> unit")
+        self._units = {**declared, **units}
+        self._frame = _local_frame(data.get("local_frame"), frame)
+
+    def model(self) -> WorldModel:
+        objects: list[WorldObject] = []
+        seen: set[str] = set()
+        for number, feature in enumerate(self._features):
+            name = f"feature {number}"
+            if isinstance(feature, dict) and isinstance(feature.get("id"), str | int):
+                name = f"feature {number} ({feature['id']})"
+            try:
+                one = self._object(feature)
+                if one.identity in seen:
+                    raise ValueError("another feature has this id, too")
+            except (ValueError, TypeError) as error:
+                raise ValueError(f"{name}: {error}") from error
+            seen.add(one.identity)
+            objects.append(one)
+        return WorldModel(objects)
+
+    def _object(self, feature: Any) -> WorldObject:
+        if not isinstance(feature, dict) or feature.get("type") != "Feature":
+            raise ValueError("a member of features is a Feature")
+        properties = feature.get("properties")
+        if not isinstance(properties, dict):
+            raise ValueError("its properties are an object with a class at least")
+        properties = {name: value for name, value in properties.items() if value is not None}
+        # Programs that know no member `id` write it as a property.
+        identity = feature.get("id", properties.get("id"))
+        if isinstance(identity, bool) or not isinstance(identity, str | int) or identity == "":
+            raise ValueError(f"its id is a text or a whole number, not {identity!r}")
+        kind = properties.get("class")
+        if not isinstance(kind, str):
+            raise ValueError(f"its property class is a text, such as tree, not {kind!r}")
+        return WorldObject(
+            str(identity),
+            kind,
+            self._pose(feature.get("geometry"), properties),
+            attributes=self._attributes(properties),
+            relations=_relations(_plain(properties.get("relations", []))),
+            source=_text(properties, "source", ""),
+            status=_text(properties, "status", CONFIRMED),
+            hits=_count(properties, "hits"),
+            misses=_count(properties, "misses"),
+            conflicts=_count(properties, "conflicts"),
+        )
+
+    def _pose(self, geometry: Any, properties: Mapping[str, Any]) -> PoseEstimate:
+        kind = geometry.get("type") if isinstance(geometry, dict) else geometry
+        if kind != "Point":
+            raise ValueError(f"its geometry is a Point, not {kind!r}: give sizes as attributes")
+        coordinates = geometry.get("coordinates")
+        if not isinstance(coordinates, list) or len(coordinates) not in (2, 3) or not _are_numbers(coordinates):
+            raise ValueError(f"its coordinates are longitude, latitude and perhaps height, not {coordinates!r}")
+        longitude, latitude, height = [*coordinates, self._frame.height][:3]
+        if not (-180.0 <= longitude <= 180.0 and -90.0 <= latitude <= 90.0):
+            raise ValueError(f"its coordinates are degrees of longitude and latitude, not {longitude}, {latitude}")
+        (position,) = self._frame.from_geographic([[longitude, latitude, height]])
+        if not np.abs(position).max() < _FARTHEST:
+            far = np.abs(position).max() / 1e3
+            raise ValueError(f"it lies {far:.0f} km from the origin of the local frame: this is a map of another place")
+        covariance = np.diag([np.inf] * 3 + [0.0] * 3)
+        if "covariance" in properties:
+            covariance = _covariance(_plain(properties["covariance"]))
+        wxyz = _plain(properties.get("orientation", [1.0, 0.0, 0.0, 0.0]))
+        if (
+            not isinstance(wxyz, list)
+            or len(wxyz) != 4
+            or not _are_numbers(wxyz)
+            or abs(np.hypot.reduce(wxyz) - 1) > 1e-6
+        ):
+            raise ValueError(f"its orientation is a unit quaternion (w, x, y, z), not {wxyz!r}")
+        rotation = RotationMatrix(Quaternion(np.array(wxyz, dtype=float) / np.linalg.norm(wxyz)))
+        time = properties.get("time", 0.0)
+        if not _are_numbers([time]):
+            raise ValueError(f"its time is a number in seconds, not {time!r}")
+        return PoseEstimate.of(RigidTransform(rotation, position), covariance, time=time)
+
+    def _attributes(self, properties: Mapping[str, Any]) -> dict[str, Quantity]:
+        found: dict[str, Quantity] = {}
+        names = [name for name in properties if name not in _OWN]
+        for name in names:
+            value = properties[name]
+            owner = name.removesuffix(_DEVIATION)
+            if owner != name:
+                if owner not in properties:
+                    raise ValueError(f"its property {name} is the deviation of an attribute that it does not have")
+            elif isinstance(value, str):
+                found[name] = Quantity(value)
+            elif not _are_numbers([value]):
+                raise ValueError(f"its attribute {name} is a number or a text, not {value!r}")
+            elif name not in self._units:
+                raise ValueError(f"its attribute {name} has no unit: declare it in units, for example as m, or as 1")
+            else:
+                deviation = properties.get(name + _DEVIATION, 0.0)
+                if not _are_numbers([deviation]):
+                    raise ValueError(f"its property {name}{_DEVIATION} is a number, not {deviation!r}")
+                try:
+                    found[name] = Quantity(value, self._units[name], deviation)
+                except ValueError as error:
+                    raise ValueError(f"its attribute {name}: {error}") from error
+        return found
+
+
+def _local_frame(data: Any, given: LocalFrame | None) -> LocalFrame:
+    if data is None and given is None:
+        raise ValueError("no local_frame (longitude_deg, latitude_deg, ...) is declared: give frame=LocalFrame(...)")
+    try:
+        declared = given if data is None else LocalFrame(**data)
+    except TypeError as error:
+        raise ValueError(f"local_frame has numbers longitude_deg, latitude_deg, height, x_axis_deg: {error}") from None
+    if declared is None or given not in (None, declared):
+        raise ValueError(f"the file declares {declared}, and not frame={given}: leave frame out")
+    return declared
+
+
+def _plain(value: Any) -> Any:
+    """Return a list that is given as one, or as a text of JSON."""
+    return json.loads(value, parse_constant=_reject) if isinstance(value, str) else value
+
+
+def _are_numbers(values: list[Any]) -> bool:
+    return all(isinstance(v, int | float) and not isinstance(v, bool) and isfinite(v) for v in values)
+
+
+def _covariance(rows: Any) -> Array:
+    shaped = isinstance(rows, list) and len(rows) == 6 and all(isinstance(row, list) and len(row) == 6 for row in rows)
+    if not shaped or not _are_numbers([value for row in rows for value in row if value is not None]):
+        raise ValueError("its covariance has six rows of six numbers, or null for infinite variances")
+    return np.array([[np.inf if value is None else value for value in row] for row in rows], dtype=float)
+
+
+def _relations(data: Any) -> tuple[Relation, ...]:
+    try:
+        found = tuple(Relation(**one) for one in data)
+    except TypeError:
+        found = None
+    if found is None or not all(isinstance(text, str) for one in found for text in (one.kind, one.other)):
+        raise ValueError('its relations are a list of {"kind": ..., "other": ...}')
+    return found
+
+
+def _text(properties: Mapping[str, Any], name: str, default: str) -> str:
+    value = properties.get(name, default)
+    if not isinstance(value, str):
+        raise ValueError(f"its property {name} is a text, not {value!r}")
+    return value
+
+
+def _count(properties: Mapping[str, Any], name: str) -> int:
+    value = properties.get(name, 0)
+    if not _are_numbers([value]) or value != int(value):
+        raise ValueError(f"its property {name} is a whole number, not {value!r}")
+    return int(value)

@@ -1,0 +1,268 @@
+"""The semantic world model: an immutable collection of objects with queries by class, region and attribute."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, replace
+from functools import partial
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.components.perception.estimate import PoseEstimate
+from vtbdrake.components.world_model.objects import Quantity, Relation, WorldObject
+from vtbdrake.state.declarations import Codec
+
+Array = NDArray[np.float64]
+
+
+class WorldModel:
+    """What is known about the objects around: a value that never changes.
+
+    Changes return a new model, which shares all objects that are the same. So a copy costs nothing, and a model is
+    abstract state of a system, the environment of a DPS for example; `WORLD_MODEL_CODEC` carries it into snapshots.
+    The spatial index is built by the first query that needs it, and shared by all who have the model.
+
+    Args:
+        objects: The objects, in the order in which queries return them.
+        created: How many identities `observe` has given to new objects so far; an identity is never given twice.
+
+    Raises:
+        ValueError: Two objects have one identity, or a relation leads to an object that is not there.
+    """
+
+    __slots__ = ("_created", "_index", "_objects")
+
+    def __init__(self, objects: Iterable[WorldObject] = (), *, created: int = 0) -> None:
+        self._objects: dict[str, WorldObject] = {}
+        for one in objects:
+            if one.identity in self._objects:
+                raise ValueError(f"two objects have the identity {one.identity!r}")
+            self._objects[one.identity] = one
+        for one in self._objects.values():
+            for relation in one.relations:
+                if relation.other not in self._objects:
+                    raise ValueError(
+                        f"{one.identity} {relation.kind} {relation.other!r}, which is not an object of the model"
+                    )
+        self._created = created
+        self._index: Any = None
+
+    @property
+    def created(self) -> int:
+        """How many identities have been given to objects that observations have added."""
+        return self._created
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+    def __iter__(self) -> Iterator[WorldObject]:
+        return iter(self._objects.values())
+
+    def __contains__(self, identity: object) -> bool:
+        return identity in self._objects
+
+    def __getitem__(self, identity: str) -> WorldObject:
+        try:
+            return self._objects[identity]
+        except KeyError:
+            raise KeyError(f"the world model has no object {identity!r}") from None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> WorldModel:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(WorldModel, created=self._created), (tuple(self),)
+
+    def __repr__(self) -> str:
+        kinds = [one.kind for one in self]
+        return f"<WorldModel: {', '.join(f'{kinds.count(k)} {k}' for k in dict.fromkeys(kinds)) or 'empty'}>"
+
+    def positions(self) -> Array:
+        """Return the positions p_WoOo_W of all objects in m, shape (n, 3)."""
+        return np.array([one.pose.matrix[:, 3] for one in self]).reshape(-1, 3)
+
+    def find(
+        self,
+        kind: str | None = None,
+        *,
+        status: str | Iterable[str] | None = None,
+        near: tuple[ArrayLike, float] | None = None,
+        box: tuple[ArrayLike, ArrayLike] | None = None,
+        attributes: Mapping[str, str | tuple[float, float]] | None = None,
+    ) -> tuple[WorldObject, ...]:
+        """Return the objects that meet all given conditions.
+
+        Args:
+            kind: Their class.
+            status: Their status, or several.
+            near: A point and a distance in m, which is the largest; the point has the shape (2,) or (3,), and the
+                distance is horizontal or in space.
+            box: The least and the largest coordinates in m, shapes (2,) or (3,).
+            attributes: By name, the text that an attribute is, or the least and the largest value of its number.
+                Objects without the attribute do not meet the condition.
+
+        Raises:
+            ValueError: A point, a box or the condition of an attribute is not one.
+        """
+        chosen: Iterable[WorldObject] = self
+        if near is not None:
+            chosen = self._near(*near)
+        if box is not None:
+            low, high = (np.asarray(corner, dtype=float) for corner in box)
+            if low.shape != high.shape or low.shape not in ((2,), (3,)) or not (low <= high).all():
+                raise ValueError(f"a box is its least and its largest coordinates, (2,) or (3,), not {box!r}")
+            chosen = [one for one in chosen if _inside(one.pose.matrix[: low.size, 3], low, high)]
+        statuses = (status,) if isinstance(status, str) else None if status is None else tuple(status)
+        conditions = [(name, _condition(name, wanted)) for name, wanted in (attributes or {}).items()]
+        return tuple(
+            one
+            for one in chosen
+            if (kind is None or one.kind == kind)
+            and (statuses is None or one.status in statuses)
+            and all(_meets(one.attributes.get(name), condition) for name, condition in conditions)
+        )
+
+    def nearest(self, p_WoQ_W: ArrayLike, count: int = 1) -> tuple[WorldObject, ...]:
+        """Return the ``count`` objects next to a point Q (3,) in m, or all if there are fewer; the nearest first."""
+        count = min(count, len(self))
+        if count < 1:
+            return ()
+        _, rows = self._tree(3).query(_point(p_WoQ_W, 3), k=count)
+        objects = tuple(self)
+        return tuple(objects[row] for row in np.atleast_1d(rows))
+
+    def related(self, identity: str, kind: str | None = None) -> tuple[WorldObject, ...]:
+        """Return the objects to which an object has a relation (of ``kind``, if given)."""
+        return tuple(self[r.other] for r in self[identity].relations if kind is None or r.kind == kind)
+
+    def known(self) -> WorldModel:
+        """Return the part of the model that is believed to be there, without tentative and retired objects.
+
+        Relations to what is left out are left out, too.
+        """
+        return self.without(one.identity for one in self if not one.is_known)
+
+    def with_objects(self, *objects: WorldObject, created: int | None = None) -> WorldModel:
+        """Return a model in which these objects replace those of the same identity, or are added.
+
+        Args:
+            objects: The new objects.
+            created: The new `created`; by default it remains.
+        """
+        updated = self._objects | {one.identity: one for one in objects}
+        return WorldModel(updated.values(), created=self._created if created is None else created)
+
+    def without(self, identities: Iterable[str]) -> WorldModel:
+        """Return a model without these objects, and without the relations to them.
+
+        Raises:
+            KeyError: One of them is not there.
+        """
+        gone = {self[identity].identity for identity in identities}
+        left = [one for one in self if one.identity not in gone]
+        return WorldModel((_cut(one, gone) for one in left), created=self._created)
+
+    def _near(self, point: ArrayLike, distance: float) -> list[WorldObject]:
+        size = np.size(point)
+        if size not in (2, 3) or not distance >= 0.0:
+            raise ValueError(f"near is a point (2,) or (3,) and a distance of at least 0 m, not {(point, distance)!r}")
+        if not self._objects:
+            return []
+        objects = tuple(self)
+        return [objects[row] for row in sorted(self._tree(size).query_ball_point(_point(point, size), distance))]
+
+    def _tree(self, size: int) -> Any:
+        """Return the k-d tree of the first ``size`` coordinates."""
+        if self._index is None:
+            from scipy.spatial import cKDTree
+
+            # Both are made at once and assigned in one step: other threads see either none or all.
+            positions = self.positions()
+            self._index = {2: cKDTree(positions[:, :2]), 3: cKDTree(positions)}
+        return self._index[size]
+
+
+def _cut(one: WorldObject, gone: set[str]) -> WorldObject:
+    """Return an object without its relations to ``gone``."""
+    left = tuple(relation for relation in one.relations if relation.other not in gone)
+    return one if len(left) == len(one.relations) else replace(one, relations=left)
+
+
+def _point(point: ArrayLike, size: int) -> Array:
+    array = np.asarray(point, dtype=float)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"a point is {size} finite numbers in m, not {point!r}")
+    return array
+
+
+def _inside(point: Array, low: Array, high: Array) -> bool:
+    return bool((low <= point).all() and (point <= high).all())
+
+
+def _condition(name: str, wanted: str | tuple[float, float]) -> str | tuple[float, float]:
+    if isinstance(wanted, str):
+        return wanted
+    low, high = wanted
+    if not -inf <= low <= high <= inf:
+        raise ValueError(f"the condition of {name} is a text, or the least and the largest number, not {wanted!r}")
+    return (low, high)
+
+
+def _meets(quantity: Quantity | None, condition: str | tuple[float, float]) -> bool:
+    if quantity is None or isinstance(quantity.value, str) != isinstance(condition, str):
+        return False
+    if isinstance(condition, str):
+        return quantity.value == condition
+    return condition[0] <= float(quantity.value) <= condition[1]
+
+
+def _encode(model: WorldModel) -> dict[str, np.ndarray]:
+    if not isinstance(model, WorldModel):
+        raise ValueError(f"a WorldModel is expected here, not {model!r}")
+    texts = [
+        {
+            "identity": one.identity,
+            "kind": one.kind,
+            "attributes": {name: asdict(quantity) for name, quantity in one.attributes.items()},
+            "relations": [asdict(relation) for relation in one.relations],
+            "source": one.source,
+            "status": one.status,
+        }
+        for one in model
+    ]
+    return {
+        "matrices": np.array([one.pose.matrix for one in model]).reshape(-1, 3, 4),
+        "covariances": np.array([one.pose.covariance for one in model]).reshape(-1, 6, 6),
+        "times": np.array([one.pose.time for one in model], dtype=float),
+        "counts": np.array([(one.hits, one.misses, one.conflicts) for one in model], dtype=np.int64).reshape(-1, 3),
+        "created": np.array(model.created),
+        "texts": np.frombuffer(json.dumps(texts).encode(), dtype=np.uint8),
+    }
+
+
+def _decode(arrays: Mapping[str, np.ndarray]) -> WorldModel:
+    columns = (arrays["matrices"], arrays["covariances"], arrays["times"].tolist(), arrays["counts"].tolist())
+    objects = [
+        WorldObject(
+            identity=text["identity"],
+            kind=text["kind"],
+            pose=PoseEstimate(matrix, covariance, time),
+            attributes={name: Quantity(**quantity) for name, quantity in text["attributes"].items()},
+            relations=tuple(Relation(**relation) for relation in text["relations"]),
+            source=text["source"],
+            status=text["status"],
+            hits=counts[0],
+            misses=counts[1],
+            conflicts=counts[2],
+        )
+        for text, matrix, covariance, time, counts in zip(json.loads(arrays["texts"].tobytes()), *columns, strict=True)
+    ]
+    return WorldModel(objects, created=int(arrays["created"].item()))
+
+
+# A world model as arrays and back, exact to the last bit: the codec of a system's abstract state.
+WORLD_MODEL_CODEC = Codec(_encode, _decode)

@@ -1,0 +1,230 @@
+"""Updates of a world model from observations: association, fusion, and the life cycle of its objects."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.math import RotationMatrix
+from scipy.optimize import linear_sum_assignment
+
+from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
+from vtbdrake.components.world_model.association import Sighting, associate, check_units
+from vtbdrake.components.world_model.model import WorldModel
+from vtbdrake.components.world_model.objects import (
+    CONFIRMED,
+    RETIRED,
+    REVISED,
+    TENTATIVE,
+    Quantity,
+    WorldObject,
+    finite_part,
+)
+
+
+@dataclass(frozen=True)
+class LifeCycle:
+    """When objects are confirmed, revised and retired. The defaults are assumed, not taken from data.
+
+    Attributes:
+        gate: The share of right pairs of object and sighting that the gate of the association lets pass.
+        confirm: The number of hits that confirms a tentative object.
+        forget: The number of misses in a row after which a tentative object is removed from the model.
+        retire: The number of misses in a row after which a confirmed object is retired.
+        revise: The number of conflicts in a row after which a confirmed object is moved to where it is seen.
+        revise_within: The horizontal distance in m up to which a sighting beyond the gate counts as a conflict with
+            an object that was expected and not seen; 0 revises nothing.
+    """
+
+    gate: float = 0.997
+    confirm: int = 3
+    forget: int = 2
+    retire: int = 8
+    revise: int = 3
+    revise_within: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.gate < 1.0:
+            raise ValueError(f"gate is a probability between 0 and 1, not {self.gate}")
+        if min(self.confirm, self.forget, self.retire, self.revise) < 1:
+            raise ValueError("confirm, forget, retire and revise are counts of at least 1")
+        if not self.revise_within >= 0.0:
+            raise ValueError(f"revise_within is a distance of at least 0 m, not {self.revise_within}")
+
+
+DEFAULT_LIFE_CYCLE = LifeCycle()
+
+
+def observe(
+    model: WorldModel,
+    sightings: Sequence[Sighting],
+    *,
+    expected: Collection[str] = (),
+    rules: LifeCycle = DEFAULT_LIFE_CYCLE,
+) -> WorldModel:
+    """Return the model after one observation: what was seen at one instant, and what should have been seen.
+
+    1. Sightings are associated with objects that are not retired (`associate`), and fused with them (`fused`). That is
+       a *hit*; enough of them confirm a tentative object.
+    2. A sighting that is left over near an expected object that was not seen is a *conflict* of the two: the object
+       may have been mapped wrongly. Enough of them in a row revise the object: its pose becomes the one seen last.
+    3. Every other sighting that is left over begins a tentative object, ``<class>#<number>``.
+    4. Every other expected object has a *miss*. Enough of them in a row retire a confirmed object, which stays in the
+       model as retired, and remove a tentative one.
+
+    The errors of the sightings must be independent of each other and of the model, or covariances become too small:
+    repeated sightings by a robot share the error of its own pose. A filter that estimates both has to update the model
+    itself (EKF-SLAM); `associate` and the rules of the life cycle remain of use.
+
+    Args:
+        model: The model before.
+        sightings: What was seen, in the world frame of the model.
+        expected: The identities of the objects that should have been seen: in the field of view and in range, and not
+            hidden. Only the sensor knows.
+        rules: The thresholds of the life cycle.
+
+    Raises:
+        KeyError: An expected object is not in the model.
+    """
+    candidates = [one for one in model if one.status != RETIRED]
+    pairs = associate(candidates, sightings, probability=rules.gate)
+    changed: dict[str, WorldObject] = {}
+    for i, j in pairs.items():
+        changed[candidates[j].identity] = _hit(candidates[j], sightings[i], rules)
+    unseen = [model[identity] for identity in dict.fromkeys(expected) if identity not in changed]
+    unseen = [one for one in unseen if one.status != RETIRED]
+    left = [sighting for i, sighting in enumerate(sightings) if i not in pairs]
+
+    conflicts = _conflicts([one for one in unseen if one.is_known], left, rules)
+    for identity, sighting in conflicts.items():
+        changed[identity] = _conflict(model[identity], sighting, rules)
+    forgotten = []
+    for one in unseen:
+        if one.identity not in conflicts:
+            missed = replace(one, misses=one.misses + 1, conflicts=0)
+            if one.status == TENTATIVE and missed.misses >= rules.forget:
+                forgotten.append(one.identity)
+            elif one.is_known and missed.misses >= rules.retire:
+                changed[one.identity] = replace(missed, status=RETIRED)
+            else:
+                changed[one.identity] = missed
+
+    created, explained = model.created, set(map(id, conflicts.values()))
+    for sighting in left:
+        if id(sighting) not in explained:
+            created += 1
+            while f"{sighting.kind}#{created}" in model:
+                created += 1
+            changed[f"{sighting.kind}#{created}"] = _new(f"{sighting.kind}#{created}", sighting, rules)
+    updated = model.with_objects(*changed.values(), created=created)
+    return updated.without(forgotten) if forgotten else updated
+
+
+def fused(prior: PoseEstimate, seen: PoseEstimate) -> PoseEstimate:
+    """Return the estimate of a pose from a prior one and an independent measurement, at the time of the later one.
+
+    This is the fusion by information: P⁻¹ = P₁⁻¹ + P₂⁻¹ and P⁻¹ δ = P₂⁻¹ δ₂, where δ is the change from the prior and
+    an infinite variance is no information. It is computed by gains, so that the prior may be exact in some components.
+    The object is assumed not to move. The rotation is correct to first order in δ.
+
+    Args:
+        prior: What is known; its covariance may be singular, or infinite in some components.
+        seen: The measurement; its covariance is positive definite, or infinite in some components.
+    """
+    had, measured = finite_part(prior.covariance), finite_part(seen.covariance)
+    both, new = had & measured, ~had & measured
+    P = np.where(np.outer(had, had), prior.covariance, 0.0)
+    delta_seen = prior.error_to(seen.X)
+    R_seen = np.where(np.outer(measured, measured), seen.covariance, 0.0)
+
+    S = (P + R_seen)[np.ix_(both, both)]
+    K = np.linalg.solve(S, P[both]).T
+    delta = K @ delta_seen[both]
+    # In Joseph's form, the covariance stays symmetric and positive semidefinite.
+    left = np.eye(6)
+    left[:, both] -= K
+    P = left @ P @ left.T + K @ R_seen[np.ix_(both, both)] @ K.T
+
+    # What is known for the first time: the measurement, less its error as far as the other components tell it.
+    G = np.linalg.solve(R_seen[np.ix_(both, both)], R_seen[np.ix_(both, new)]).T
+    delta[new] = delta_seen[new] - G @ (delta_seen[both] - delta[both])
+    across = G @ P[both]
+    P[new, :] = across
+    P[:, new] = across.T
+    P[np.ix_(new, new)] = R_seen[np.ix_(new, new)] - G @ R_seen[np.ix_(both, new)] + across[:, both] @ G.T
+    covariance = 0.5 * (P + P.T)
+    unknown = ~(had | measured)
+    covariance[unknown, unknown] = np.inf
+    return PoseEstimate(_moved(prior, delta), covariance, max(prior.time, seen.time))
+
+
+def _moved(prior: PoseEstimate, delta: Array) -> Array:
+    """Return the matrix (3, 4) of a pose that differs from the prior one by δ."""
+    rotation = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(delta[:3]) @ prior.matrix[:, :3]).matrix()
+    return np.column_stack([rotation, prior.matrix[:, 3] + delta[3:]])
+
+
+def _fused_attributes(one: WorldObject, sighting: Sighting) -> Mapping[str, Quantity]:
+    """Return attributes after a sighting: measured numbers are fused, exact ones and texts are kept, new ones added."""
+    attributes = dict(one.attributes)
+    for name, seen in sighting.attributes.items():
+        known = attributes.setdefault(name, seen)
+        if known is not seen and known.is_measured and seen.is_measured:
+            check_units(one, name, known, seen)
+            gain = known.deviation**2 / (known.deviation**2 + seen.deviation**2)
+            value = float(known.value) + gain * (float(seen.value) - float(known.value))
+            attributes[name] = Quantity(value, known.unit, float(np.sqrt(gain)) * seen.deviation)
+    return attributes
+
+
+def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+    hits = one.hits + 1
+    return replace(
+        one,
+        pose=fused(one.pose, sighting.pose),
+        attributes=_fused_attributes(one, sighting),
+        status=CONFIRMED if one.status == TENTATIVE and hits >= rules.confirm else one.status,
+        hits=hits,
+        misses=0,
+        conflicts=0,
+    )
+
+
+def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: LifeCycle) -> dict[str, Sighting]:
+    """Return the sighting nearest to each object that was expected elsewhere; one to one, by horizontal distance."""
+    gain = np.zeros((len(unseen), len(left)))
+    for i, one in enumerate(unseen):
+        for j, sighting in enumerate(left):
+            if one.kind == sighting.kind:
+                offset = sighting.pose.matrix[:2, 3] - one.pose.matrix[:2, 3]
+                gain[i, j] = max(0.0, rules.revise_within - float(np.hypot(*offset)))
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    return {unseen[i].identity: left[j] for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0.0}
+
+
+def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+    if one.conflicts + 1 < rules.revise:
+        return replace(one, conflicts=one.conflicts + 1)
+    return replace(
+        one,
+        pose=sighting.pose,
+        attributes={**one.attributes, **sighting.attributes},
+        source=sighting.source,
+        status=REVISED,
+        hits=1,
+        misses=0,
+        conflicts=0,
+    )
+
+
+def _new(identity: str, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+    return WorldObject(
+        identity,
+        sighting.kind,
+        sighting.pose,
+        attributes=sighting.attributes,
+        source=sighting.source,
+        status=CONFIRMED if rules.confirm == 1 else TENTATIVE,
+        hits=1,
+    )
