@@ -4,6 +4,7 @@ from vtbdrake.visualization.decisions import plot_decision, show_decision
 from vtbdrake.visualization.diagram import svg
 from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions, show_poses
 from vtbdrake.visualization.plots import plot_quality, plot_sweep
+from vtbdrake.visualization.world_model import show_world_model
 
 __all__ = [
     "Scene",
@@ -15,5 +16,6 @@ __all__ = [
     "show_motion",
     "show_motions",
     "show_poses",
+    "show_world_model",
     "svg",
 ]

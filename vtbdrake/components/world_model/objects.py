@@ -115,10 +115,10 @@ class WorldObject:
     conflicts: int = 0
 
     def __post_init__(self) -> None:
-        if not self.identity or not isinstance(self.identity, str):
-            raise ValueError(f"the identity of an object is a text that is not empty, not {self.identity!r}")
-        if not self.kind or not isinstance(self.kind, str):
-            raise ValueError(f"the class of {self.identity} is a text that is not empty, not {self.kind!r}")
+        if not isinstance(self.identity, str) or not self.identity.strip():
+            raise ValueError(f"the identity of an object is a text that is not blank, not {self.identity!r}")
+        if not isinstance(self.kind, str) or not self.kind.strip():
+            raise ValueError(f"the class of {self.identity} is a text that is not blank, not {self.kind!r}")
         check_pose(self.identity, self.pose)
         object.__setattr__(self, "attributes", checked_attributes(self.identity, self.attributes))
         object.__setattr__(self, "relations", tuple(self.relations))

@@ -1,0 +1,109 @@
+"""A semantic world model in Meshcat: classes by colour, covariances as ellipsoids, identities as labels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.textpath import TextPath
+from numpy.typing import NDArray
+from pydrake.geometry import Ellipsoid, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.components.world_model.geometry import PartsOf
+from vtbdrake.components.world_model.model import WorldModel
+from vtbdrake.components.world_model.objects import RETIRED, TENTATIVE, WorldObject
+from vtbdrake.visualization.meshcat import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
+# By class, from the palette of Okabe and Ito for all kinds of colour vision.
+_COLORS = {"tree": "#009e73", "rock": "#e69f00", "satellite": "#0072b2", "crater rim": "#cc79a7"}
+_OTHERS = "#56b4e9"
+_TENTATIVE_OPACITY, _ELLIPSOID_OPACITY = 0.35, 0.3
+# The least semi-axis of an ellipsoid in m: what is exact, or unknown, is drawn flat.
+_FLAT = 1e-3
+
+
+def show_world_model(
+    meshcat: Meshcat,
+    model: WorldModel,
+    *,
+    prefix: str = "world_model",
+    colors: Mapping[str, ColorType] | None = None,
+    parts: Mapping[str, PartsOf] | None = None,
+    marker: float = 0.15,
+    deviations: float = 2.0,
+    label_height: float = 0.3,
+) -> Scene:
+    """Draw the objects of a world model, each under ``<prefix>/<class>/<identity>``, instead of what was drawn there.
+
+    Tentative objects are translucent, retired ones are left out. The ellipsoid around an object holds its position
+    within so many standard deviations; it is flat along what is exactly known or not known at all.
+
+    Args:
+        meshcat: The server that shows it.
+        model: The objects.
+        prefix: The Meshcat path under which it is drawn.
+        colors: Class -> any matplotlib colour, beside the default ones.
+        parts: Class -> function that returns an object's shapes, such as `geometry.PARTS`; objects of other classes are
+            spheres.
+        marker: Radius of these spheres in m.
+        deviations: Size of the ellipsoids in standard deviations; 0 draws none.
+        label_height: Height of the letters of the identities in m; 0 draws none. They are read along the y axis.
+
+    Returns:
+        The scene, whose legend names the classes; it shows itself in a notebook.
+
+    Raises:
+        ValueError: A size is negative, or an object lacks an attribute that its function in ``parts`` needs.
+    """
+    if not marker > 0.0 or not deviations >= 0.0 or not label_height >= 0.0:
+        raise ValueError(
+            f"marker is positive, deviations and label_height are at least 0, not {(marker, deviations, label_height)}"
+        )
+    chosen = _COLORS | {kind: to_hex(color) for kind, color in (colors or {}).items()}
+    shown = [one for one in model if one.status != RETIRED]
+    meshcat.Delete(prefix)
+    for one in shown:
+        path = f"{prefix}/{one.kind}/{one.identity}"
+        red, green, blue = to_rgb(chosen.get(one.kind, _OTHERS))
+        opacity = _TENTATIVE_OPACITY if one.status == TENTATIVE else 1.0
+        if parts is not None and one.kind in parts:
+            for part in parts[one.kind](one):
+                meshcat.SetObject(f"{path}/{part.name}", part.shape, Rgba(red, green, blue, opacity))
+                meshcat.SetTransform(f"{path}/{part.name}", one.X_WO @ part.X_OS)
+        else:
+            meshcat.SetObject(f"{path}/marker", Sphere(marker), Rgba(red, green, blue, opacity))
+            meshcat.SetTransform(f"{path}/marker", one.X_WO)
+        if deviations:
+            X_WE, semi_axes = covariance_ellipsoid(one)
+            shape = Ellipsoid(*np.maximum(deviations * semi_axes, _FLAT))
+            meshcat.SetObject(f"{path}/covariance", shape, Rgba(red, green, blue, _ELLIPSOID_OPACITY))
+            meshcat.SetTransform(f"{path}/covariance", X_WE)
+        if label_height:
+            start, end = _strokes(one.identity, label_height)
+            meshcat.SetLineSegments(f"{path}/label", start, end, 1.0, Rgba(red, green, blue, 1.0))
+            meshcat.SetTransform(f"{path}/label", RigidTransform(one.p_WoOo_W + np.array([0.0, 0.0, 2.0 * marker])))
+    return Scene(meshcat, legend={kind: chosen.get(kind, _OTHERS) for kind in sorted({one.kind for one in shown})})
+
+
+def covariance_ellipsoid(one: WorldObject) -> tuple[RigidTransform, NDArray[np.float64]]:
+    """Return the pose in W of the ellipsoid of one standard deviation of the position, and its semi-axes (3,) in m.
+
+    The semi-axis along a coordinate that is not known is 0.
+    """
+    covariance = one.pose.covariance[3:, 3:]
+    variances, axes = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
+    axes[:, 0] *= np.linalg.det(axes)
+    return RigidTransform(RotationMatrix(axes), one.p_WoOo_W), np.sqrt(np.maximum(variances, 0.0))
+
+
+def _strokes(text: str, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return begin and end of the line segments, each (3, n), of a text in the plane of x and z."""
+    polygons: list[NDArray[np.float64]] = [np.array(p) for p in TextPath((0.0, 0.0), text, size=height).to_polygons()]
+    outlines = [polygon[:, [0, 0, 1]] * np.array([1.0, 0.0, 1.0]) for polygon in polygons]
+    return np.vstack([outline[:-1] for outline in outlines]).T, np.vstack([outline[1:] for outline in outlines]).T
