@@ -104,7 +104,7 @@ def test_a_result_is_shown_one_latency_after_its_sample(latency, offset):
 
 @pytest.mark.parametrize("start", [0.0, 1e5])
 def test_no_sample_and_no_result_is_left_out_however_time_is_advanced(start):
-    for latency, offset in [(0.03, 0.0), (0.007, 0.011), (0.019, 0.003)]:
+    for latency, offset in [(0.03, 0.0), (0.007, 0.011), (0.019, 0.003), (0.15, 0.05)]:
         calls = []
         rig = Rig(lambda t, calls=calls: calls.append(t.item()) or t, latency=latency, offset=offset)
         rig.context.SetTime(start)
@@ -112,7 +112,7 @@ def test_no_sample_and_no_result_is_left_out_however_time_is_advanced(start):
         for n in range(5000):
             rig.advance(start + n * 0.001)
         ticks = np.round((np.array(calls) - offset) / PERIOD)
-        assert len(ticks) >= 98 and set(np.diff(ticks)) == {1.0}
+        assert len(ticks) >= 95 and set(np.diff(ticks)) == {1.0}
 
 
 def test_what_is_updated_at_the_instant_of_a_result_sees_it():

@@ -208,7 +208,10 @@ PROGRESS_CODEC = Codec(_encode, _decode)
 MOST_UNDER_WAY = 16
 # Drake sometimes skips a periodic event with an offset when a simulation is advanced to exactly its time, because
 # (t - offset) / period is rounded up. Events that are a little early are not skipped, and results are there in time.
+# It also skips an event that is due the last bit of a number after another one: so results are shown before samples of
+# the same instant are taken, by more than that.
 _EARLY = 1e-8  # s
+_SHOWN_EARLY = 2e-8  # s
 _SHORTEST = 1e-6  # s
 _SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
 _REQUEST, _TAKEN, _DPS = "request", "taken", "dps"
@@ -336,7 +339,7 @@ class SlowPart(LeafSystem):
         )
         self.codecs = {int(self._progress): PROGRESS_CODEC}
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, max(0.0, offset - _EARLY), self._sample)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency - _EARLY, self._show)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency - _SHOWN_EARLY, self._show)
 
     def _declare_input(self, name: str, model: Any) -> InputPort:
         if _is_size(model):
@@ -443,7 +446,7 @@ class SlowPart(LeafSystem):
 
     def due(self, tick: int) -> float:
         """Return when the result of sample number ``tick`` is shown, in seconds: just before a latency has passed."""
-        return self.offset + self.latency - _EARLY + tick * self.period
+        return self.offset + self.latency - _SHOWN_EARLY + tick * self.period
 
     def waiting(self, context: Context) -> dict[int, Arrays]:
         """Return the samples whose results have neither arrived nor been declared missing, by tick, in order.
