@@ -1,0 +1,95 @@
+"""Dates what arrives at a DPS by the DPS's own clock: images, scans, and other samples of abstract signals."""
+
+from __future__ import annotations
+
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.codecs import codec_of
+from vtbdrake.state.declarations import NO_DICT
+
+
+class Arrival(LeafSystem):
+    """Holds the newest sample of an abstract signal, numbers it, and tells when it was taken.
+
+    .. pydrake_system::
+
+        name: Arrival
+        input_ports:
+        - signal
+        output_ports:
+        - sample
+        - time (s)
+        - number
+
+    Every ``period`` it compares the signal with the sample that it holds. One that differs in any digit is a new one:
+    sensors have noise, and what they measure has a time stamp or moves. Its ``time`` is the time of its arrival less
+    the parameter ``age``, and not before 0: what is there at the start was taken then. ``number`` is 1 for the first
+    sample, and one more for each that follows; before it, ``sample`` is ``model_value``, of time 0 and number 0. So
+    nothing depends on the clock of the sensor, or on when it samples.
+
+    The outputs agree with each other, and stay until the next arrival. With a `SlowPart` on request, ``number`` is the
+    request: then each sample is evaluated once.
+
+    In a simulation and on a machine in lock-step, a sample that a sensor has shown in one period of the DPS arrives in
+    the next: its age is one period, plus the latency of the sensor.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, model_value: Any, *, period: float, age: float) -> None:
+        """Declare the system.
+
+        Args:
+            model_value: A value of the signal, such as an image of its size.
+            period: The period of the DPS, in s.
+            age: How long before its arrival a sample was taken, in s.
+
+        Raises:
+            ValueError: A time is impossible, or there is no codec for the values (see `codec_of`).
+        """
+        super().__init__()
+        if not 0.0 < period < inf:
+            raise ValueError(f"Arrival: the period is positive, in s, not {period!r}")
+        if not (isfinite(age) and age >= 0.0):
+            raise ValueError(f"Arrival: the age is a finite time in s, and not negative, not {age!r}")
+        self._codec = codec_of(model_value, varying=True)
+        self._signal = self.DeclareAbstractInputPort("signal", Value(model_value))
+        sample = self.DeclareAbstractState(Value(model_value))
+        time, number = (self.DeclareDiscreteState(1) for _ in range(2))
+        for name, index in {"sample": sample, "time": time, "number": number}.items():
+            self.DeclareStateOutputPort(name, index)
+        self._sample, self._time, self._number = int(sample), int(time), int(number)
+        self.DeclareNumericParameter(BasicVector([age]))
+        self.variables = (
+            discrete_state("time", self._time, unit="s"),
+            discrete_state("number", self._number, bounds=(0.0, inf)),
+            parameter("age", 0, unit="s", bounds=(0.0, inf)),
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> EventStatus:
+        value = self._signal.Eval(context)
+        if self._is_same(value, context.get_abstract_state(self._sample).get_value()):
+            return EventStatus.DidNothing()
+        age = float(context.get_numeric_parameter(0).value()[0])
+        state.get_mutable_abstract_state(self._sample).set_value(value)
+        numbers = state.get_mutable_discrete_state()
+        numbers.set_value(self._time, [max(context.get_time() - age, 0.0)])
+        numbers.set_value(self._number, context.get_discrete_state(self._number).value() + 1.0)
+        return EventStatus.Succeeded()
+
+    def _is_same(self, one: Any, other: Any) -> bool:
+        if one is other:
+            return True
+        arrays, others = self._codec.encode(one), self._codec.encode(other)
+        return all(_equal(array, others[part]) for part, array in arrays.items())
+
+
+def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+    return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
