@@ -53,9 +53,7 @@ class Eyes:
         aboard: Those of ``camera`` and ``scanner`` whose data are evaluated, whether the tracker follows them or not.
         config: How images and scans are evaluated.
         image: Size of the images and intrinsics of the camera, if it is aboard.
-        image_period: Of the camera, in s.
         image_latency: How old the images are when they are shown, in s.
-        scan_period: How often the DPS looks for a new scan, in s.
         pose_latency: How old the poses of the pose sensor are when they are shown, in s.
     """
 
@@ -63,9 +61,7 @@ class Eyes:
     aboard: tuple[str, ...]
     config: PerceptionConfig
     image: CameraInfo | None
-    image_period: float
     image_latency: float
-    scan_period: float
     pose_latency: float
 
 
@@ -142,16 +138,13 @@ def _make_env(eyes: Eyes, *, period: float) -> Diagram:
             target,
             config=eyes.config,
             period=period,
-            image_period=eyes.image_period,
             info=eyes.image,
             image_latency=eyes.image_latency,
         )
         sources["camera"] = markers.GetOutputPort("estimate")
     if "scanner" in eyes.aboard:
         attitude = RotationMatrix() if eyes.guides == ("scanner",) else None
-        registration = add_scan_part(
-            builder, base, target, config=eyes.config, period=period, scan_period=eyes.scan_period, attitude=attitude
-        )
+        registration = add_scan_part(builder, base, target, config=eyes.config, period=period, attitude=attitude)
         sources["scanner"] = registration.GetOutputPort("estimate")
     for sensor in sensors:
         port = sources[sensor]

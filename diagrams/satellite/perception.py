@@ -1,9 +1,10 @@
 """The perception in the DPS: images and scans become poses of the target, for its tracker.
 
 Every estimate is the pose X_IT of the target T in the servicer's own inertial frame I, at the time at which the image
-was taken or the scan was complete. It is made from the poses of the base B at that time, as the `BaseEstimator`
-remembers them: so a part takes its sample two periods of the DPS after the sensor did. The newest pose in the history
-then is that of the sensor's instant, and the tracker's state is one period newer.
+was taken or the scan was complete, by the clock of the DPS: an `Arrival` dates each of them. It is made from the poses
+of the base B at that time, as the `BaseEstimator` remembers them. So a part takes a sample one period of the DPS after
+its arrival: a history that then ends one period before the arrival reaches the sample's time. The tracker's state is
+one period newer than the history.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
+from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetector, detect_markers, pose_from_markers
 from vtbdrake.components.perception.registration import Faces, Registration, deskew, misfit, register_points
@@ -109,7 +111,6 @@ class MarkerPose:
         X_BC: Pose of the camera, as the DPS knows it.
         intrinsics: [fx, fy, cx, cy] of the camera in pixels.
         detector: How markers are found.
-        latency: How old the camera's images are when it shows them, in s.
         period: The period of the DPS, in s.
     """
 
@@ -117,22 +118,22 @@ class MarkerPose:
     X_BC: RigidTransform
     intrinsics: Array
     detector: MarkerDetector
-    latency: float
     period: float
 
     def prepare(self) -> None:
         """Load OpenCV."""
         detect_markers(np.zeros((8, 8), dtype=np.uint8), self.detector)
 
-    def __call__(self, *, image: ImageRgba8U, history: Array, target: Array, status: Array) -> dict[str, Any]:
+    def __call__(
+        self, *, image: ImageRgba8U, time: Array, request: Array, history: Array, target: Array, status: Array
+    ) -> dict[str, Any]:
         """Return the estimate of X_IT, and the count of the target's markers in the image."""
+        taken = float(time[0])
         found = detect_markers(image, self.detector).on(self.board)
-        newest = float(history[0])
-        time = newest - self.latency
-        X_IC = pose_at(history, time) @ self.X_BC
-        tracked = TrackedTarget(target, status, newest + self.period)
-        prediction = X_IC.inverse() @ tracked.at(time) if tracked.valid else None
-        X_CT = pose_from_markers(found, self.board, self.intrinsics, time=time, prediction=prediction)
+        X_IC = pose_at(history, taken) @ self.X_BC
+        tracked = TrackedTarget(target, status, float(history[0]) + self.period)
+        prediction = X_IC.inverse() @ tracked.at(taken) if tracked.valid else None
+        X_CT = pose_from_markers(found, self.board, self.intrinsics, time=taken, prediction=prediction)
         return {"estimate": X_CT.seen_from(X_IC), "count": np.array([len(found.ids)], dtype=float)}
 
 
@@ -157,43 +158,50 @@ class ScanPose:
     period: float
 
     def __call__(
-        self, *, scan: Scan, history: Array, target: Array, status: Array, memory: PoseEstimate
-    ) -> tuple[PoseEstimate | None, PoseEstimate]:
-        """Return the estimate of X_IT if the scan is a new one, and what is remembered: the last one that was shown.
+        self,
+        *,
+        scan: Scan,
+        time: Array,
+        request: Array,
+        history: Array,
+        target: Array,
+        status: Array,
+        memory: PoseEstimate,
+    ) -> tuple[PoseEstimate, PoseEstimate]:
+        """Return the estimate of X_IT, and what is remembered: the last one that was shown.
 
         While nothing is tracked, what is remembered is the estimate before de-skewing. Then a scan is de-skewed by the
         motion since the last one: both are skewed alike, so that the difference of their poses is not. The first scan
         alone says nothing of the motion, and is not shown.
         """
-        if scan.stamp <= memory.time:
-            return None, memory
+        taken = float(time[0])
         tracked = TrackedTarget(target, status, float(history[0]) + self.period)
         if not len(scan.ranges) or not (tracked.valid or self.attitude):
-            nothing = PoseEstimate.missing(time=scan.stamp)
+            nothing = PoseEstimate.missing(time=taken)
             return nothing, nothing
-        eye = (pose_at(history, scan.stamp) @ self.X_BL).translation()
+        eye = (pose_at(history, taken) @ self.X_BL).translation()
         p_BQ = scan.points() @ self.X_BL.rotation().matrix().T + self.X_BL.translation()
-        fired = scan.stamp + (scan.times if self.deskew else np.zeros_like(scan.times))
+        fired = taken + (scan.times if self.deskew else np.zeros_like(scan.times))
         points = in_inertial_frame(p_BQ, fired, history)
         if tracked.valid:
-            found = self._follow(points, scan, eye, tracked)
+            found = self._follow(points, scan.times, eye, tracked, time=taken)
             return found, found
-        is_recent = memory.valid and scan.stamp - memory.time < _RECENT
-        skewed = self._best(points, eye, scan.stamp, [memory.X] if is_recent else self._guesses(points, eye))
+        is_recent = memory.valid and taken - memory.time < _RECENT
+        skewed = self._best(points, eye, taken, [memory.X] if is_recent else self._guesses(points, eye))
         if not (self.deskew and skewed.valid):
             return skewed, skewed
         if not is_recent:
-            return PoseEstimate.missing(time=scan.stamp), skewed
-        motion = skewed.error_to(memory.X) / (memory.time - scan.stamp)
+            return PoseEstimate.missing(time=taken), skewed
+        motion = skewed.error_to(memory.X) / (memory.time - taken)
         points = deskew(points, scan.times, origin=skewed.matrix[:, 3], velocity=motion[3:], rate=motion[:3])
-        return self._best(points, eye, scan.stamp, [skewed.X]), skewed
+        return self._best(points, eye, taken, [skewed.X]), skewed
 
-    def _follow(self, points: Array, scan: Scan, eye: Array, tracked: TrackedTarget) -> PoseEstimate:
-        """Return the estimate that begins at the predicted pose."""
-        start = tracked.at(scan.stamp)
+    def _follow(self, points: Array, fired: Array, eye: Array, tracked: TrackedTarget, *, time: float) -> PoseEstimate:
+        """Return the estimate that begins at the predicted pose; ``fired`` is relative to ``time``."""
+        start = tracked.at(time)
         if self.deskew:
             rate, velocity = tracked.state[7:10], tracked.state[10:13]
-            points = deskew(points, scan.times, origin=start.translation(), velocity=velocity, rate=rate)
+            points = deskew(points, fired, origin=start.translation(), velocity=velocity, rate=rate)
         attitude, position = tracked.deviation()
         settings = self.registration
         # What is too far from the predicted pose is not the target.
@@ -203,7 +211,7 @@ class ScanPose:
             self.faces,
             start,
             eye=eye,
-            time=scan.stamp,
+            time=time,
             registration=replace(settings, basin=basin),
             deviation=(attitude, position),
         )
@@ -258,11 +266,10 @@ def add_marker_part(
     *,
     config: PerceptionConfig,
     period: float,
-    image_period: float,
     info: CameraInfo,
     image_latency: float = 0.0,
 ) -> SlowPart:
-    """Add the slow part ``markers``, and the input port ``image`` of the Diagram that it belongs to.
+    """Add the slow part ``markers`` with its ``image_arrival``, and the input port ``image`` of their Diagram.
 
     Args:
         builder: Of the Diagram ``env`` of the DPS.
@@ -270,7 +277,6 @@ def add_marker_part(
         target: Predicts the target's pose.
         config: How images are evaluated.
         period: The period of the DPS, in s.
-        image_period: The period of the camera, in s.
         info: The size of its images, and its intrinsics.
         image_latency: How old its images are when it shows them, in s.
 
@@ -284,18 +290,20 @@ def add_marker_part(
         X_BC=Servicer().X_BC,
         intrinsics=np.array([info.focal_x(), info.focal_y(), info.center_x(), info.center_y()]),
         detector=config.detector,
-        latency=image_latency,
         period=period,
     )
+    image = ImageRgba8U(info.width(), info.height())
     part = SlowPart(
         function,
-        inputs={"image": ImageRgba8U(info.width(), info.height()), **_ESTIMATES},
+        inputs={"image": image, **_ESTIMATES},
         outputs={"estimate": PoseEstimate.missing(), "count": 1},
-        period=image_period,
+        period=period,
         latency=config.marker_latency,
-        offset=2.0 * period,
+        offset=period,
+        on_request=True,
     )
-    return _add(builder, "markers", part, base, target, sensor="image")
+    arrival = Arrival(image, period=period, age=period + image_latency)
+    return _add(builder, "markers", part, base, target, sensor="image", arrival=arrival)
 
 
 def add_scan_part(
@@ -305,10 +313,9 @@ def add_scan_part(
     *,
     config: PerceptionConfig,
     period: float,
-    scan_period: float,
     attitude: RotationMatrix | None = None,
 ) -> SlowPart:
-    """Add the slow part ``registration``, and the input port ``scan`` of the Diagram that it belongs to.
+    """Add the slow part ``registration`` with its ``scan_arrival``, and the input port ``scan`` of their Diagram.
 
     Args:
         builder: Of the Diagram ``env`` of the DPS.
@@ -316,7 +323,6 @@ def add_scan_part(
         target: Predicts the target's pose.
         config: How scans are evaluated.
         period: The period of the DPS, in s.
-        scan_period: How often the part looks for a new scan, in s.
         attitude: R_IT to begin with; None if the track begins with markers.
 
     Returns:
@@ -335,23 +341,35 @@ def add_scan_part(
         inputs={"scan": Scan.empty(), **_ESTIMATES},
         outputs={"estimate": PoseEstimate.missing()},
         memory=PoseEstimate.missing(),
-        period=scan_period,
+        period=period,
         latency=config.scan_latency,
-        offset=2.0 * period,
+        offset=period,
+        on_request=True,
     )
-    return _add(builder, "registration", part, base, target, sensor="scan")
+    arrival = Arrival(Scan.empty(), period=period, age=period)
+    return _add(builder, "registration", part, base, target, sensor="scan", arrival=arrival)
 
 
 # The inputs of both parts beside their sensor.
-_ESTIMATES = {"history": HISTORY * POSE, "target": STATE_SIZE, "status": STATUS_SIZE}
+_ESTIMATES = {"time": 1, "history": HISTORY * POSE, "target": STATE_SIZE, "status": STATUS_SIZE}
 
 
 def _add(
-    builder: DiagramBuilder, name: str, part: SlowPart, base: BaseEstimator, target: TargetTracker, *, sensor: str
+    builder: DiagramBuilder,
+    name: str,
+    part: SlowPart,
+    base: BaseEstimator,
+    target: TargetTracker,
+    *,
+    sensor: str,
+    arrival: Arrival,
 ) -> SlowPart:
+    builder.AddNamedSystem(f"{sensor}_arrival", arrival)
     builder.AddNamedSystem(name, part)
+    for output, port in {"sample": sensor, "time": "time", "number": "request"}.items():
+        builder.Connect(arrival.GetOutputPort(output), part.GetInputPort(port))
     builder.Connect(base.GetOutputPort("history"), part.GetInputPort("history"))
     builder.Connect(target.GetOutputPort("state"), part.GetInputPort("target"))
     builder.Connect(target.GetOutputPort("status"), part.GetInputPort("status"))
-    builder.ExportInput(part.GetInputPort(sensor), sensor)
+    builder.ExportInput(arrival.GetInputPort("signal"), sensor)
     return part

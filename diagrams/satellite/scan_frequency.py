@@ -154,7 +154,7 @@ def _make_env(config: PerceptionConfig) -> Diagram:
     target = builder.AddNamedSystem("target", TargetTracker(["scan"], starting=["scan"], period=PERIOD))
     builder.ExportInput(base.GetInputPort("imu"), "imu")
     facing = RotationMatrix()
-    part = add_scan_part(builder, base, target, config=config, period=PERIOD, scan_period=PERIOD, attitude=facing)
+    part = add_scan_part(builder, base, target, config=config, period=PERIOD, attitude=facing)
     builder.Connect(part.GetOutputPort("estimate"), target.GetInputPort("scan"))
     return builder.Build()
 

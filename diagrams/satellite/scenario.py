@@ -7,6 +7,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from drake import lcmt_scope
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
@@ -17,6 +18,11 @@ from vtbdrake.components.perception.estimate import rotation_matrix
 from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
+from vtbdrake.control.fallback import Hold
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.drake_messages import image_map, scan_map
+from vtbdrake.lcm.maps import LcmMap, vector_map
+from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.scan import Scan
 from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
@@ -28,9 +34,6 @@ from vtbdrake_diagrams.satellite.supervisor import GO, STOP
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
-
-SCAN_PERIOD = 0.1
-"""How often the DPS looks for a new scan, in s."""
 
 _LARGEST_TUMBLE_DEG = 30.0
 
@@ -183,12 +186,30 @@ class SatelliteScenario(Scenario):
             aboard=self.aboard,
             config=self.evaluation,
             image=self.camera_info if "camera" in self.aboard else None,
-            image_period=1.0 / self.camera_rate,
             image_latency=self.camera_errors.latency / self.camera_rate,
-            scan_period=SCAN_PERIOD,
             pose_latency=self.pose_errors.latency * POSE_PERIOD,
         )
         return make_dps(eyes, wheels=self.wheels)
+
+    def deployment(self) -> Deployment:
+        """Return how the DPS runs on its satellite: joints hold after a fault, and CAPTURE carries the command.
+
+        Signals of numbers travel as ``lcmt_scope``; images and scans leave before them in the satellite's cycle.
+        """
+        sense = [_lcm_map(signal, signal.name) for signal in reversed(self.interface().sense)]
+        periods = {"TARGET_POSE": POSE_PERIOD}
+        if "camera" in self.aboard:
+            periods["IMAGE"] = 1.0 / self.camera_rate
+        if "scanner" in self.aboard:
+            periods["SCAN"] = 1.0 / self.scanner.frequency
+        act = [_lcm_map(signal, f"{signal.name}_command") for signal in self.interface().act]
+        commands = [_lcm_map(signal, signal.name) for signal in self.interface().commands]
+        return Deployment(
+            protocol=Protocol(sense=sense, act=act, commands=commands, periods=periods),
+            period=PERIOD,
+            guards={"fallback": {"joint_position": Hold()}},
+            continuity={"joint_position": ("joint_position", 0.05)},
+        )
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the satellite runs without a plant.
@@ -296,6 +317,16 @@ class SatelliteScenario(Scenario):
         of = [f"{target}.pose", f"{target}.velocity"]
         builder.believe("sim.sys.target.body.pose", of=of, by=_one_period_before, age=PERIOD)
         builder.believe("sim.sys.target.body.velocity", of=of[1:], age=PERIOD)
+
+
+def _lcm_map(signal: Signal, channel: str) -> LcmMap:
+    """Return how a signal travels on a channel."""
+    channel = channel.upper()
+    if signal.name == "image":
+        return image_map(channel, signal.name)
+    if signal.name == "scan":
+        return scan_map(channel, signal.name)
+    return vector_map(channel, lcmt_scope, {signal.name: "value"})
 
 
 def _one_period_before(pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
