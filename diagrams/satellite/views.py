@@ -71,7 +71,7 @@ def film_strip(testbed: VirtualTestbed, times: Sequence[float]) -> Figure:
         for axis, picture in zip(column, pictures(testbed, context), strict=True):
             axis.imshow(picture)
             axis.set_axis_off()
-        count = testbed.read(context, "dps.env.markers.count")
+        count = int(testbed.read(context, "dps.env.markers.count"))
         column[0].set_title(f"{time:g} s: {mode}")
-        column[1].set_title(f"docking camera, {count:.0f} markers", fontsize="small")
+        column[1].set_title(f"docking camera, {count} marker{'' if count == 1 else 's'}", fontsize="small")
     return figure
