@@ -122,7 +122,7 @@ def _make_env(eyes: Eyes, *, period: float) -> Diagram:
     """
     builder = DiagramBuilder()
     base = builder.AddNamedSystem("base", BaseEstimator(period=period))
-    reader = PoseReader(period=POSE_PERIOD, delay=period, latency=eyes.pose_latency)
+    reader = PoseReader(period=period, latency=eyes.pose_latency)
     builder.AddNamedSystem("pose_reader", reader)
     sensors = (*eyes.aboard, "pose_sensor")
     starting = [_SOURCES[sensor] for sensor in eyes.guides if sensor != "scanner"] or [_SOURCES["scanner"]]

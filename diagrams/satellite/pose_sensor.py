@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, State
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.tracking import pose_of_state
@@ -87,47 +87,56 @@ class PoseReader(LeafSystem):
         - estimate
 
     ``history`` is that of a `BaseEstimator`; ``estimate`` is a PoseEstimate of X_IT. A pose that arrives was measured
-    one period of the DPS before, plus the parameter ``latency`` (s). A pose that equals the last one in all digits is
-    taken for one that did not arrive: sensors have noise.
+    one period of the DPS before, plus the parameter ``latency`` (s), whenever the sensor samples. A period later the
+    history reaches that time, and the estimate is made. A pose that equals the last one in all digits is taken for one
+    that did not arrive: sensors have noise.
     """
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float, delay: float, latency: float = 0.0, deviation: float = 0.01) -> None:
+    def __init__(self, *, period: float, latency: float = 0.0, deviation: float = 0.01) -> None:
         """Declare the system.
 
         Args:
-            period: The period of the sensor, in s.
-            delay: The period of the DPS, in s: so much later a sample is read.
+            period: The period of the DPS, in s.
             latency: The age of the sensor's samples when they are shown, in s.
             deviation: The standard deviation of its poses that is assumed, in m, and in rad twice as much.
         """
         super().__init__()
-        self._delay = delay
+        self._period = period
         self._pose = self.DeclareVectorInputPort("target_pose", 7)
         self._history = self.DeclareVectorInputPort("history", HISTORY * POSE)
         estimate = self.DeclareAbstractState(Value(PoseEstimate.missing()))
         self.DeclareStateOutputPort("estimate", estimate)
         self._estimate = int(estimate)
         self._last = int(self.DeclareDiscreteState(7))
+        self._arrived = int(self.DeclareDiscreteState([0.0, 0.0]))
         self.DeclareNumericParameter(BasicVector([latency, deviation]))
         self.variables = (
             discrete_state("last_pose", self._last, shape=(7,), unit="1, m"),
+            discrete_state("last_time", self._arrived, unit="s"),
+            discrete_state("waiting", self._arrived, start=1, bounds=(0.0, 1.0)),
             parameter("latency", 0, unit="s", bounds=(0.0, 1.0)),
             parameter("deviation", 0, start=1, unit="m", bounds=(0.0, inf)),
         )
-        # Late enough for the base's history to reach the sample's time.
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 2 * delay, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> None:
+    def _update(self, context: Context, state: State) -> EventStatus:
         latency, deviation = context.get_numeric_parameter(0).value().tolist()
-        time = context.get_time() - 2 * self._delay - latency
-        pose = self._pose.Eval(context)
-        if time < 0.0 or (pose == context.get_discrete_state(self._last).value()).all():
-            return
-        state.get_mutable_discrete_state(self._last).SetFromVector(pose)
-        X_BT = pose_of_state(pose)
-        X_IB: RigidTransform = pose_at(self._history.Eval(context), time)
-        covariance = np.diag(np.repeat([2.0 * deviation, deviation], 3) ** 2)
-        estimate = PoseEstimate.of(X_IB @ X_BT, covariance, time=time)
-        state.get_mutable_abstract_state(self._estimate).set_value(estimate)
+        last = context.get_discrete_state(self._last).value()
+        time, waiting = context.get_discrete_state(self._arrived).value().tolist()
+        taken, pose = context.get_time() - self._period - latency, self._pose.Eval(context)
+        # Nothing was measured before the start; times are rounded.
+        is_new = taken > -0.5 * self._period and not (pose == last).all()
+        if not (is_new or waiting):
+            return EventStatus.DidNothing()
+        if waiting:
+            X_IB: RigidTransform = pose_at(self._history.Eval(context), time)
+            covariance = np.diag(np.repeat([2.0 * deviation, deviation], 3) ** 2)
+            estimate = PoseEstimate.of(X_IB @ pose_of_state(last), covariance, time=time)
+            state.get_mutable_abstract_state(self._estimate).set_value(estimate)
+        if is_new:
+            state.get_mutable_discrete_state(self._last).SetFromVector(pose)
+            time = max(taken, 0.0)
+        state.get_mutable_discrete_state(self._arrived).SetFromVector([time, float(is_new)])
+        return EventStatus.Succeeded()

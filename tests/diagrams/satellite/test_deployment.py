@@ -13,37 +13,37 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.dps import PERIOD
 
-SEEING = SatelliteScenario(seed=1, tumble_deg=2.0, perception="camera", image_width=240, image_height=180)
 CYCLES = 60
 AHEAD = 7  # By how many cycles the clock of the DPS is ahead of the satellite's.
 TIMEOUT = 60.0  # s; for a computer that is busy with other things
 READ = [f"dps.env.target.{name}" for name in ("pose", "fused", "left_out")]
 
 
-def test_images_from_a_satellite_are_dated_by_the_clock_of_the_dps() -> None:
+@pytest.mark.parametrize("perception", ["camera", "pose_sensor"])
+def test_poses_from_a_satellite_are_dated_by_the_clock_of_the_dps(perception: str) -> None:
     pytest.importorskip("cv2")
-    testbed, dps = SEEING.build(), DpsAlone(SEEING)
+    scenario = SatelliteScenario(seed=1, tumble_deg=2.0, perception=perception, image_width=240, image_height=180)
+    testbed, dps = scenario.build(), DpsAlone(scenario)
     simulated, own = testbed.default_context(), dps.default_context()
     testbed.simulator(simulated).AdvanceTo((CYCLES - 1) * PERIOD)
     own.SetTime(AHEAD * PERIOD)
-    deployment = Deployment.of(SEEING).in_lock_step("joint_position")
+    deployment = Deployment.of(scenario).in_lock_step("joint_position")
     with (
         Hub(port=0) as hub,
-        MachineProcess(SEEING, hub.url, lock_step=True, period=PERIOD),
-        SEEING.deploy(hub.url, target=dps, context=own, deployment=deployment) as runtime,
+        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        scenario.deploy(hub.url, target=dps, context=own, deployment=deployment) as runtime,
     ):
         assert runtime.slow_parts.wait(TIMEOUT)
         runtime.take_over()
         # A satellite in lock-step leaves no time to compute. The first cycle receives; the second commands.
         runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
         assert not runtime.guards.latched
-    (expected, *counts), (pose, *found) = (
-        [system.read(c, a) for a in READ] for system, c in ((testbed, simulated), (dps, own))
-    )
-    assert found == counts == [6.0, 0.0]
+    ways = (testbed, simulated), (dps, own)
+    (expected, fused, _), (pose, used, left_out) = ([system.read(c, a) for a in READ] for system, c in ways)
+    assert used >= fused >= 6.0 and left_out == 0.0
     error = pose_from_array(pose).InvertAndCompose(pose_from_array(expected))
-    assert np.linalg.norm(error.translation()) < 5e-4
-    assert error.rotation().ToAngleAxis().angle() < 1e-3
+    assert np.linalg.norm(error.translation()) < 2e-3
+    assert error.rotation().ToAngleAxis().angle() < 2e-3
 
 
 @pytest.mark.parametrize("perception", ["camera+scanner", "pose_sensor"])
