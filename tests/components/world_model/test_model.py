@@ -3,10 +3,13 @@
 import copy
 import pickle
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import (
@@ -17,6 +20,8 @@ from vtbdrake.components.world_model import (
     WorldObject,
     position_estimate,
 )
+from vtbdrake.state.codecs import abstract_state
+from vtbdrake.state.declarations import NO_DICT
 
 
 def tree(identity: str, xyz: list[float], *, diameter: float = 0.3, **fields: object) -> WorldObject:
@@ -110,6 +115,34 @@ def test_codec_is_exact() -> None:
             assert np.array_equal(one.pose.covariance, other.pose.covariance)
             assert replace(one, pose=other.pose).__getstate__() == other.__getstate__()
     assert len(WORLD_MODEL_CODEC.decode(WORLD_MODEL_CODEC.encode(WorldModel()))) == 0
+
+
+class Keeper(LeafSystem):
+    """A DPS's environment: a world model as abstract state."""
+
+    __slots__ = NO_DICT
+    codecs: ClassVar = {0: WORLD_MODEL_CODEC}
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareStateOutputPort("world_model", self.DeclareAbstractState(Value(WorldModel())))
+
+
+def test_model_is_state_of_a_context(stand: WorldModel) -> None:
+    builder = DiagramBuilder()
+    keeper = builder.AddNamedSystem("keeper", Keeper())
+    diagram = builder.Build()
+    context, other = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
+    keeper.GetMyMutableContextFromRoot(context).SetAbstractState(0, stand)
+    seen = keeper.GetOutputPort("world_model").Eval(keeper.GetMyContextFromRoot(context.Clone()))
+    assert seen is stand
+    arrays = abstract_state("keeper", keeper, keeper.GetMyContextFromRoot(context)).read(
+        keeper.GetMyContextFromRoot(context)
+    )
+    own = keeper.GetMyMutableContextFromRoot(other)
+    abstract_state("keeper", keeper, own).writer(arrays)(own)
+    restored = keeper.GetOutputPort("world_model").Eval(own)
+    assert np.array_equal(restored.positions(), stand.positions())
 
 
 @pytest.mark.parametrize(

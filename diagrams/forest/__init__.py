@@ -1,0 +1,1 @@
+"""The forest: stands of trees, and maps of them with errors."""

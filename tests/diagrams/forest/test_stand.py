@@ -1,0 +1,121 @@
+"""Tests of stands and maps against the figures and distributions that they claim."""
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.distance import pdist
+from scipy.stats import kstest, weibull_min
+
+from vtbdrake.components.world_model import WorldModel, add_to_plant
+from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE, MapErrors, Stand, tree_height
+
+
+def diameters(model: WorldModel) -> np.ndarray:
+    return np.array([one.number("trunk_diameter", unit="m") for one in model])
+
+
+def offsets(stand: Stand, errors: MapErrors, *, seed: int = 0) -> np.ndarray:
+    """What the nearest entry of the map is off, for each tree."""
+    found, true = stand.map(errors, seed=seed).positions()[:, :2], stand.trees().positions()[:, :2]
+    nearest = np.argmin(np.sum((true[:, np.newaxis] - found) ** 2, axis=2), axis=1)
+    return found[nearest] - true
+
+
+def test_density_and_spacing() -> None:
+    trees = Stand(length=50.0, width=80.0, density=1000.0, spacing=1.5).trees()
+    places = trees.positions()
+    assert len(trees) == 400
+    assert (places >= 0.0).all() and (places <= [50.0, 80.0, 0.0]).all()
+    assert pdist(places).min() >= 1.5
+
+
+def test_diameters_follow_the_cut_distribution() -> None:
+    stand = Stand(seed=1)
+    found, weibull = diameters(stand.trees()), weibull_min(2.5, scale=0.2)
+    low, high = weibull.cdf([0.06, 0.41])
+    assert found.min() >= 0.06 and found.max() <= 0.41
+    assert kstest(found, lambda d: (weibull.cdf(d) - low) / (high - low)).pvalue > 0.01
+
+
+def test_defaults_lie_in_the_ranges_of_published_plots() -> None:
+    for seed in range(3):
+        trees = Stand(seed=seed).trees()
+        heights = [one.number("height", unit="m") for one in trees]
+        assert 605 <= len(trees) <= 1210
+        assert 0.033 < diameters(trees).std() < 0.087
+        assert min(heights) > 4.0 and max(heights) < 27.0
+
+
+def test_seed_determines_the_stand() -> None:
+    stand = Stand(seed=4, length=20.0)
+    assert np.array_equal(stand.trees().positions(), stand.trees().positions())
+    assert not np.array_equal(stand.trees().positions(), Stand(seed=5, length=20.0).trees().positions())
+    assert not np.array_equal(stand.map(REMOTE).positions(), stand.map(REMOTE, seed=1).positions())
+
+
+def test_accurate_map_is_complete() -> None:
+    stand = Stand(seed=2, spacing=2.0)
+    assert len(stand.map(ACCURATE)) == stand.count
+    # Trees are 2 m apart, so that the nearest entry is the right one.
+    assert offsets(stand, ACCURATE).std(axis=0) == pytest.approx([0.1, 0.1], rel=0.1)
+    assert next(iter(stand.map(ACCURATE))).pose.covariance[3, 3] == pytest.approx(0.01)
+
+
+def test_remote_map_lacks_trees_and_has_wrong_ones() -> None:
+    stand = Stand(seed=3)
+    mapped = stand.map(REMOTE)
+    # 70 % of 800 trees are nine tenths of the entries.
+    assert len(mapped) == round(800 * 0.7 / 0.9)
+    true = stand.trees().positions()[:, :2]
+    gaps = np.sqrt(((mapped.positions()[:, np.newaxis, :2] - true) ** 2).sum(axis=2)).min(axis=1)
+    assert (gaps < 1.5).mean() > 0.9
+
+
+def test_diameters_of_a_map_are_off() -> None:
+    stand, errors = Stand(seed=6, spacing=2.0), MapErrors(position=0.0, diameter=0.2)
+    trees = {tuple(one.p_WoOo_W): one.number("trunk_diameter", unit="m") for one in stand.trees()}
+    ratios = [one.number("trunk_diameter", unit="m") / trees[tuple(one.p_WoOo_W)] for one in stand.map(errors)]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.03) and np.std(ratios) == pytest.approx(0.2, rel=0.1)
+
+
+def test_errors_of_the_poor_map_are_correlated() -> None:
+    """Over many complete maps: a tree, the next one, and one about 40 m away."""
+    stand = Stand(seed=7, length=60.0, width=10.0, density=300.0, spacing=3.0)
+    errors = MapErrors(position=0.3, correlation=POOR.correlation)
+    places = stand.trees().positions()[:, :2]
+    distances = np.linalg.norm(places - places[0], axis=1)
+    near, far = np.argsort(distances)[1], np.argmin(np.abs(distances - 40.0))
+    drawn = np.array([offsets(stand, errors, seed=seed)[[0, near, far]] for seed in range(200)])
+    assert drawn.std(axis=0) == pytest.approx(np.full((3, 2), 0.3), rel=0.15)
+    for k, other in ((1, near), (2, far)):
+        correlation = np.corrcoef(drawn[:, 0].ravel(), drawn[:, k].ravel())[0, 1]
+        assert correlation == pytest.approx(np.exp(-(distances[other] ** 2) / (2.0 * 40.0**2)), abs=0.1)
+
+
+def test_stand_becomes_a_simulated_world() -> None:
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.001)
+    assert add_to_plant(plant, Stand(length=20.0, width=20.0).trees()) == 2 * 32
+
+
+def test_heights_are_plausible() -> None:
+    assert tree_height(0.30) == pytest.approx(20.2, abs=0.1)
+    assert tree_height(0.06) < 10.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: Stand(density=1200.0, spacing=3.0),
+            "1200 trees/ha find no place at random 3 m apart: give at most 2.19",
+        ),
+        (lambda: Stand(length=0.0), "are positive"),
+        (lambda: Stand(least_diameter=0.5), "no such range"),
+        (lambda: MapErrors(position=-0.1), "at least 0"),
+        (lambda: MapErrors(position=0.1, wrong=1.0), "shares from 0 to 1"),
+    ],
+)
+def test_impossible_stands_are_refused(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
