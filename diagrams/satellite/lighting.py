@@ -14,9 +14,10 @@ the starts 0 and 100, which therefore do not count.)
   `CHECKED_ON`;
 * a capture that has not succeeded by `HORIZON`, or is aborted, costs `FAILURE`.
 
-The default run chooses on one start, which is coarse; ``--full`` on eight, and takes hours.
+The default run chooses among the candidates of `SHORT` on one start: a first look, which never counts as an answer that
+holds. ``--starts 8`` does so on eight, and ``--full`` among all candidates on eight, which takes hours.
 
-``python -m vtbdrake_diagrams.satellite.lighting [--full]`` prints the answer and draws it.
+``python -m vtbdrake_diagrams.satellite.lighting [--starts N] [--full]`` prints the answer and draws it.
 """
 
 from __future__ import annotations
@@ -251,10 +252,15 @@ def plot_answer(answer: LightingAnswer) -> Figure:
     return figure
 
 
-def answer_lighting(*, full: bool = False) -> LightingAnswer:
-    """Answer O3 with two worker processes; the short version tries `SHORT` on one start, the long one `GRID` on 8."""
+def answer_lighting(*, full: bool = False, starts: int = 1) -> LightingAnswer:
+    """Answer O3 with two worker processes.
+
+    Args:
+        full: Whether to try `GRID` on all starts, instead of `SHORT` on some.
+        starts: On how many, at most 8.
+    """
     candidates = (DEFAULT, *(settings for settings in GRID if settings != DEFAULT)) if full else SHORT
-    count = len(CHOSEN_ON) if full else 1
+    count = len(CHOSEN_ON) if full else starts
     with ProcessExecutor(2) as executor:
         return find_settings(candidates, seeds=CHOSEN_ON[:count], others=CHECKED_ON[:count], executor=executor)
 
@@ -269,6 +275,7 @@ def _table(answer: LightingAnswer) -> str:
 def lighting(full: bool) -> Answer:
     """Answer O3: which parameters of the robot are best under different lighting?"""
     answer = answer_lighting(full=full)
+    enough = answer.checked.shape[2] >= len(CHECKED_ON)
     best = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
     return Answer(
         id="O3",
@@ -278,8 +285,9 @@ def lighting(full: bool) -> Answer:
         unit="",
         interval=None,
         paper="none given",
-        holds=answer.holds,
-        note=f"Of {len(answer.candidates)} candidates, chosen on {answer.costs.shape[2]} start(s), compared on "
+        holds=answer.holds and enough,
+        note=f"{'' if enough else 'A first look, too few starts to hold. '}"
+        f"Of {len(answer.candidates)} candidates, chosen on {answer.costs.shape[2]} start(s), compared on "
         f"{answer.checked.shape[2]} other(s); without success {FAILURE:g} s. {_table(answer)}. Best for each light: "
         f"{best}",
     )
@@ -287,10 +295,11 @@ def lighting(full: bool) -> Answer:
 
 @click.command()
 @click.option("--full", is_flag=True, help="All candidates, from all starts.")
+@click.option("--starts", type=click.IntRange(1, len(CHOSEN_ON)), default=1, help="How many starts, without --full.")
 @click.option("--figure", default="lighting.png", help="File of the picture.", show_default=True)
-def main(full: bool, figure: str) -> None:
+def main(full: bool, starts: int, figure: str) -> None:
     """Answer O3, and draw the answer."""
-    answer = answer_lighting(full=full)
+    answer = answer_lighting(full=full, starts=starts)
     for settings, costs in zip(answer.candidates, answer.by_light, strict=True):
         click.echo(f"{'  '.join(f'{cost:5.1f}' for cost in costs)}  {settings}")
     click.echo(f"robust: {answer.candidates[answer.robust]}; {_table(answer)}; holds: {answer.holds}")

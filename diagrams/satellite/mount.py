@@ -342,7 +342,7 @@ def answer_mount(*, full: bool = False) -> MountAnswer:
         return find_mount(
             seeds=SEEDS if full else SEEDS[:FEW],
             candidates=200 if full else 36,
-            grid=13 if full else 6,
+            grid=13 if full else 4,
             executor=executor,
         )
 
@@ -353,8 +353,6 @@ def mount(full: bool) -> Answer:
     The short version averages over the first `FEW` captures, the long one over all of `SEEDS`, with a finer grid.
     """
     found = answer_mount(full=full)
-    y, z, roll, yaw = entries(found.best.pose)
-    tilt, pan = np.degrees([-np.pi / 2 - roll, yaw + np.pi / 2])
     others, afterwards = (
         "; ".join(f"{p.name} {p.mean:.2f} (largest {p.most:.1f})" for p in placements)
         for placements in (found.by_hand, found.afterwards)
@@ -362,8 +360,7 @@ def mount(full: bool) -> Answer:
     return Answer(
         id="O1",
         question="Where should the docking camera sit to see the most markers during the capture?",
-        answer=f"at y = {y:.2f} m, z = {z:.2f} m, {tilt:.0f} deg down, {pan:.0f} deg to the left: "
-        f"{found.best.mean:.2f} markers in the mean",
+        answer=f"{_place(found.best)}: {found.best.mean:.2f} markers in the mean",
         unit="",
         interval=None,
         paper="none given",
@@ -372,6 +369,13 @@ def mount(full: bool) -> Answer:
         f"Best of the grid over the position: {found.best_on_grid:.2f}. Mean of {len(found.best.rollouts)} captures; "
         f"differences under {TELLING} mean nothing.",
     )
+
+
+def _place(placement: Placement) -> str:
+    """Return where a placement is, and where it looks."""
+    y, z, roll, yaw = entries(placement.pose)
+    up, left = np.degrees([roll + np.pi / 2, yaw + np.pi / 2])
+    return f"at y = {y:.2f} m, z = {z:.2f} m, {up:.0f} deg up, {left:.0f} deg to the left"
 
 
 @click.command()
@@ -383,7 +387,7 @@ def main(full: bool, figure: str) -> None:
     click.echo(f"{'placement':38} {'mean':>5} {'largest':>7}")
     for placement in (found.best, *found.by_hand, *found.afterwards):
         click.echo(f"{placement.name:38} {placement.mean:5.2f} {placement.most:7.1f}")
-    click.echo(f"best of the grid: {found.best_on_grid:.2f}; holds: {found.holds}")
+    click.echo(f"found {_place(found.best)}; best of the grid: {found.best_on_grid:.2f}; holds: {found.holds}")
     plot_answer(found).savefig(figure, dpi=110)
 
 
