@@ -375,7 +375,8 @@ def _place(placement: Placement) -> str:
     """Return where a placement is, and where it looks."""
     y, z, roll, yaw = entries(placement.pose)
     up, left = np.degrees([roll + np.pi / 2, yaw + np.pi / 2])
-    return f"at y = {y:.2f} m, z = {z:.2f} m, {up:.0f} deg up, {left:.0f} deg to the left"
+    side = "left" if left >= 0.0 else "right"
+    return f"at y = {y:.2f} m, z = {z:.2f} m, {up:.0f} deg up, {abs(left):.0f} deg to the {side}"
 
 
 @click.command()
