@@ -213,6 +213,17 @@ _NUMBERS = {
 }
 
 
+def _signal_of(kind: type, signals: Sequence[Signal], channel: str, *, example: str = "") -> Signal:
+    """Return the only signal, whose values are of ``kind``; raise a ValueError if they are not."""
+    (signal,) = signals
+    if not isinstance(signal.model_value, kind):
+        raise ValueError(
+            f"signal {signal.name} on channel {channel} needs a {kind.__name__} as model_value{example}, not "
+            f"{signal.model_value!r}"
+        )
+    return signal
+
+
 class PointCloudMap(LcmMap):
     """An `LcmMap` of point clouds; `point_cloud_map` makes one.
 
@@ -237,13 +248,7 @@ class PointCloudMap(LcmMap):
     def _checked(self, signals: Sequence[Signal]) -> Signal:
         from pydrake.perception import PointCloud
 
-        (signal,) = signals
-        if not isinstance(signal.model_value, PointCloud):
-            raise ValueError(
-                f"signal {signal.name} on channel {self.channel} needs a PointCloud as model_value, not "
-                f"{signal.model_value!r}"
-            )
-        return signal
+        return _signal_of(PointCloud, signals, self.channel)
 
 
 def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
@@ -288,13 +293,7 @@ class ScanMap(LcmMap):
         return float(time - scan.stamp)
 
     def _checked(self, signals: Sequence[Signal]) -> Signal:
-        (signal,) = signals
-        if not isinstance(signal.model_value, Scan):
-            raise ValueError(
-                f"signal {signal.name} on channel {self.channel} needs a Scan as model_value, such as Scan.empty(), "
-                f"not {signal.model_value!r}"
-            )
-        return signal
+        return _signal_of(Scan, signals, self.channel, example=", such as Scan.empty()")
 
 
 def scan_map(channel: str, signal: str) -> ScanMap:
