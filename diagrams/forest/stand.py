@@ -36,7 +36,7 @@ _WAVES = 400
 
 @dataclass(frozen=True)
 class MapErrors:
-    """What is wrong with a map of trees.
+    """The errors of a map of trees.
 
     Attributes:
         position: Standard deviation of the positions in m, per axis.

@@ -38,7 +38,7 @@ ORDER = "bspline"
 RESTING = 2
 """The number of equal knots at each end of a plan, for a rate of zero there."""
 REACH = 1.2
-"""How far a free knot may be from the straight path, in rad: for a smaller space of search."""
+"""The largest distance of a free knot from the straight path, in rad: it keeps the space of search small."""
 
 # Steps of the integration for each piece of the curve.
 _STEPS_PER_PIECE = 6

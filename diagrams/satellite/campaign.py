@@ -1,4 +1,4 @@
-"""How often does the capture succeed, and why does it fail?
+"""A campaign of captures from random starts: how often they succeed, and why they fail.
 
 ``python -m vtbdrake_diagrams.satellite.campaign [--captures N] [--perception P] [--workers W] [--seed S]`` simulates
 captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with camera and
@@ -39,13 +39,16 @@ LARGEST_TUMBLE = np.radians(3.0)
 HORIZON = 75.0
 """Longest capture in s: the supervisor gives up after 60 s."""
 GRIP_LENGTH = 0.06
-"""In m: the bar reaches 0.13 m to both sides, the fingers 0.04 m."""
+"""Largest offset of the bar along itself, in m: the bar reaches 0.13 m to both sides, the fingers 0.04 m."""
 GRIP_DEPTH = 0.02
-"""In m: the pads reach from 0.04 m behind G to 0.05 m before it, the bar 0.033 m to both sides of H."""
+"""Largest offset of the bar along the approach, in m.
+
+The pads reach from 0.04 m behind G to 0.05 m before it, the bar 0.033 m to both sides of H.
+"""
 CREEP = 1e-3
-"""In m."""
+"""Largest motion of the bar in the gripper that counts as none, in m."""
 JOINT_CREEP = 2e-3
-"""In rad."""
+"""Largest motion of a joint that counts as none, in rad."""
 
 MODE, REASON = "dps.impl.supervisor.mode", "dps.impl.supervisor.reason"
 BASE, TARGET = "sim.sys.servicer.base.pose", "sim.sys.target.body.pose"

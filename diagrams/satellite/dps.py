@@ -46,7 +46,7 @@ _SOURCES = {"camera": "markers", "scanner": "registration", "pose_sensor": "pose
 
 @dataclass(frozen=True)
 class Eyes:
-    """What the DPS perceives the target with.
+    """The sensors with which the DPS perceives the target.
 
     Attributes:
         guides: The sensors that the tracker follows: some of ``camera``, ``scanner`` and ``pose_sensor``.
