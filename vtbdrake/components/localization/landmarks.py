@@ -1,0 +1,111 @@
+"""Landmarks in the plane: what a detector sees around the carrier, and what a map has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.components.localization.planar import rotation, transform
+from vtbdrake.components.world_model import WorldModel
+
+Array = NDArray[np.float64]
+
+DIAMETERS = {"tree": "trunk_diameter", "rock": "width"}
+"""The attribute that is the diameter of a landmark, by the class of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """n upright landmarks, seen from above, in one frame. Immutable: the arrays are read-only.
+
+    Attributes:
+        positions: The axes of the landmarks in m, shape (n, 2).
+        covariances: Those of the positions in m^2, shape (n, 2, 2).
+        diameters: Their diameters in m, shape (n,).
+        diameter_deviations: Standard deviations of the diameters in m, shape (n,); infinite where nothing is known.
+
+    Raises:
+        ValueError: The shapes do not agree, a position, covariance or diameter is not finite, or a deviation or a
+            variance is negative.
+    """
+
+    positions: Array
+    covariances: Array
+    diameters: Array
+    diameter_deviations: Array
+
+    def __post_init__(self) -> None:
+        n = len(np.asarray(self.positions))
+        shapes = {"positions": (n, 2), "covariances": (n, 2, 2), "diameters": (n,), "diameter_deviations": (n,)}
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=float)
+            if array.shape != shape:
+                raise ValueError(f"{name} of {n} landmarks have the shape {shape}, not {array.shape}")
+            if np.isnan(array).any() or (name != "diameter_deviations" and np.isinf(array).any()):
+                raise ValueError(f"{name} of landmarks are finite numbers: leave out those of which nothing is known")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
+        if (self.diameter_deviations < 0.0).any() or (variances < 0.0).any():
+            raise ValueError("standard deviations and variances of landmarks are at least 0")
+
+    @classmethod
+    def empty(cls) -> Landmarks:
+        """Return no landmarks."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Landmarks]) -> Landmarks:
+        """Return the landmarks of all parts, which are in the same frame, one after the other."""
+        parts = parts or [cls.empty()]
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def __len__(self) -> int:
+        return len(self.diameters)
+
+    def __deepcopy__(self, memo: object) -> Landmarks:
+        return self
+
+    def select(self, rows: ArrayLike) -> Landmarks:
+        """Return those with these indices, or those for which a mask (n,) is true."""
+        chosen = np.asarray(rows)
+        return Landmarks(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def seen_from(self, X_AB: ArrayLike) -> Landmarks:
+        """Return the landmarks in frame A, if these are in frame B; the pose X_AB (3,) is taken as exact."""
+        R_AB = rotation(float(np.asarray(X_AB)[2]))
+        return Landmarks(
+            transform(X_AB, self.positions),
+            R_AB @ self.covariances @ R_AB.T,
+            self.diameters,
+            self.diameter_deviations,
+        )
+
+
+def map_landmarks(model: WorldModel, kind: str = "tree") -> Landmarks:
+    """Return the objects of a class that are believed to be there, as landmarks in the world frame of the model.
+
+    Args:
+        model: The map.
+        kind: The class: ``"tree"``, with the attribute ``trunk_diameter``, or ``"rock"``, with ``width``.
+
+    Raises:
+        ValueError: The class is unknown, there is no such object, or one has no diameter in m, or no variance in the
+            plane.
+    """
+    if kind not in DIAMETERS:
+        raise ValueError(f"landmarks are of the class {' or '.join(DIAMETERS)}, not {kind!r}")
+    objects = [one for one in model.find(kind) if one.is_known]
+    if not objects:
+        raise ValueError(f"the map has no {kind} that is believed to be there: localization needs landmarks")
+    diameters = [one.number(DIAMETERS[kind], unit="m") for one in objects]
+    deviations = [one.attributes[DIAMETERS[kind]].deviation for one in objects]
+    return Landmarks(
+        np.array([one.p_WoOo_W[:2] for one in objects]),
+        np.array([one.pose.covariance[3:5, 3:5] for one in objects]),
+        np.array(diameters),
+        np.array(deviations),
+    )

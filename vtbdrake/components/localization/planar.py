@@ -1,0 +1,40 @@
+"""Poses in the plane: arrays X_AB = [x, y, heading] (m, rad), shape (3,), of a frame B in a frame A."""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def rotation(heading: float) -> Array:
+    """Return R_AB, shape (2, 2), of a frame B that is turned by ``heading`` (rad)."""
+    c, s = cos(heading), sin(heading)
+    return np.array([[c, -s], [s, c]])
+
+
+def wrap(angle: float) -> float:
+    """Return the angle (rad) in [-pi, pi) that means the same direction."""
+    return float((angle + pi) % (2.0 * pi) - pi)
+
+
+def compose(X_AB: ArrayLike, X_BC: ArrayLike) -> Array:
+    """Return X_AC."""
+    ab, bc = np.asarray(X_AB, dtype=float), np.asarray(X_BC, dtype=float)
+    return np.array([*(ab[:2] + rotation(ab[2]) @ bc[:2]), wrap(ab[2] + bc[2])])
+
+
+def inverse(X_AB: ArrayLike) -> Array:
+    """Return X_BA."""
+    ab = np.asarray(X_AB, dtype=float)
+    return np.array([*(-(rotation(-ab[2]) @ ab[:2])), wrap(-ab[2])])
+
+
+def transform(X_AB: ArrayLike, points_B: ArrayLike) -> Array:
+    """Return points, shape (n, 2), in A that are given in B."""
+    ab = np.asarray(X_AB, dtype=float)
+    points: Array = np.asarray(points_B, dtype=float) @ rotation(ab[2]).T + ab[:2]
+    return points
