@@ -1,0 +1,239 @@
+"""Trials of global localization: how often a place is recognized on a map without a guess, and how often wrongly.
+
+``python -m vtbdrake_diagrams.forest.trials [--trials N] [--seed S]`` draws stands, maps with errors and places,
+simulates the detections (`detections`), and prints a table: how often the matching of constellations was sure and
+right, sure and wrong, or not sure, with its errors, consistency and time.
+
+What counts, fixed before any result was seen:
+
+* Places and headings are uniform in a stand of 1 ha; in the cases ``inside``, at least `MARGIN` from its edge, and in
+  the cases ``edge`` nearer, where much of what could be seen is missing. Where a stand ends, there are no trees.
+* A place ``outside`` lies in another stand of the same kind, which the map does not show: what is sure there is wrong.
+* A pose is right if it is nearer to the true one than 0.2 m plus four standard deviations of the map's positions, and
+  turned by less than `LARGEST_TURN`.
+* With the poor map, landmarks are gathered along a drive of 40 m.
+* Seeds begin at 100,000. No constant of the matching may be chosen by these trials.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.cli.output import table
+from vtbdrake.components.localization.constellation import ConstellationMap
+from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.planar import compose, wrap
+from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, gathered
+from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE, Stand
+
+Array = NDArray[np.float64]
+
+SEED = 100_000
+MARGIN = 10.0
+"""Least distance in m of a place from the edge of the stand in the cases ``inside``."""
+LARGEST_TURN = np.radians(10.0)
+DRIVE = 40.0
+"""Length in m of the drive over which landmarks are gathered."""
+DENSITIES = (300.0, 600.0, 1000.0)
+MAPS = {"accurate": ACCURATE, "remote": REMOTE, "poor": POOR}
+GOALS = {"accurate": 0.97, "remote": 0.95, "poor": 0.90}
+"""The least share of places inside that are recognized: right and sure."""
+LARGEST_WRONG = 1e-3
+"""The share of all trials that may be wrong and sure stays below this."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of trial.
+
+    Attributes:
+        stand: ``natural`` or ``plantation``.
+        density: Trees per hectare.
+        map: ``accurate``, ``remote`` or ``poor``.
+        place: ``inside``, ``edge`` or ``outside``.
+    """
+
+    stand: str
+    density: float
+    map: str
+    place: str
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the share of places recognized has a goal in this case."""
+        return self.stand == "natural" and self.place == "inside"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of one trial.
+
+    Attributes:
+        is_sure: Whether the pose was claimed.
+        is_right: Whether it is the true one.
+        position: Distance of the pose from the true one in m.
+        heading: Its error of heading in rad.
+        nees: Normalized estimation error squared, of 3 degrees of freedom.
+        seconds: CPU time of the matching, the table of the map not included.
+    """
+
+    is_sure: bool
+    is_right: bool
+    position: float
+    heading: float
+    nees: float
+    seconds: float
+
+
+def cases() -> list[Case]:
+    """Return all kinds of trials."""
+    natural = [
+        Case("natural", density, name, place)
+        for place in ("inside", "edge", "outside")
+        for name in MAPS
+        for density in DENSITIES
+    ]
+    return natural + [Case("plantation", 1000.0, name, place) for place in ("inside", "outside") for name in MAPS]
+
+
+def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Odometry | None = None) -> Trial:
+    """Run one trial.
+
+    Args:
+        case: Its kind.
+        seed: Determines stand, map, place and detections.
+        detector: Its performance; by default that of `Detector`, with a share of false trunks from 0.3 to 0.4.
+        odometry: The drift over a drive.
+    """
+    rng = np.random.default_rng([seed, 7])
+    stand = _stand(case, seed)
+    errors = MAPS[case.map]
+    detector = detector or Detector(false=rng.uniform(0.3, 0.4))
+    wood = Wood.of(_stand(case, seed + 10**6) if case.place == "outside" else stand, false=detector.false, rng=rng)
+    poses = _drive(case, stand, rng) if errors is POOR else _place(case, stand, rng)[np.newaxis]
+    local, _ = gathered(wood, poses, detector, odometry or Odometry(), rng)
+    return judged(ConstellationMap(map_landmarks(stand.map(errors))), local, poses[-1], case)
+
+
+def judged(constellation: ConstellationMap, local: Landmarks, X_WH: Array, case: Case) -> Trial:
+    """Return what came of matching local landmarks whose true pose is known."""
+    begin = time.process_time()
+    fix = constellation.locate(local)
+    seconds = time.process_time() - begin
+    if not fix.is_sure:
+        return Trial(False, False, np.nan, np.nan, np.nan, seconds)
+    error = np.append(fix.pose[:2] - X_WH[:2], wrap(fix.pose[2] - X_WH[2]))
+    position, heading = float(np.hypot(*error[:2])), abs(float(error[2]))
+    is_near = position < 0.2 + 4.0 * MAPS[case.map].position and heading < LARGEST_TURN
+    nees = float(error @ np.linalg.solve(fix.covariance, error))
+    return Trial(True, case.place != "outside" and is_near, position, heading, nees, seconds)
+
+
+def _stand(case: Case, seed: int) -> Stand:
+    return (Rows if case.stand == "plantation" else Stand)(seed=seed, density=case.density)
+
+
+class Rows(Stand):
+    """A plantation: rows 2.5 m apart, the trees in a row as close as the density asks, all 0.15 m off per axis."""
+
+    def _places(self, rng: np.random.Generator) -> Array:
+        rows = round(self.width / 2.5)
+        per_row = int(np.ceil(self.count / rows))
+        x, y = np.meshgrid((np.arange(per_row) + 0.5) / per_row * self.length, (np.arange(rows) + 0.5) * 2.5)
+        places = np.column_stack([x.ravel(), y.ravel()])[: self.count]
+        return np.clip(places + 0.15 * rng.normal(size=places.shape), 0.0, [self.length, self.width])
+
+
+def _place(case: Case, stand: Stand, rng: np.random.Generator) -> Array:
+    """Return a pose in the stand, at its edge or not."""
+    extent = np.array([stand.length, stand.width])
+    while True:
+        place = rng.random(2) * extent
+        is_at_edge = min(*place, *(extent - place)) < MARGIN
+        if is_at_edge == (case.place == "edge"):
+            return np.array([*place, rng.uniform(-np.pi, np.pi)])
+
+
+def _drive(case: Case, stand: Stand, rng: np.random.Generator) -> Array:
+    """Return poses of a drive within the stand that ends at a place of the case, every 2 m."""
+    extent = np.array([stand.length, stand.width])
+    while True:
+        end = _place(case, stand, rng)
+        # Backwards from the end: turned by half a turn, driven, and turned back.
+        back = arc(compose(end, [0.0, 0.0, np.pi]), length=DRIVE, curvature=rng.uniform(-0.03, 0.03), step=2.0)
+        if (back[:, :2] > 0.0).all() and (back[:, :2] < extent).all():
+            return np.array([compose(pose, [0.0, 0.0, np.pi]) for pose in back[::-1]])
+
+
+def trials(chosen: Sequence[Case], *, count: int, seed: int = SEED) -> Iterator[tuple[Case, list[Trial]]]:
+    """Run ``count`` trials of each case, and yield them; no two cases share a stand."""
+    for number, case in enumerate(chosen):
+        first = seed + number * count
+        yield case, [run(case, seed=first + k) for k in range(count)]
+
+
+def row(case: Case, found: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the row of the table of one case."""
+    right = [one for one in found if one.is_right]
+    wrong = sum(one.is_sure and not one.is_right for one in found)
+    return (
+        case.stand,
+        f"{case.density:g}",
+        case.map,
+        case.place,
+        str(len(found)),
+        f"{len(right) / len(found):.1%}",
+        str(wrong),
+        f"{sum(not one.is_sure for one in found) / len(found):.1%}",
+        _rms([one.position for one in right], "{:.3f}"),
+        _rms([float(np.degrees(one.heading)) for one in right], "{:.2f}"),
+        f"{np.mean([one.nees for one in right]):.1f}" if right else "",
+        f"{1e3 * np.median([one.seconds for one in found]):.0f}",
+    )
+
+
+HEADER = ("stand", "trees/ha", "map", "place", "trials", "right", "wrong", "not sure", "m", "deg", "NEES", "ms")
+
+
+def _rms(values: Sequence[float], form: str) -> str:
+    return form.format(np.sqrt(np.mean(np.square(values)))) if values else ""
+
+
+def verdicts(results: Sequence[tuple[Case, Sequence[Trial]]]) -> list[tuple[str, float, float, bool]]:
+    """Return, for each goal, (what, value, goal, whether it is met)."""
+    found = []
+    for name, goal in GOALS.items():
+        judged_ = [one for case, trials_ in results if case.is_judged and case.map == name for one in trials_]
+        if judged_:
+            share = float(np.mean([one.is_right for one in judged_]))
+            found.append((f"right and sure, {name} map", share, goal, share >= goal))
+    every = [one for _, trials_ in results for one in trials_]
+    wrong = float(np.mean([one.is_sure and not one.is_right for one in every]))
+    found.append((f"wrong and sure, of {len(every)}", wrong, LARGEST_WRONG, wrong < LARGEST_WRONG))
+    return found
+
+
+def main() -> None:
+    """Run the trials, and print their table and whether the goals are met."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--trials", type=int, default=40, help="per case, of which there are 33")
+    parser.add_argument("--seed", type=int, default=SEED)
+    chosen = parser.parse_args()
+    results, rows = [], []
+    for case, found in trials(cases(), count=chosen.trials, seed=chosen.seed):
+        results.append((case, found))
+        rows.append(row(case, found))
+        print("  ".join(rows[-1]), flush=True)
+    print(table(HEADER, rows))
+    for what, value, goal, holds in verdicts(results):
+        print(f"{what}: {value:.2%} (goal {goal:.1%}): {'yes' if holds else 'NO'}")
+
+
+if __name__ == "__main__":
+    main()
