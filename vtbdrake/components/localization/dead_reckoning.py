@@ -1,0 +1,311 @@
+"""Dead reckoning of a carrier on wheels by gyros, accelerometers and wheel speed, and how it corrects scans.
+
+Frames: B is the body of the carrier, with x forward, where the IMU measures. H is its level frame: its origin is Bo, z
+is up by gravity, x points in the heading of B. O is where H was at the start. L is the frame of the scanner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from math import atan2, ceil, cos, hypot, inf, isfinite, sin, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from vtbdrake.components.localization.planar import rotation
+from vtbdrake.scan import Scan
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT
+
+Array = NDArray[np.float64]
+
+MOTION = 8
+"""Size of the port ``motion``: [time (s), roll, pitch (rad), x, y (m), heading (rad), speed (m/s), turn (rad/s)]."""
+POSE = 6
+"""Size of an entry of the port ``history``: [time (s), roll, pitch (rad), x, y (m), heading (rad)]."""
+HISTORY_LENGTH = 1.0
+"""For how long poses are remembered, in s."""
+
+# Once the carrier has stood still for so long, its gyros show their bias, in s.
+_SETTLING_TIME = 0.5
+# Of the gyros' bias at the start, in rad/s.
+_BIAS_DEVIATION = 0.005
+
+
+@dataclass(frozen=True)
+class DriftModel:
+    """How dead reckoning drifts: random walks, whose deviations grow with the roots of distance, time and turn.
+
+    The values are assumed.
+
+    Attributes:
+        along: Of the distance travelled, in m per root metre.
+        across: Of the way that it slips sideways, in m per root metre.
+        heading: Of the heading, in rad per root second.
+        turn: Of the heading in turns, in rad per root radian.
+    """
+
+    along: float = 0.03
+    across: float = 0.01
+    heading: float = 0.001
+    turn: float = 0.01
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not 0.0 <= getattr(self, field.name) < inf:
+                raise ValueError(
+                    f"{field.name} of a drift is a finite deviation of at least 0, not {getattr(self, field.name)!r}"
+                )
+
+    def covariance(self, motion: ArrayLike, duration: float) -> Array:
+        """Return the covariance (3, 3) of a motion X_AB by dead reckoning, in the order x, y (in A, m), heading (rad).
+
+        Args:
+            motion: X_AB = [x, y, heading] from where the carrier was, (3,) in m and rad. It is about an arc.
+            duration: How long it took, in s.
+        """
+        x, y, turned = np.asarray(motion, dtype=float).tolist()
+        length = hypot(x, y)
+        heading = self.heading**2 * abs(duration) + self.turn**2 * abs(turned)
+        # What the heading has drifted halfway leads aside.
+        across = self.across**2 * length + heading * length**2 / 3.0
+        in_chord = np.array(
+            [
+                [self.along**2 * length, 0.0, 0.0],
+                [0.0, across, heading * length / 2.0],
+                [0.0, heading * length / 2.0, heading],
+            ]
+        )
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(atan2(y, x))
+        covariance: Array = turn @ in_chord @ turn.T
+        return covariance
+
+
+class DeadReckoning(LeafSystem):
+    r"""Roll, pitch, and the path in the plane, from an IMU and the speed of the wheels.
+
+    .. pydrake_system::
+
+        name: DeadReckoning
+        input_ports:
+        - imu
+        - odometry
+        output_ports:
+        - motion
+        - history
+
+    ``imu`` is [angular velocity (rad/s); specific force (m/s^2)] of B, means over the sample interval T that ended one
+    period ago; ``odometry`` is the forward speed v (m/s) at its end. The estimates therefore hold for that time, the
+    first entry of ``motion``, which is laid out as `MOTION` says. ``history`` has the poses of the last
+    `HISTORY_LENGTH`, newest first, each laid out as `POSE` says; before the start, the carrier stood still. x, y and
+    heading are those of H in O; the heading is continuous, not wrapped.
+
+    *Levelling.* The vertical u in B is turned by the gyros, and led with the time constant ``levelling_time`` to what
+    the accelerometers show without the acceleration of the carrier, which moves along x_B:
+
+        u <- exp(-[w T]x) u,   u <- u + k (a / |a| - u),   a = f - [dv/dt, w_z v, -w_y v],
+
+    where w are the rates without the gyros' bias. k is T / levelling_time, at the start that of a mean: 1, 1/2, 1/3,
+    ... Only the direction of a counts, so that gravity need not be known.
+
+    *Path.* The carrier moves along x_B, and
+
+        heading <- heading + T (w_y u_y + w_z u_z) / (u_y^2 + u_z^2),
+        [x, y] <- [x, y] + T v cos(pitch) [cos(heading), sin(heading)], halfway.
+
+    *Bias of the gyros.* While the carrier stands still, what the gyros measure is their bias. A Kalman filter estimates
+    it: a random walk with the deviation ``bias_drift``, measured with ``gyro_noise``. The carrier stands still when
+    speed and rates have stayed below ``still_speed`` and ``still_rate`` for half a second.
+
+    A sample with a number that is not finite is left out and counted in ``ignored``: speed and turn rate go on.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float) -> None:
+        """Declare the system.
+
+        Args:
+            period: That of both sensors, in s.
+
+        Raises:
+            ValueError: The period is not positive.
+        """
+        super().__init__()
+        if not 0.0 < period < inf:
+            raise ValueError(f"DeadReckoning: the period is positive, in s, not {period!r}")
+        self._period = period
+        self._imu = self.DeclareVectorInputPort("imu", 6)
+        self._odometry = self.DeclareVectorInputPort("odometry", 1)
+        length = history_size(period) // POSE
+        past = np.zeros((length, POSE))
+        past[:, 0] = -period * np.arange(1, length + 1)
+        motion = self.DeclareDiscreteState(np.array([-period, *[0.0] * (MOTION - 1)]))
+        history = self.DeclareDiscreteState(past.ravel())
+        # [up, samples, bias, its variance, samples at rest, ignored]
+        inner = self.DeclareDiscreteState([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, _BIAS_DEVIATION**2, 0.0, 0.0])
+        self.DeclareStateOutputPort("motion", motion)
+        self.DeclareStateOutputPort("history", history)
+        self._motion, self._history, self._inner = int(motion), int(history), int(inner)
+        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 1e-3]))
+        bounds = (0.0, inf)
+        self.variables = (
+            discrete_state("time", self._motion, unit="s"),
+            discrete_state("roll", self._motion, start=1, unit="rad"),
+            discrete_state("pitch", self._motion, start=2, unit="rad"),
+            discrete_state("position", self._motion, start=3, shape=(2,), unit="m"),
+            discrete_state("heading", self._motion, start=5, unit="rad"),
+            discrete_state("speed", self._motion, start=6, unit="m/s"),
+            discrete_state("turn_rate", self._motion, start=7, unit="rad/s"),
+            discrete_state("history", self._history, shape=(length, POSE), unit="s, rad, m"),
+            discrete_state("up", self._inner, shape=(3,)),
+            discrete_state("samples", self._inner, start=3, bounds=bounds),
+            discrete_state("gyro_bias", self._inner, start=4, shape=(3,), unit="rad/s"),
+            discrete_state("gyro_bias_variance", self._inner, start=7, unit="rad^2/s^2", bounds=bounds),
+            discrete_state("samples_at_rest", self._inner, start=8, bounds=bounds),
+            discrete_state("ignored", self._inner, start=9, bounds=bounds),
+            parameter("levelling_time", settings, unit="s", bounds=bounds),
+            parameter("still_speed", settings, start=1, unit="m/s", bounds=bounds),
+            parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
+            parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=bounds),
+            parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=bounds),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        _, roll, pitch, x, y, heading, v_before, turn_rate = context.get_discrete_state(self._motion).value().tolist()
+        inner = context.get_discrete_state(self._inner).value().tolist()
+        sample = [*self._imu.Eval(context).tolist(), *self._odometry.Eval(context).tolist()]
+        T, now = self._period, context.get_time() - self._period
+        v = v_before
+        if not all(map(isfinite, sample)):
+            inner[9] += 1.0
+        elif now > -T / 2:  # The sample before the first interval is about no motion.
+            v = sample[6]
+            bias, inner[7], inner[8] = self._gyro_bias(context, sample, inner)
+            w = [rate - offset for rate, offset in zip(sample[:3], bias, strict=True)]
+            up = self._levelled(context, inner, w, sample[3:6], v=(v_before + v) / 2.0, acceleration=(v - v_before) / T)
+            across = up[1] ** 2 + up[2] ** 2
+            turn_rate = (w[1] * up[1] + w[2] * up[2]) / max(across, 1e-9)
+            roll, pitch = atan2(up[1], up[2]), atan2(-up[0], sqrt(across))
+            inner[:3], inner[3], inner[4:7] = up, inner[3] + 1.0, bias
+        if now > -T / 2:
+            way = T * (v_before + v) / 2.0 * cos(pitch)
+            halfway = heading + T * turn_rate / 2.0
+            x, y, heading = x + way * cos(halfway), y + way * sin(halfway), heading + T * turn_rate
+        motion = [now, roll, pitch, x, y, heading, v, turn_rate]
+        state.set_value(self._motion, motion)
+        state.set_value(self._inner, inner)
+        past = context.get_discrete_state(self._history).value()
+        state.set_value(self._history, np.concatenate((motion[:POSE], past[:-POSE])))
+
+    def _gyro_bias(self, context: Context, sample: list[float], inner: list[float]) -> tuple[list[float], float, float]:
+        """Return the gyros' bias (rad/s), its variance, and the number of samples at rest up to now."""
+        _, still_speed, still_rate, drift, noise = context.get_numeric_parameter(0).value().tolist()
+        bias, variance = inner[4:7], inner[7] + drift**2 * self._period
+        if abs(sample[6]) > still_speed or any(abs(rate) > still_rate for rate in sample[:3]):
+            return bias, variance, 0.0
+        at_rest = inner[8] + 1.0
+        if at_rest * self._period > _SETTLING_TIME:
+            gain = variance / (variance + max(noise, 1e-9) ** 2)
+            bias = [b + gain * (rate - b) for b, rate in zip(bias, sample[:3], strict=True)]
+            variance *= 1.0 - gain
+        return bias, variance, at_rest
+
+    def _levelled(
+        self, context: Context, inner: list[float], w: list[float], f: list[float], *, v: float, acceleration: float
+    ) -> list[float]:
+        """Return the vertical in B after a sample, (3,)."""
+        T, u = self._period, _turned_back(inner[:3], w, self._period)
+        # The specific force is that of B halfway.
+        a = _turned_back([f[0] - acceleration, f[1] - w[2] * v, f[2] + w[1] * v], w, T / 2.0)
+        size = sqrt(sum(e * e for e in a))
+        if size > 0.0:
+            gain = max(1.0 / (inner[3] + 1.0), T / max(float(context.get_numeric_parameter(0).value()[0]), T))
+            u = [e + gain * (b / size - e) for e, b in zip(u, a, strict=True)]
+        length = sqrt(sum(e * e for e in u))
+        return [e / length for e in u] if length > 0.0 else inner[:3]
+
+
+def _turned_back(u: list[float], w: list[float], duration: float) -> list[float]:
+    """Return exp(-[w duration]x) u, to the second order: a fixed vector, in a body that has turned."""
+    first = _cross(w, u)
+    second = _cross(w, first)
+    return [e - duration * a + duration**2 / 2.0 * b for e, a, b in zip(u, first, second, strict=True)]
+
+
+def _cross(a: list[float], b: list[float]) -> list[float]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def history_size(period: float) -> int:
+    """Return the size of the port ``history`` of a `DeadReckoning` with this period in s."""
+    return POSE * ceil(HISTORY_LENGTH / period - 1e-6)
+
+
+def carrier_pose_at(history: ArrayLike, time: float) -> Array:
+    """Return [time (s), roll, pitch (rad), x, y (m), heading (rad)] of the carrier at a time in s, (6,).
+
+    It is interpolated between the poses of a `DeadReckoning`; outside its history, it is the newest or the oldest one.
+
+    Args:
+        history: Its port ``history``, newest first.
+        time: By the clock of the DPS, in s.
+    """
+    past = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
+    return np.array([time, *(np.interp(time, past[:, 0], past[:, k]) for k in range(1, POSE))])
+
+
+def levelling(roll: float, pitch: float) -> Array:
+    """Return R_HB, shape (3, 3), of a body with this roll and pitch in rad."""
+    matrix: Array = RollPitchYaw(roll, pitch, 0.0).ToRotationMatrix().matrix()
+    return matrix
+
+
+def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: float) -> Array:
+    """Return the points of a scan in the level frame H at one time, (n, 3) in m.
+
+    Each ray is turned and moved by the pose that the carrier had when it was fired, against the pose at ``time``. Poses
+    between those of the history are interpolated linearly. That the carrier rises and sinks is neglected.
+
+    Args:
+        scan: What was measured.
+        history: The port ``history`` of a `DeadReckoning`, newest first.
+        X_BL: Pose of the scanner in B.
+        time: When the scan was complete, by the clock of the DPS, in s.
+    """
+    knots = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
+    fired = time + scan.times
+    first, last = (fired.min(), fired.max()) if len(fired) else (time, time)
+    # Only the knots around the scan.
+    low = max(int(np.searchsorted(knots[:, 0], first, side="right")) - 1, 0)
+    high = max(int(np.searchsorted(knots[:, 0], last)) + 1, low + 1)
+    knots = knots[low:high]
+    _, _, _, x, y, heading = carrier_pose_at(history, time).tolist()
+    R_OH = rotation(heading)
+    turns = np.array([_turn(pose, heading) for pose in knots.tolist()])
+    moves = np.zeros((len(knots), 3))
+    moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
+    p_BQ = scan.points() @ X_BL.rotation().matrix().T + X_BL.translation()
+    points = np.empty_like(p_BQ)
+    # Between which knots a ray was fired, and where between them; before the first and after the last at these.
+    place = np.interp(fired, knots[:, 0], np.arange(len(knots)))
+    segments = np.minimum(place.astype(int), max(len(knots) - 2, 0))
+    for segment in range(segments.min(initial=0), segments.max(initial=-1) + 1):
+        rows = np.flatnonzero(segments == segment)
+        share = (place[rows] - segment)[:, np.newaxis]
+        following = min(segment + 1, len(knots) - 1)
+        before = p_BQ[rows] @ turns[segment].T + moves[segment]
+        after = p_BQ[rows] @ turns[following].T + moves[following]
+        points[rows] = before + share * (after - before)
+    return points
+
+
+def _turn(pose: list[float], heading: float) -> Array:
+    """Return R_HB of an entry of the history, H being the level frame with a heading in rad."""
+    _, roll, pitch, _, _, own = pose
+    matrix: Array = RollPitchYaw(roll, pitch, own - heading).ToRotationMatrix().matrix()
+    return matrix
