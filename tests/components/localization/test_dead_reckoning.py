@@ -62,10 +62,10 @@ class Drive:
         return RigidTransform(self.R_OB[k], self.p_O[k])
 
 
-def reckoned(samples):
+def reckoned(samples, axle=0.0):
     """The system and its context after these samples, each seen one period after it was taken."""
     builder = DiagramBuilder()
-    system = builder.AddSystem(DeadReckoning(period=T))
+    system = builder.AddSystem(DeadReckoning(period=T, axle=axle))
     times = T * (np.arange(len(samples) + 1) - 0.5)
     for name, part in {"imu": slice(0, 6), "odometry": slice(6, 7)}.items():
         steps = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([samples[0], samples])[:, part].T)
@@ -76,8 +76,8 @@ def reckoned(samples):
     return system, system.GetMyContextFromRoot(simulator.get_context())
 
 
-def motion_of(samples):
-    system, context = reckoned(samples)
+def motion_of(samples, axle=0.0):
+    system, context = reckoned(samples, axle)
     return system.GetOutputPort("motion").Eval(context)
 
 
@@ -97,6 +97,22 @@ def test_follows_a_drive_over_bumps():
     assert heading == pytest.approx(drive.angles[548 * 20, 2], abs=3e-4)
     np.testing.assert_allclose([x, y], truth.translation()[:2], atol=2e-3)
     assert speed == pytest.approx(drive.speed[548 * 20])
+
+
+def test_body_ahead_of_its_axle_swings_out_in_bends():
+    axle, v, rate, n = -0.9, 1.5, 0.4, 400
+    # Bo is on a circle, too, and its acceleration points to the middle.
+    inward = rate**2 * np.array([-axle, 0.0, 0.0]) * -1.0 + rate * v * np.array([0.0, 1.0, 0.0])
+    samples = np.tile([0.0, 0.0, rate, *(inward - G), v], (n, 1))
+    _, roll, pitch, x, y, heading, _, _ = motion_of(samples, axle)
+    turned = rate * T * (n - 1)
+    assert heading == pytest.approx(turned, abs=1e-9)
+    np.testing.assert_allclose([roll, pitch], 0.0, atol=1e-9)
+    at_axle = v / rate * np.array([np.sin(turned), 1.0 - np.cos(turned)])
+    start = np.array([axle, 0.0])  # Of A in O, whose origin is where Bo was.
+    expected = start + at_axle - axle * np.array([np.cos(turned), np.sin(turned)])
+    np.testing.assert_allclose([x, y], expected, atol=1e-4)
+    assert abs(y - at_axle[1]) > 0.3
 
 
 def test_history_holds_the_poses_of_the_last_second():

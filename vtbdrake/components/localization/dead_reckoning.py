@@ -98,23 +98,24 @@ class DeadReckoning(LeafSystem):
         - history
 
     ``imu`` is [angular velocity (rad/s); specific force (m/s^2)] of B, means over the sample interval T that ended one
-    period ago; ``odometry`` is the forward speed v (m/s) at its end. The estimates therefore hold for that time, the
-    first entry of ``motion``, which is laid out as `MOTION` says. ``history`` has the poses of the last
+    period ago. ``odometry`` is the speed v (m/s) by the wheels at its end: along x_B, of the point A that does not move
+    sideways, the middle of an axle that is not steered, at x = ``axle`` in B. The estimates therefore hold for that
+    time, the first entry of ``motion``, which is laid out as `MOTION` says. ``history`` has the poses of the last
     `HISTORY_LENGTH`, newest first, each laid out as `POSE` says; before the start, the carrier stood still. x, y and
     heading are those of H in O; the heading is continuous, not wrapped.
 
     *Levelling.* The vertical u in B is turned by the gyros, and led with the time constant ``levelling_time`` to what
-    the accelerometers show without the acceleration of the carrier, which moves along x_B:
+    the accelerometers show without the acceleration of Bo, which has the velocity V = [v, -axle w_z, 0] in B:
 
-        u <- exp(-[w T]x) u,   u <- u + k (a / |a| - u),   a = f - [dv/dt, w_z v, -w_y v],
+        u <- exp(-[w T]x) u,   u <- u + k (a / |a| - u),   a = f - dV/dt - w x V,
 
     where w are the rates without the gyros' bias. k is T / levelling_time, at the start that of a mean: 1, 1/2, 1/3,
     ... Only the direction of a counts, so that gravity need not be known.
 
-    *Path.* The carrier moves along x_B, and
+    *Path.* A moves along x_B, and Bo stays ahead of it:
 
         heading <- heading + T (w_y u_y + w_z u_z) / (u_y^2 + u_z^2),
-        [x, y] <- [x, y] + T v cos(pitch) [cos(heading), sin(heading)], halfway.
+        p_A <- p_A + T v cos(pitch) [cos(heading), sin(heading)], halfway,   [x, y] = p_A - axle [cos(heading), ...].
 
     *Bias of the gyros.* While the carrier stands still, what the gyros measure is their bias. A Kalman filter estimates
     it: a random walk with the deviation ``bias_drift``, measured with ``gyro_noise``. The carrier stands still when
@@ -125,11 +126,12 @@ class DeadReckoning(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float) -> None:
+    def __init__(self, *, period: float, axle: float = 0.0) -> None:
         """Declare the system.
 
         Args:
             period: That of both sensors, in s.
+            axle: Where on x_B the point is that does not move sideways, in m; behind Bo it is negative.
 
         Raises:
             ValueError: The period is not positive.
@@ -150,7 +152,7 @@ class DeadReckoning(LeafSystem):
         self.DeclareStateOutputPort("motion", motion)
         self.DeclareStateOutputPort("history", history)
         self._motion, self._history, self._inner = int(motion), int(history), int(inner)
-        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 1e-3]))
+        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 1e-3, axle]))
         bounds = (0.0, inf)
         self.variables = (
             discrete_state("time", self._motion, unit="s"),
@@ -172,6 +174,7 @@ class DeadReckoning(LeafSystem):
             parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
             parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=bounds),
             parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=bounds),
+            parameter("axle", settings, start=5, unit="m"),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -179,23 +182,31 @@ class DeadReckoning(LeafSystem):
         _, roll, pitch, x, y, heading, v_before, turn_rate = context.get_discrete_state(self._motion).value().tolist()
         inner = context.get_discrete_state(self._inner).value().tolist()
         sample = [*self._imu.Eval(context).tolist(), *self._odometry.Eval(context).tolist()]
+        axle = float(context.get_numeric_parameter(0).value()[5])
         T, now = self._period, context.get_time() - self._period
+        # The sample before the first interval is about no motion.
+        begun = now > -T / 2.0
         v = v_before
         if not all(map(isfinite, sample)):
             inner[9] += 1.0
-        elif now > -T / 2:  # The sample before the first interval is about no motion.
+        elif begun:
             v = sample[6]
             bias, inner[7], inner[8] = self._gyro_bias(context, sample, inner)
             w = [rate - offset for rate, offset in zip(sample[:3], bias, strict=True)]
-            up = self._levelled(context, inner, w, sample[3:6], v=(v_before + v) / 2.0, acceleration=(v - v_before) / T)
+            velocity = (v, -axle * w[2])
+            if not inner[3]:  # How fast the carrier was before the first sample is not known.
+                v_before, turn_rate = v, w[2]
+            before = (v_before, -axle * turn_rate)
+            up = self._levelled(context, inner, w, sample[3:6], before=before, after=velocity)
             across = up[1] ** 2 + up[2] ** 2
             turn_rate = (w[1] * up[1] + w[2] * up[2]) / max(across, 1e-9)
             roll, pitch = atan2(up[1], up[2]), atan2(-up[0], sqrt(across))
             inner[:3], inner[3], inner[4:7] = up, inner[3] + 1.0, bias
-        if now > -T / 2:
-            way = T * (v_before + v) / 2.0 * cos(pitch)
-            halfway = heading + T * turn_rate / 2.0
-            x, y, heading = x + way * cos(halfway), y + way * sin(halfway), heading + T * turn_rate
+        if begun:
+            way, halfway, turned = T * (v_before + v) / 2.0 * cos(pitch), T * turn_rate / 2.0, T * turn_rate
+            x += way * cos(heading + halfway) - axle * (cos(heading + turned) - cos(heading))
+            y += way * sin(heading + halfway) - axle * (sin(heading + turned) - sin(heading))
+            heading += turned
         motion = [now, roll, pitch, x, y, heading, v, turn_rate]
         state.set_value(self._motion, motion)
         state.set_value(self._inner, inner)
@@ -204,7 +215,7 @@ class DeadReckoning(LeafSystem):
 
     def _gyro_bias(self, context: Context, sample: list[float], inner: list[float]) -> tuple[list[float], float, float]:
         """Return the gyros' bias (rad/s), its variance, and the number of samples at rest up to now."""
-        _, still_speed, still_rate, drift, noise = context.get_numeric_parameter(0).value().tolist()
+        _, still_speed, still_rate, drift, noise, _ = context.get_numeric_parameter(0).value().tolist()
         bias, variance = inner[4:7], inner[7] + drift**2 * self._period
         if abs(sample[6]) > still_speed or any(abs(rate) > still_rate for rate in sample[:3]):
             return bias, variance, 0.0
@@ -216,12 +227,31 @@ class DeadReckoning(LeafSystem):
         return bias, variance, at_rest
 
     def _levelled(
-        self, context: Context, inner: list[float], w: list[float], f: list[float], *, v: float, acceleration: float
+        self,
+        context: Context,
+        inner: list[float],
+        w: list[float],
+        f: list[float],
+        *,
+        before: tuple[float, float],
+        after: tuple[float, float],
     ) -> list[float]:
-        """Return the vertical in B after a sample, (3,)."""
+        """Return the vertical in B after a sample, (3,).
+
+        Args:
+            context: For the parameters.
+            inner: The state before.
+            w: Angular velocity without bias, in rad/s.
+            f: Specific force in m/s^2.
+            before: Velocity of Bo along x_B and y_B at the sample before, in m/s.
+            after: That at this sample.
+        """
         T, u = self._period, _turned_back(inner[:3], w, self._period)
+        change = [(new - old) / T for old, new in zip(before, after, strict=True)]
+        inward = _cross(w, [(old + new) / 2.0 for old, new in zip(before, after, strict=True)] + [0.0])
+        a = [f[0] - change[0] - inward[0], f[1] - change[1] - inward[1], f[2] - inward[2]]
         # The specific force is that of B halfway.
-        a = _turned_back([f[0] - acceleration, f[1] - w[2] * v, f[2] + w[1] * v], w, T / 2.0)
+        a = _turned_back(a, w, T / 2.0)
         size = sqrt(sum(e * e for e in a))
         if size > 0.0:
             gain = max(1.0 / (inner[3] + 1.0), T / max(float(context.get_numeric_parameter(0).value()[0]), T))
@@ -259,9 +289,15 @@ def carrier_pose_at(history: ArrayLike, time: float) -> Array:
     return np.array([time, *(np.interp(time, past[:, 0], past[:, k]) for k in range(1, POSE))])
 
 
-def levelling(roll: float, pitch: float) -> Array:
-    """Return R_HB, shape (3, 3), of a body with this roll and pitch in rad."""
-    matrix: Array = RollPitchYaw(roll, pitch, 0.0).ToRotationMatrix().matrix()
+def body_rotation(roll: float, pitch: float, heading: float = 0.0) -> Array:
+    """Return the rotation matrix (3, 3) of a body with this roll and pitch in a level frame, R_HB if heading is 0.
+
+    Args:
+        roll: Of the body, in rad.
+        pitch: Of the body, in rad.
+        heading: By which the body is turned from the x axis of the level frame, in rad.
+    """
+    matrix: Array = RollPitchYaw(roll, pitch, heading).ToRotationMatrix().matrix()
     return matrix
 
 
@@ -286,7 +322,7 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     knots = knots[low:high]
     _, _, _, x, y, heading = carrier_pose_at(history, time).tolist()
     R_OH = rotation(heading)
-    turns = np.array([_turn(pose, heading) for pose in knots.tolist()])
+    turns = np.array([body_rotation(roll, pitch, turned - heading) for _, roll, pitch, _, _, turned in knots.tolist()])
     moves = np.zeros((len(knots), 3))
     moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
     p_BQ = scan.points() @ X_BL.rotation().matrix().T + X_BL.translation()
@@ -302,10 +338,3 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
         after = p_BQ[rows] @ turns[following].T + moves[following]
         points[rows] = before + share * (after - before)
     return points
-
-
-def _turn(pose: list[float], heading: float) -> Array:
-    """Return R_HB of an entry of the history, H being the level frame with a heading in rad."""
-    _, roll, pitch, _, _, own = pose
-    matrix: Array = RollPitchYaw(roll, pitch, own - heading).ToRotationMatrix().matrix()
-    return matrix
