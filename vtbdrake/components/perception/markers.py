@@ -9,8 +9,6 @@ counts from that centre instead; all that it returns is corrected here.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -20,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.perception.estimate import Array, PoseEstimate, cross_matrix, rotation_matrix
+from vtbdrake.components.textures import textured_mesh
 
 if TYPE_CHECKING:
-    from pydrake.geometry import SceneGraphInspector
+    from pydrake.geometry import Mesh, SceneGraphInspector
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import RigidBody
     from pydrake.systems.sensors import ImageRgba8U
@@ -104,23 +103,9 @@ def add_markers(plant: MultibodyPlant, body: RigidBody, board: MarkerBoard, *, n
         board: The markers.
         name: Name of the geometry.
     """
-    from pydrake.common import MemoryFile
-    from pydrake.geometry import (
-        GeometryInstance,
-        IllustrationProperties,
-        InMemoryMesh,
-        Mesh,
-        PerceptionProperties,
-        RenderLabel,
-    )
+    from pydrake.geometry import GeometryInstance, IllustrationProperties, PerceptionProperties, RenderLabel
 
-    files = {
-        "markers.mtl": MemoryFile(_MATERIAL.encode(), ".mtl", "markers.mtl"),
-        "markers.png": MemoryFile(_png(_texture(board.ids)), ".png", "markers.png"),
-    }
-    shape = Mesh(
-        InMemoryMesh(mesh_file=MemoryFile(_mesh(board).encode(), ".obj", "markers.obj"), supporting_files=files)
-    )
+    shape = _mesh(board)
     geometry = GeometryInstance(RigidTransform(), shape, name)
     geometry.set_illustration_properties(IllustrationProperties())
     properties = PerceptionProperties()
@@ -148,20 +133,20 @@ def check_marker_size(board: MarkerBoard, inspector: SceneGraphInspector) -> Non
             )
 
 
-_MATERIAL = "newmtl markers\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd markers.png\n"
-
-
-def _mesh(board: MarkerBoard) -> str:
-    """Return the markers as an OBJ file: one quad each, with its strip of the texture."""
+def _mesh(board: MarkerBoard) -> Mesh:
+    """Return the markers as a mesh: one quad each, with its strip of the texture."""
     count = len(board.ids)
-    lines = ["mtllib markers.mtl", "usemtl markers"]
-    for k, corners in enumerate(_on(board.poses, board.size * _FRAMED / _CELLS)):
-        left, right = k / count, (k + 1) / count
-        lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in corners]
-        lines += [f"vt {u:.9f} {v}" for u, v in ((left, 1), (right, 1), (right, 0), (left, 0))]
-        lines.append("vn {:.9f} {:.9f} {:.9f}".format(*board.poses[k, :, 2]))
-        lines.append("f " + " ".join(f"{4 * k + j}/{4 * k + j}/{k + 1}" for j in (4, 3, 2, 1)))
-    return "\n".join(lines) + "\n"
+    first = np.arange(count)[:, None]
+    strips = np.stack([first, first + 1, first + 1, first], axis=-1).reshape(count, 4) / count
+    heights = np.broadcast_to([1.0, 1.0, 0.0, 0.0], (count, 4))
+    corners = 4 * np.arange(count)[:, None, None] + [[3, 2, 1], [3, 1, 0]]
+    return textured_mesh(
+        _on(board.poses, board.size * _FRAMED / _CELLS).reshape(-1, 3),
+        normals=np.repeat(board.poses[:, :, 2], 4, axis=0),
+        coordinates=np.stack([strips, heights], axis=-1).reshape(-1, 2),
+        triangles=corners.reshape(-1, 3),
+        image=_texture(board.ids),
+    )
 
 
 def _texture(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -170,18 +155,6 @@ def _texture(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
     dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
     tiles = [aruco.generateImageMarker(dictionary, int(k), _CELLS * _CELL_PIXELS) for k in ids]
     return np.hstack([np.pad(tile, _CELL_PIXELS, constant_values=255) for tile in tiles])
-
-
-def _png(grey: NDArray[np.uint8]) -> bytes:
-    """Return a grey image as a PNG file in colours, as every renderer reads it."""
-    height, width = grey.shape
-    rows = b"".join(b"\0" + np.repeat(row, 3).tobytes() for row in grey)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 # -- in an image
