@@ -1,4 +1,4 @@
-"""Textures: procedural images of bark and soil, and meshes in memory that wear an image.
+"""Textures: procedural images, and meshes in memory whose surface shows an image.
 
 Cameras that measure distances by comparing two images need surfaces that look different from place to place.
 """
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Where the brightness of a procedural texture lies for 95 of 100 pixels, as a share of its colour.
-_CONTRAST = 0.45
-_BARK, _SOIL = (150.0, 125.0, 100.0), (125.0, 110.0, 80.0)
+# Of a grained image: the highest frequency of its grain in waves per pixel, and the deviation of the brightness as a
+# share of its mean.
+_FINEST, _CONTRAST = 0.2, 0.22
 
 
 def textured_mesh(
@@ -56,6 +56,45 @@ def textured_mesh(
     return Mesh(InMemoryMesh(mesh_file=obj, supporting_files=files))
 
 
+def tiled_mesh(
+    vertices: ArrayLike, triangles: ArrayLike, *, image: NDArray[np.uint8], tile: tuple[float, float]
+) -> Mesh:
+    """Return a surface in memory that is tiled with an image, along the two axes that each triangle faces least.
+
+    So upright surfaces show the image upright, and each place of a surface in space shows another part of it. Edges of
+    triangles are sharp.
+
+    Args:
+        vertices: The vertices in m, shape (v, 3).
+        triangles: Indices of three vertices each, counterclockwise seen from outside, shape (t, 3).
+        image: Colours, shape (h, w, 3), that repeat without a seam.
+        tile: The extent of the image in m, across and (on upright surfaces) along z. No triangle extends farther.
+
+    Raises:
+        ValueError: A triangle is larger than the image.
+    """
+    corners = np.asarray(vertices, dtype=float)[np.asarray(triangles, dtype=np.int64)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(np.abs(normals), axis=1)]
+    across = np.take_along_axis(corners, axes[:, np.newaxis, :], axis=2) / tile
+    folded = across - np.floor(across.min(axis=1, keepdims=True))
+    if folded.max(initial=0.0) > 2.0:
+        extent = np.ptp(across, axis=1).max(axis=0) * tile
+        raise ValueError(
+            f"a triangle extends over {extent[0]:.3g} x {extent[1]:.3g} m, more than the image of {tile[0]:g} x "
+            f"{tile[1]:g} m: give a larger tile, or divide the triangle"
+        )
+    # Renderers do not repeat an image: here it is twice as wide and high, so that a triangle may cross its edges.
+    return textured_mesh(
+        corners.reshape(-1, 3),
+        normals=np.repeat(normals, 3, axis=0),
+        coordinates=0.5 * folded.reshape(-1, 2),
+        triangles=np.arange(3 * len(corners)).reshape(-1, 3),
+        image=np.tile(image, (2, 2, 1)),
+    )
+
+
 def png(image: NDArray[np.uint8]) -> bytes:
     """Return an image, shape (h, w, 3), or (h, w) if grey, as a PNG file in colours, as every renderer reads it."""
     rgb = np.ascontiguousarray(np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image, dtype=np.uint8)
@@ -69,40 +108,21 @@ def png(image: NDArray[np.uint8]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def bark(pixels: int = 512, *, seed: int = 0) -> NDArray[np.uint8]:
-    """Return a square image of bark that repeats without a seam, shape (pixels, pixels, 3): long fissures, upright.
+def grain(color: ArrayLike, *, pixels: int = 512, seed: int = 0) -> NDArray[np.uint8]:
+    """Return a square image of spots of all sizes that repeats without a seam, shape (pixels, pixels, 3).
 
-    Meant for about 2 m of trunk: then its finest fissures are 2 cm wide.
-    """
-    return _coloured(_noise(pixels, seed=seed, finest=100.0, stretch=4.0), _BARK)
-
-
-def soil(pixels: int = 512, *, seed: int = 0) -> NDArray[np.uint8]:
-    """Return a square image of litter and soil that repeats without a seam, shape (pixels, pixels, 3).
-
-    Meant for about 4 m of ground: then its finest spots are 4 cm wide.
-    """
-    return _coloured(_noise(pixels, seed=seed, finest=100.0, stretch=1.0), _SOIL)
-
-
-def _noise(pixels: int, *, seed: int, finest: float, stretch: float) -> Array:
-    """Return periodic noise of unit variance, (pixels, pixels); amplitudes fall with the root of the frequency.
+    Its brightness is noise whose amplitudes fall with the square root of the frequency; the smallest spots are about
+    three pixels wide. On a tile that is higher than wide, it resembles bark.
 
     Args:
+        color: The mean red, green and blue, from 0 to 1, shape (3,).
         pixels: The edge of the image.
-        seed: Determines it.
-        finest: The highest frequency, in waves along the width of the image.
-        stretch: How many times longer than wide its spots are.
+        seed: Determines the spots.
     """
     spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(pixels, pixels)))
-    along, across = np.fft.fftfreq(pixels, 1.0 / pixels), np.fft.rfftfreq(pixels, 1.0 / pixels)
-    frequency = np.hypot(stretch * along[:, None], across)
-    spectrum *= np.exp(-((frequency / finest) ** 2)) / np.maximum(frequency, 1.0) ** 0.5
+    frequency = np.hypot(np.fft.fftfreq(pixels)[:, np.newaxis], np.fft.rfftfreq(pixels))
+    spectrum *= np.exp(-((frequency / _FINEST) ** 2)) / np.maximum(frequency, 1.0 / pixels) ** 0.5
     spectrum[0, 0] = 0.0
     noise = np.fft.irfft2(spectrum, s=(pixels, pixels))
-    return np.asarray(noise / noise.std())
-
-
-def _coloured(noise: Array, colour: tuple[float, float, float]) -> NDArray[np.uint8]:
-    brightness = 1.0 + 0.5 * _CONTRAST * noise
-    return np.clip(np.rint(brightness[..., None] * colour), 0.0, 255.0).astype(np.uint8)
+    brightness = 255.0 * (1.0 + _CONTRAST * noise / noise.std())
+    return np.clip(np.rint(brightness[..., np.newaxis] * np.asarray(color)), 0.0, 255.0).astype(np.uint8)

@@ -24,7 +24,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
-from vtbdrake.components.textures import bark, textured_mesh
+from vtbdrake.components.textures import grain, textured_mesh
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def wall(corners: Array) -> GeometryInstance:
         normals=np.tile([0.0, 0.0, -1.0], (4, 1)),
         coordinates=[[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]],
         triangles=[[0, 3, 2], [0, 2, 1]],
-        image=bark(),
+        image=grain((0.6, 0.5, 0.4)),
     )
     geometry = GeometryInstance(RigidTransform(), mesh, f"wall {corners[0]}")
     geometry.set_perception_properties(PerceptionProperties())
