@@ -1,0 +1,463 @@
+"""Tracking of a carrier among landmarks of a map, from a first pose on: simultaneous localization and map refinement.
+
+The state x = [X_WH; b; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector, and the
+true positions l_i (in W) of those landmarks of the map that have been seen. Each of them enters once, with its place
+in the map and the map's own error as the prior; from then on it is refined by detections, and correlated with the
+pose. A filter that takes the map's error afresh from every scan would become overconfident, because that error is the
+same in every scan. A detection z of landmark l in the level frame H is
+
+    z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
+
+where s is the place of the scanner. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous localization
+and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
+
+Errors of a map may be correlated: neighbours are displaced alike. With K_ij = c σ_i σ_j exp(-r_ij² / (2 L²)) +
+(1 - c) σ_i² δ_ij for the errors of the landmarks, per axis, the prior of a landmark that is seen for the first time is
+its distribution given the errors of those in the state (simple kriging). So displacements that the state has learned
+are expected of new landmarks, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose, rotation, transform
+from vtbdrake.components.world_model.association import chi_square_quantile
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_BIAS, _FIXED = 3, 4
+
+# Hypotheses that are tried in the association of a scan.
+_HYPOTHESES = 40
+
+# An innovation of a diameter counts no more than that of three deviations: trunks are no cylinders.
+_DIAMETER_CAP = 9.0
+
+# Shares of what is expected under which a scan is taken not to show the place where the carrier is believed to be.
+_LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
+
+# Detections, or landmarks to be seen again, from which on that is judged.
+_JUDGED_FROM = 6
+
+# The share of first matches that are assumed to be by chance although the pose is right.
+_CHANCE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class TrackState:
+    """The memory of a `Tracker`: an immutable value with read-only arrays.
+
+    Attributes:
+        mean: The estimate of x (m, rad), shape (4 + 2 n,); empty if nothing is tracked.
+        covariance: Its covariance, shape (4 + 2 n, 4 + 2 n).
+        indices: Which landmarks of the map are in x, shape (n,).
+        is_recent: Which of them the last scan that was fused showed, shape (n,).
+        evidence: How well first matches agree with the map, see `Tracker`.
+        failures: Scans in succession that did not show the place.
+    """
+
+    mean: Array
+    covariance: Array
+    indices: Indices
+    is_recent: NDArray[np.bool_]
+    evidence: float = 0.0
+    failures: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "covariance", "indices", "is_recent"):
+            array = np.array(getattr(self, name))
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def none(cls) -> TrackState:
+        """Return the state in which nothing is tracked."""
+        return cls(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool))
+
+    def __deepcopy__(self, memo: object) -> TrackState:
+        return self
+
+    @property
+    def is_tracking(self) -> bool:
+        """Whether there is a pose."""
+        return bool(self.mean.size)
+
+    @property
+    def pose(self) -> Array:
+        """X_WH, shape (3,)."""
+        return self.mean[:3]
+
+    @property
+    def pose_covariance(self) -> Array:
+        """The covariance of X_WH, shape (3, 3)."""
+        return self.covariance[:3, :3]
+
+    @property
+    def range_bias(self) -> float:
+        """How much too far the detector sees landmarks, in m."""
+        return float(self.mean[_BIAS])
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What a scan had in common with the map.
+
+    Attributes:
+        pairs: Detection and landmark of the map, by index, shape (k, 2).
+        nis: The normalized innovation squared of the pairs: chi-square distributed with 2 k degrees of freedom.
+        is_fused: Whether the scan changed the estimate.
+    """
+
+    pairs: Indices
+    nis: float = 0.0
+    is_fused: bool = False
+
+
+_NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class Tracker:
+    """The filter described in the module, for one map.
+
+    Association: pairs of detection and landmark within a gate on the Mahalanobis distance are hypotheses. The one that
+    agrees with most others, after the state has been conditioned on it, decides which pairs are possible; the best
+    one-to-one assignment among them is taken, and its worst pairs are dropped until the joint innovation is
+    probable. Differences of diameter count in the assignment.
+
+    Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
+    not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
+    than ``largest_deviation``, or when first matches of landmarks speak against the pose: the d² of a right match is
+    chi-square distributed, that of a match by chance is uniform within the gate. The logarithm of this ratio is summed
+    up to at most ``credit``; below 0, the track is lost (the cumulative sum of Page, Biometrika 41, 1954).
+
+    Landmarks that were marginalized enter anew if the carrier comes back. Their map error is then used twice.
+
+    Attributes:
+        landmarks: The map, in W.
+        sensor: s = p_HoLo_H in the plane, in m.
+        bias_deviation: Standard deviation of the range bias, in m; assumed.
+        least_deviation: Standard deviation in m that is added to those of detections, per axis; assumed.
+        correlation: L in m, 0 if the map's errors are independent.
+        correlated_share: c, of the variance; assumed.
+        gate: The share of right pairs that the gate lets pass.
+        horizon: Distance from the carrier in m beyond which landmarks are marginalized.
+        most: The largest number of landmarks in the state.
+        patience: Failures in succession until the track is lost.
+        credit: The largest evidence.
+        first_credit: The evidence at the start: a wrong start ends sooner.
+        largest_deviation: Of the position per axis, in m, until the track is lost.
+    """
+
+    landmarks: Landmarks
+    sensor: tuple[float, float] = (0.0, 0.0)
+    bias_deviation: float = 0.03
+    least_deviation: float = 0.01
+    correlation: float = 0.0
+    correlated_share: float = 0.98
+    gate: float = 0.997
+    horizon: float = 30.0
+    most: int = 90
+    patience: int = 3
+    credit: float = 12.0
+    first_credit: float = 6.0
+    largest_deviation: float = 2.0
+    _tree: cKDTree = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not len(self.landmarks):
+            raise ValueError("the map of a tracker is empty: localization needs landmarks")
+        if not 0.0 < self.gate < 1.0 or not 0.0 <= self.correlated_share < 1.0:
+            raise ValueError(f"gate and correlated share lie in (0, 1), not {self.gate} and {self.correlated_share}")
+        if min(self.bias_deviation, self.least_deviation, self.correlation) < 0.0:
+            raise ValueError("deviations and the length of correlation of a tracker are at least 0")
+        if min(self.horizon, self.most, self.patience, self.credit, self.first_credit, self.largest_deviation) <= 0:
+            raise ValueError("horizon, largest values, patience and credits of a tracker are positive")
+        object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions))
+
+    def start(
+        self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | None = None
+    ) -> tuple[TrackState, Matches]:
+        """Return the state at a first pose, and the matches of what is seen there.
+
+        With landmarks, the pose is taken to come from the same map. Its errors must not be used twice: the covariance
+        serves to associate, and the estimate then has its information from the matched pairs alone.
+
+        Args:
+            X_WH: The pose, shape (3,).
+            covariance: Its covariance, shape (3, 3).
+            landmarks: Detections in H at that pose; None starts with the given covariance.
+        """
+        pose = np.array(X_WH, dtype=float)
+        state = self._at(pose, np.array(covariance, dtype=float))
+        if landmarks is None:
+            return state, _NO_MATCHES
+        pairs = self._associate(state, landmarks)[0]
+        loose = self._at(pose, np.diag([5.0**2, 5.0**2, 0.2**2]))
+        extended = self._extended(loose, pairs[:, 1])
+        return self._fused(extended, landmarks, pairs)
+
+    def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike) -> TrackState:
+        """Return the state after a motion.
+
+        Args:
+            state: The state before.
+            motion: The pose of the carrier afterwards in its frame before, shape (3,).
+            covariance: The covariance of the motion, shape (3, 3).
+        """
+        move = np.asarray(motion, dtype=float)
+        heading = state.mean[2]
+        F, G = np.eye(3), block_diag(rotation(heading), 1.0)
+        F[:2, 2] = rotation(heading + np.pi / 2.0) @ move[:2]
+        mean, P = state.mean.copy(), state.covariance.copy()
+        mean[:3] = compose(mean[:3], move)
+        P[:3] = F @ P[:3]
+        P[:, :3] = P[:, :3] @ F.T
+        P[:3, :3] += G @ np.asarray(covariance, dtype=float) @ G.T
+        return replace(state, mean=mean, covariance=P)
+
+    def update(self, state: TrackState, landmarks: Landmarks) -> tuple[TrackState, Matches]:
+        """Return the state after a scan, and its matches.
+
+        Args:
+            state: The state at the time of the scan.
+            landmarks: The detections, in H.
+        """
+        if not len(landmarks):
+            return state, _NO_MATCHES
+        pairs, distances, extended = self._associate(state, landmarks)
+        known = np.isin(pairs[:, 1], state.indices)
+        if self._is_elsewhere(state, landmarks, len(pairs), int(known.sum())):
+            return replace(state, failures=state.failures + 1), Matches(pairs)
+        if len(pairs) < 2:
+            return state, Matches(pairs)
+        room = np.cumsum(~known) + len(state.indices) <= self.most
+        taken = known | room
+        pairs, distances, known = pairs[taken], distances[taken], known[taken]
+        extended = _without(extended, ~np.isin(extended.indices, np.concatenate([state.indices, pairs[:, 1]])))
+        fused, matches = self._fused(extended, landmarks, pairs)
+        # Only where the carrier is well known does a distance tell right from wrong.
+        evidence = min(self.credit, state.evidence + self._evidence(distances[~known]))
+        return replace(fused, evidence=evidence, failures=0), matches
+
+    def is_lost(self, state: TrackState) -> bool:
+        """Return whether the pose must not be believed any more."""
+        deviation = float(np.sqrt(np.diagonal(state.pose_covariance)[:2].max()))
+        return state.failures >= self.patience or state.evidence < 0.0 or deviation > self.largest_deviation
+
+    # -- the state
+
+    def _at(self, X_WH: Array, covariance: Array) -> TrackState:
+        P = block_diag(covariance, self.bias_deviation**2)
+        return replace(TrackState.none(), mean=np.append(X_WH, 0.0), covariance=P, evidence=self.first_credit)
+
+    def _extended(self, state: TrackState, indices: ArrayLike) -> TrackState:
+        """Return the state with further landmarks (m,) of the map, which it does not have yet."""
+        new = np.asarray(indices, dtype=np.int64)
+        places, variances = self.landmarks.positions, self.landmarks.covariances
+        mean, P, n = state.mean, state.covariance, len(state.indices)
+        if self.correlation == 0.0:
+            prior, J, added = (
+                block_diag(np.zeros((0, 0)), *variances[new]),
+                np.zeros((2 * len(new), 2 * n)),
+                places[new],
+            )
+        else:
+            K = self._covariance(np.concatenate([state.indices, new]))
+            weights = np.linalg.solve(K[:n, :n], K[:n, n:])
+            prior = np.kron(K[n:, n:] - K[n:, :n] @ weights, np.eye(2))
+            J = np.kron(weights.T, np.eye(2))
+            added = places[new] + weights.T @ (mean[_FIXED:].reshape(-1, 2) - places[state.indices])
+        cross = J @ P[_FIXED:]
+        return replace(
+            state,
+            mean=np.concatenate([mean, added.ravel()]),
+            covariance=np.block([[P, cross.T], [cross, cross[:, _FIXED:] @ J.T + prior]]),
+            indices=np.concatenate([state.indices, new]),
+            is_recent=np.concatenate([state.is_recent, np.zeros(len(new), dtype=bool)]),
+        )
+
+    def _covariance(self, indices: Indices) -> Array:
+        """Return K of the map's errors, shape (m, m) in m^2."""
+        places = self.landmarks.positions[indices]
+        deviations = np.sqrt(0.5 * np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2))
+        squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+        K: Array = (
+            self.correlated_share * np.exp(-0.5 * squares / self.correlation**2) * np.outer(deviations, deviations)
+        )
+        K[np.diag_indices_from(K)] = deviations**2
+        return K
+
+    def _fused(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> tuple[TrackState, Matches]:
+        """Return the state with the matched detections, of landmarks that it has."""
+        # A pair that makes the whole improbable is no pair, but the landmark stays.
+        while len(pairs):
+            rows = _rows_of(state.indices, pairs[:, 1])
+            expected, H = self._expected(state, rows)
+            innovation = (landmarks.positions[pairs[:, 0]] - expected).ravel()
+            PHt = _times_transpose(state.covariance, H, rows)
+            S = _times(H, rows, PHt) + block_diag(*self._noise(landmarks)[pairs[:, 0]])
+            factor = cho_factor(S, lower=True)
+            weighted = cho_solve(factor, innovation)
+            parts = (innovation * weighted).reshape(-1, 2).sum(axis=1)
+            if parts.sum() <= chi_square_quantile(self.gate, 2 * len(pairs)):
+                break
+            pairs = np.delete(pairs, np.argmax(parts), axis=0)
+        else:
+            return state, _NO_MATCHES
+        mean = state.mean + PHt @ weighted
+        P = state.covariance - PHt @ cho_solve(factor, PHt.T)
+        fused = replace(state, mean=mean, covariance=0.5 * (P + P.T), is_recent=np.isin(state.indices, pairs[:, 1]))
+        far = np.hypot(*(mean[_FIXED:].reshape(-1, 2) - mean[:2]).T) > self.horizon
+        return _without(fused, far), Matches(pairs, float(parts.sum()), is_fused=True)
+
+    def _noise(self, landmarks: Landmarks) -> Array:
+        return landmarks.covariances + self.least_deviation**2 * np.eye(2)
+
+    def _expected(self, state: TrackState, rows: Indices) -> tuple[Array, Array]:
+        """Return where landmarks of the state are to be seen in H, (m, 2), and the derivatives (m, 2, 6).
+
+        The derivatives are those with respect to the pose, the bias, and the landmark itself.
+        """
+        R_HW = rotation(-state.mean[2])
+        d = (state.mean[_FIXED:].reshape(-1, 2)[rows] - state.mean[:2]) @ R_HW.T
+        ray = d - np.asarray(self.sensor)
+        length = np.maximum(np.hypot(*ray.T), 1e-3)[:, None]
+        along = ray / length
+        bias = state.mean[_BIAS]
+        # The derivative of d + b along, with respect to d.
+        across = np.eye(2) - along[:, :, None] * along[:, None, :]
+        D = np.eye(2) + (bias / length)[:, :, None] * across
+        H = np.empty((len(rows), 2, 6))
+        H[:, :, 4:] = D @ R_HW
+        H[:, :, :2] = -H[:, :, 4:]
+        H[:, :, 2] = np.einsum("nij,nj->ni", D, d[:, ::-1] * [1.0, -1.0])
+        H[:, :, 3] = along
+        return d + bias * along, H
+
+    # -- association
+
+    def _associate(self, state: TrackState, landmarks: Landmarks) -> tuple[Indices, Array, TrackState]:
+        """Return pairs (k, 2), their d² (k,), and the state with all landmarks that came into question."""
+        near = self._nearby(state, landmarks)
+        extended = self._extended(state, near[~np.isin(near, state.indices)])
+        rows = np.flatnonzero(np.isin(extended.indices, near))
+        expected, H = self._expected(extended, rows)
+        # Covariances of all expected detections with each other.
+        joint = _times(H, rows, _times_transpose(extended.covariance, H, rows)).reshape(len(rows), 2, len(rows), 2)
+        joint = joint.transpose(0, 2, 1, 3)
+        innovations = landmarks.positions[:, None] - expected
+        spread = joint[np.arange(len(rows)), np.arange(len(rows))] + self._noise(landmarks)[:, None]
+        threshold = chi_square_quantile(self.gate, 2)
+        squares = _squared_distance(innovations, spread)
+        seen, column = np.nonzero(squares < threshold)
+        if not len(seen):
+            return np.zeros((0, 2), dtype=np.int64), np.zeros(0), extended
+        nu, S = innovations[seen, column], spread[seen, column]
+        # After conditioning on pair q, what remains of each pair p.
+        chosen = np.unique(np.linspace(0, len(seen) - 1, _HYPOTHESES).astype(int))
+        C = joint[column[:, None], column[chosen]]
+        gain = C @ np.linalg.inv(S[chosen])
+        after = _squared_distance(
+            nu[:, None] - np.einsum("pqij,qj->pqi", gain, nu[chosen]), S[:, None] - gain @ C.transpose(0, 1, 3, 2)
+        )
+        other = (seen[:, None] != seen[chosen]) & (column[:, None] != column[chosen])
+        after = np.where(other, after, np.where(np.arange(len(seen))[:, None] == chosen, 0.0, np.inf))
+        agreement = np.zeros((len(landmarks), len(chosen)))
+        np.maximum.at(agreement, seen, np.maximum(threshold - after, 0.0))
+        best = after[:, np.argmax(agreement.sum(axis=0))]
+        cost = best + np.log(np.linalg.det(S)) + self._diameter_cost(landmarks, seen, extended.indices[rows][column])
+        possible = best < threshold
+        value = np.zeros((len(landmarks), len(rows)))
+        value[seen, column] = np.where(possible, 1.0 + cost[possible].max() - cost, 0.0)
+        one, two = linear_sum_assignment(value, maximize=True)
+        taken = value[one, two] > 0.0
+        one, two = one[taken], two[taken]
+        return np.column_stack([one, extended.indices[rows[two]]]), squares[one, two], extended
+
+    def _nearby(self, state: TrackState, landmarks: Landmarks) -> Indices:
+        """Return the landmarks of the map that can be within the gate of a detection."""
+        places = transform(state.pose, landmarks.positions)
+        P, levers = state.pose_covariance, (landmarks.positions**2).sum(axis=1)
+        largest = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1].max()
+        own = np.trace(landmarks.covariances, axis1=1, axis2=2)
+        variances = largest + own + P[0, 0] + P[1, 1] + levers * P[2, 2] + self.bias_deviation**2
+        reach = np.sqrt(chi_square_quantile(self.gate, 2) * variances)
+        found = self._tree.query_ball_point(places, reach)
+        return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in found]))
+
+    def _diameter_cost(self, landmarks: Landmarks, seen: Indices, indices: Indices) -> Array:
+        variance = (
+            self.landmarks.diameter_deviations[indices] ** 2
+            + landmarks.diameter_deviations[seen] ** 2
+            + self.least_deviation**2
+        )
+        squares = (landmarks.diameters[seen] - self.landmarks.diameters[indices]) ** 2 / variance
+        return np.minimum(squares, _DIAMETER_CAP)
+
+    # -- health
+
+    def _is_elsewhere(self, state: TrackState, landmarks: Landmarks, matched: int, again: int) -> bool:
+        """Return whether a scan does not show the place, with matched detections and landmarks seen again."""
+        recent = state.mean[_FIXED:].reshape(-1, 2)[state.is_recent]
+        # At the edge of what is seen, landmarks come and go.
+        reach = 0.7 * np.hypot(*landmarks.positions.T).max()
+        expected = int((np.hypot(*(recent - state.mean[:2]).T) < reach).sum())
+        few = len(landmarks) >= _JUDGED_FROM and matched < _LEAST_SHARE * len(landmarks)
+        return few or (expected >= _JUDGED_FROM and again < _LEAST_AGAIN * expected)
+
+    def _evidence(self, squares: Array) -> float:
+        """Return the log-likelihood ratio of d² (k,) of first matches, right against by chance."""
+        ratio = 0.5 * chi_square_quantile(self.gate, 2) * np.exp(-0.5 * squares)
+        return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
+
+
+def _without(state: TrackState, dropped: NDArray[np.bool_]) -> TrackState:
+    """Return the state without the landmarks for which the mask (n,) is true."""
+    kept = np.concatenate([np.ones(_FIXED, dtype=bool), np.repeat(~dropped, 2)])
+    return replace(
+        state,
+        mean=state.mean[kept],
+        covariance=state.covariance[np.ix_(kept, kept)],
+        indices=state.indices[~dropped],
+        is_recent=state.is_recent[~dropped],
+    )
+
+
+def _rows_of(indices: Indices, wanted: Indices) -> Indices:
+    """Return where each of the wanted values stands in indices, which have it once."""
+    order = np.argsort(indices)
+    return order[np.searchsorted(indices, wanted, sorter=order)]
+
+
+def _columns(rows: Indices) -> Indices:
+    """Return the places in x of landmarks, shape (m, 2)."""
+    return _FIXED + 2 * rows[:, None] + np.arange(2)
+
+
+def _times_transpose(P: Array, H: Array, rows: Indices) -> Array:
+    """Return P Hᵀ, shape (N, 2 m), for derivatives (m, 2, 6)."""
+    own = np.einsum("Nmj,mij->Nmi", P[:, _columns(rows)], H[:, :, _FIXED:])
+    return P[:, :_FIXED] @ H[:, :, :_FIXED].reshape(-1, _FIXED).T + own.reshape(len(P), -1)
+
+
+def _times(H: Array, rows: Indices, columns: Array) -> Array:
+    """Return H times columns (N, k), shape (2 m, k), for derivatives (m, 2, 6)."""
+    return _times_transpose(columns.T, H, rows).T
+
+
+def _squared_distance(nu: Array, S: Array) -> Array:
+    """Return νᵀ S⁻¹ ν for innovations (..., 2) and covariances (..., 2, 2)."""
+    x, y = nu[..., 0], nu[..., 1]
+    determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
+    squares: Array = S[..., 1, 1] * x**2 - (S[..., 0, 1] + S[..., 1, 0]) * x * y + S[..., 0, 0] * y**2
+    return squares / np.maximum(determinant, 1e-12)

@@ -1,0 +1,240 @@
+"""The localization unit: where a carrier is on a map of landmarks, from what it detects and its odometry.
+
+Without a pose, it gathers a local map along the odometry and matches it with the map, without a guess. Once a match is
+sure, it tracks. When the tracker's health fails, it says so, and searches again with what it has seen since.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import inf, isfinite, nan
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vtbdrake.components.localization.dead_reckoning import DriftModel
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose, inverse
+from vtbdrake.components.localization.submap import Submap
+from vtbdrake.components.localization.tracking import Matches, Tracker, TrackState
+from vtbdrake.state import Codec
+from vtbdrake.state.codecs import codec_of
+
+Array = NDArray[np.float64]
+
+SEARCHING, TRACKING, LOST = range(3)
+"""What a `Localization` says: no pose yet; a pose; no pose any more. Searching goes on after a loss, too."""
+
+STATUS_NAMES = ("searching", "tracking", "lost")
+
+# The fewest matched detections with which a track begins.
+_FEWEST = 4
+
+
+class Fix(Protocol):
+    """What is used of the result of matching without a guess."""
+
+    @property
+    def pose(self) -> Array:
+        """X_WH, shape (3,)."""
+
+    @property
+    def covariance(self) -> Array:
+        """Its covariance, shape (3, 3)."""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the match is unique."""
+
+
+class Locator(Protocol):
+    """A map that can be matched with local landmarks without a guess: a `ConstellationMap`."""
+
+    def locate(self, local: Landmarks) -> Fix:
+        """Return where the carrier is that sees these landmarks in H."""
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """Where the carrier is: what a `LocalizationUnit` answers to one scan.
+
+    Attributes:
+        time: The time of the scan, in s; -inf before the first one.
+        X_OH: The pose of the odometry for which the answer holds, shape (3,).
+        pose: X_WH, shape (3,) in m and rad; NaN without a pose.
+        covariance: Its covariance in the order x, y, heading, shape (3, 3); infinite variances without a pose.
+        status: `SEARCHING`, `TRACKING` or `LOST`. Only while tracking is there a pose.
+        detected: The number of detections.
+        matched: How many of them were fused.
+        nis: Normalized innovation squared of the scan, of 2 ``matched`` degrees of freedom.
+        range_bias: The estimated bias of detections along the ray, in m; 0 without a pose.
+    """
+
+    time: float
+    X_OH: Array
+    pose: Array
+    covariance: Array
+    status: int
+    detected: int = 0
+    matched: int = 0
+    nis: float = 0.0
+    range_bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("X_OH", "pose", "covariance"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def unknown(
+        cls, status: int = SEARCHING, *, time: float = -inf, X_OH: ArrayLike = (0.0, 0.0, 0.0), detected: int = 0
+    ) -> Localization:
+        """Return the answer without a pose."""
+        return cls(time, np.asarray(X_OH), np.full(3, nan), np.diag(np.full(3, inf)), status, detected)
+
+    def __deepcopy__(self, memo: object) -> Localization:
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class UnitState:
+    """The memory of a `LocalizationUnit`, an immutable value; `UNIT_STATE_CODEC` makes arrays of it.
+
+    Attributes:
+        answer: The last answer.
+        track: The state of the tracker; none while there is no pose.
+        submap: What was gathered since there is no pose; empty while there is one.
+        tried_at: Distance travelled in m and time in s of the last match without a guess, shape (2,).
+        ignored: Calls with a number that is not finite, or a time that was not after the last one.
+        losses: How often the track was lost.
+    """
+
+    answer: Localization = field(default_factory=Localization.unknown)
+    track: TrackState = field(default_factory=TrackState.none)
+    submap: Submap = field(default_factory=Submap.empty)
+    tried_at: Array = field(default_factory=lambda: np.array([-inf, -inf]))
+    ignored: int = 0
+    losses: int = 0
+
+    def __deepcopy__(self, memo: object) -> UnitState:
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationUnit:
+    """The unit for one map; a function of its arguments, without memory of its own.
+
+    Attributes:
+        locator: The map, prepared for matching without a guess.
+        tracker: The filter, with the same map.
+        drift: How the odometry drifts.
+        submap_length: Over how many metres landmarks are gathered.
+        try_every: Metres travelled or seconds, whichever comes first, between matches without a guess.
+    """
+
+    locator: Locator
+    tracker: Tracker
+    drift: DriftModel = field(default_factory=DriftModel)
+    submap_length: float = 40.0
+    try_every: tuple[float, float] = (2.0, 2.0)
+
+    def start(self) -> UnitState:
+        """Return the memory before the first scan."""
+        return UnitState()
+
+    def step(
+        self, state: UnitState, landmarks: Landmarks, *, X_OH: ArrayLike, time: float
+    ) -> tuple[Localization, UnitState]:
+        """Return the answer to a scan, and the memory after it.
+
+        A call with a pose or a time that is not finite, or with a time that is not after the last one, is ignored and
+        counted. The answer is then the last one, which says for which time it holds.
+
+        Args:
+            state: The memory before.
+            landmarks: What was detected, in H.
+            X_OH: The pose of the carrier by odometry at the time of the scan, shape (3,).
+            time: That time, in s.
+
+        Raises:
+            ValueError: X_OH is no array of 3 numbers.
+        """
+        pose = np.asarray(X_OH, dtype=float)
+        if pose.shape != (3,):
+            raise ValueError(f"X_OH is a planar pose [x, y, heading], shape (3,), not of shape {pose.shape}")
+        last = state.answer
+        if not (np.isfinite(pose).all() and isfinite(time) and time > last.time):
+            return last, replace(state, ignored=state.ignored + 1)
+        begins = not isfinite(last.time)
+        motion = np.zeros(3) if begins else compose(inverse(last.X_OH), pose)
+        C = np.zeros((3, 3)) if begins else self.drift.covariance(motion, time - last.time)
+        if begins:
+            state = replace(state, submap=Submap.empty(pose))
+        if state.track.is_tracking:
+            track, matches = self.tracker.update(self.tracker.predict(state.track, motion, C), landmarks)
+            if not self.tracker.is_lost(track):
+                answer = _answer(track, matches, len(landmarks), pose, time)
+                return answer, replace(state, answer=answer, track=track)
+            none = Localization.unknown(LOST)
+            submap = Submap.empty(pose)
+            state = replace(UnitState(none, submap=submap), ignored=state.ignored, losses=state.losses + 1)
+        return self._searched(state, landmarks, pose, C, time)
+
+    def _searched(
+        self, state: UnitState, landmarks: Landmarks, X_OH: Array, C: Array, time: float
+    ) -> tuple[Localization, UnitState]:
+        """Return the answer and the memory after a scan without a pose before it."""
+        submap = state.submap.moved(X_OH, C, length=self.submap_length).with_scan(landmarks)
+        none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
+        state = replace(state, answer=none, submap=submap)
+        if not (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any():
+            return none, state
+        state = replace(state, tried_at=np.array([submap.distance, time]))
+        fix = self.locator.locate(submap.landmarks())
+        if not fix.is_sure:
+            return none, state
+        track, matches = self.tracker.start(fix.pose, fix.covariance, landmarks)
+        if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track):
+            return none, state
+        answer = _answer(track, matches, len(landmarks), X_OH, time)
+        return answer, UnitState(answer, track, Submap.empty(X_OH), ignored=state.ignored, losses=state.losses)
+
+
+def _answer(track: TrackState, matches: Matches, detected: int, X_OH: Array, time: float) -> Localization:
+    matched = len(matches.pairs) if matches.is_fused else 0
+    return Localization(
+        time, X_OH, track.pose, track.pose_covariance, TRACKING, detected, matched, matches.nis, track.range_bias
+    )
+
+
+_PARTS = {
+    "answer": codec_of(Localization.unknown()),
+    "track": codec_of(TrackState.none()),
+    "submap": codec_of(Submap.empty()),
+    "tried_at": codec_of(np.zeros(2)),
+    "ignored": codec_of(0),
+    "losses": codec_of(0),
+}
+
+
+def _encode(state: UnitState) -> dict[str, np.ndarray]:
+    return {
+        f"{name}.{part}": array
+        for name, codec in _PARTS.items()
+        for part, array in codec.encode(getattr(state, name)).items()
+    }
+
+
+def _decode(arrays: Mapping[str, np.ndarray]) -> UnitState:
+    groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _PARTS}
+    for key, array in arrays.items():
+        name, _, part = key.partition(".")
+        groups[name][part] = array
+    return UnitState(**{name: codec.decode(groups[name]) for name, codec in _PARTS.items()})
+
+
+UNIT_STATE_CODEC = Codec(_encode, _decode)
+"""How a `UnitState` becomes arrays, and back: for the ``codecs`` of a `SlowPart`."""
