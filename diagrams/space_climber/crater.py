@@ -7,6 +7,9 @@ The world differs from the map, see `differing`: its ground is rough, its fricti
 Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
 that no heading counts as passable which only is with good luck. Among boulders a decimeter decides; so each heading can
 be tried from several samples of the belief, of which the worst counts.
+
+``python -m vtbdrake_diagrams.space_climber.crater`` draws h over a fine grid of headings (Figure 6), and compares a
+continuous search with it.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
+import click
 import numpy as np
 from pydrake.systems.analysis import SimulatorStatus
 
@@ -24,6 +28,7 @@ from vtbdrake.reasoning import Budget, Decision, Reasoner
 from vtbdrake.rollout import RolloutResult, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.plots import mark_best
 from vtbdrake_diagrams.space_climber.crater_scenario import PASSED, CraterScenario
 
 HEADING = "u.heading"
@@ -128,13 +133,13 @@ def _uncertain_mass(believed: np.ndarray, rng: np.random.Generator) -> np.ndarra
     return believed * rng.uniform(*MASS_RANGE)
 
 
-def heading_problem(scenario: CraterScenario) -> vtb.Problem:
+def heading_problem(scenario: CraterScenario, *, horizon: float = HORIZON) -> vtb.Problem:
     """Return problem (18) over the heading in the mental copy of a scenario, from its own start, for the landscape."""
     return vtb.Problem(
         scenario=scenario.mental(),
         parameters=[vtb.Parameter(HEADING, -LIMIT, LIMIT)],
         quality=vtb.Quality(elevation, of=ELEVATION),
-        horizon=HORIZON,
+        horizon=horizon,
         sample_period=SAMPLE_PERIOD,
     )
 
@@ -265,3 +270,36 @@ def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
         decision = expedition.decide(reasoner)
     promising = decision.chosen is not None and all(map(passes, decision.candidates[decision.chosen].rollouts))
     return Case(seed, decision, expedition.climb(float(decision.values[HEADING])) if promising else None)
+
+
+@click.command()
+@click.option("--seed", default=0, show_default=True, help="Of the crater.")
+@click.option("--step", default=1.5, show_default=True, help="Of the grid of headings, in deg.")
+@click.option("--candidates", default=24, show_default=True, help="How many headings the continuous search tries.")
+@click.option("--horizon", default=HORIZON, show_default=True, help="Of every rollout, in s.")
+@click.option("--figure", default="headings.png", show_default=True, help="File of the picture.")
+def main(seed: int, step: float, candidates: int, horizon: float, figure: str) -> None:
+    """Draw h over the heading in the robot's model of a crater, and search continuously with CEM."""
+    degrees = np.degrees(LIMIT)
+    sweep = heading_problem(model(seed), horizon=horizon).sweep(round(2.0 * degrees / step) + 1, progress=False)
+    passable = [f"{np.degrees(r.parameters[HEADING]):g}" for r in sweep.rollouts if passes(r)]
+    click.echo(f"crater {seed}: {len(passable)} of {len(sweep)} headings pass the rim: {', '.join(passable)} deg")
+    for method in ("grid", "CEM"):
+        count = HEADINGS.size if method == "grid" else candidates
+        case = decide_and_climb(seed, difference=seed, method=method, candidates=count, horizon=horizon)
+        heading = float(case.decision.values[HEADING])
+        ended = "no way seen" if case.climb is None else f"the rim reached in the world: {case.climb.reached}"
+        click.echo(
+            f"{method}, {count} headings: {np.degrees(heading):.1f} deg, h = {case.decision.quality:.3f} m, {ended}"
+        )
+        if method == "CEM":
+            picture = sweep.plot()
+            mark_best(picture.axes[0], heading, float(case.decision.quality), text="found by CEM", size=12)
+            picture.savefig(figure, dpi=110)
+
+
+if __name__ == "__main__":
+    # Under its own name, so that worker processes find its functions.
+    from vtbdrake_diagrams.space_climber.crater import main as program
+
+    program(prog_name="python -m vtbdrake_diagrams.space_climber.crater")

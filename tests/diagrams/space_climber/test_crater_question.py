@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from vtbdrake.rollout import RolloutRunner
 from vtbdrake_diagrams.space_climber import CraterScenario
@@ -25,6 +26,7 @@ from vtbdrake_diagrams.space_climber.crater import (
     elevation,
     heading_problem,
     heading_reasoner,
+    main,
     model,
 )
 
@@ -71,3 +73,13 @@ def test_a_mental_robot_walks_in_the_direction_of_its_heading() -> None:
         way = pose[-1, :2] - pose[len(pose) // 2, :2]
         assert np.arctan2(way[1], way[0]) == pytest.approx(angle, abs=0.1)
         assert np.hypot(*way) == pytest.approx(0.19 * 6.0, rel=0.15)
+
+
+def test_the_landscape_is_drawn_beside_a_continuous_search(tmp_path) -> None:
+    figure = tmp_path / "headings.png"
+    options = ["--step", "45", "--candidates", "3", "--horizon", "4", "--figure", str(figure)]
+    result = CliRunner().invoke(main, options, catch_exceptions=False)
+    assert "0 of 3 headings pass the rim" in result.output
+    assert "CEM, 3 headings" in result.output
+    assert "no way seen" in result.output
+    assert figure.stat().st_size > 10_000
