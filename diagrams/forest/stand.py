@@ -3,12 +3,13 @@
 Plots near Evo in Finland had 605 to 1,210 stems per hectare with diameters of 6 to 41 cm, whose standard deviation was
 3.3 to 8.7 cm within a plot, and heights of 4 to 27 m (Liang and Hyyppä, "Automatic Stem Mapping by Merging Several
 Terrestrial Laser Scans at the Feature and Decision Levels", Sensors 13, 2013). The defaults lie in these ranges. The
-rest is assumed: the distribution of the diameters, the least distance of two trees, the curve of the heights, and the
-kinds of errors that a map has.
+rest is assumed: the distribution of the diameters, the least distance of two trees, the sizes of clusters and the
+distances of rows, the curve of the heights, and the kinds of errors that a map has.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import exp, pi
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
+from vtbdrake_diagrams.forest.routes import Route, strip_roads
 
 Array = NDArray[np.float64]
 
@@ -29,6 +31,16 @@ _NAESLUND = (1.2, 0.19)
 
 # Random sequential placement of discs ends at a coverage of 0.547; the last per cent take ever more attempts.
 _LARGEST_COVERAGE = 0.45
+
+KINDS = ("natural", "clustered", "plantation")
+"""How the trees of a stand stand."""
+
+# Of a clustered stand: clusters per hectare, and their radius in m.
+_CLUSTERS, _CLUSTER_RADIUS = 60.0, 6.0
+# Of a plantation: the distance of the rows in m, and how far trees are off their places, per axis, in m.
+_ROWS, _JITTER = 2.5, 0.15
+# Attempts to place one tree.
+_ATTEMPTS = 10_000
 
 # Waves that add up to a field of correlated errors.
 _WAVES = 400
@@ -64,6 +76,8 @@ class MapErrors:
 ACCURATE = MapErrors(position=0.10)
 REMOTE = MapErrors(position=0.35, missing=0.3, wrong=0.1, diameter=0.2)
 POOR = MapErrors(position=0.7, missing=0.3, wrong=0.1, diameter=0.2, correlation=40.0)
+MAPS = {"exact": MapErrors(position=0.0, diameter=0.0), "accurate": ACCURATE, "remote": REMOTE, "poor": POOR}
+"""The errors of maps by the names that scenarios use."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +86,23 @@ class Stand:
 
     Diameters follow a Weibull distribution that is cut off at the least and the largest diameter. Positions are those
     of a hard-core process: trees are placed at random one after the other, and a place too close to an earlier tree is
-    given up.
+    given up. In a ``natural`` stand all places are equally likely. In a ``clustered`` one, they lie in discs around
+    points that are placed at random: a Matérn cluster process (Matérn, "Spatial Variation", 1960) with a hard core. In
+    a ``plantation``, trees stand in rows along x, 2.5 m apart, nearly where they were planted.
 
     Attributes:
-        seed: Determines trees and maps.
+        seed: Determines trees, roads and maps.
         length: Extent along x in m.
         width: Extent along y in m.
-        density: Trees per hectare.
-        spacing: The least distance of two trees in m.
+        density: Trees per hectare, before roads are cleared.
+        spacing: The least distance of two trees in m; a plantation has its own.
         diameter_scale: Scale of the Weibull distribution of trunk diameters in m.
         diameter_shape: Its shape; 1 is an exponential distribution, 3.6 nearly a normal one.
         least_diameter: The least trunk diameter in m.
         largest_diameter: The largest trunk diameter in m.
+        kind: ``natural``, ``clustered`` or ``plantation``.
+        road_width: Width of the strip roads in m, which are free of trees; 0 for a stand without roads.
+        road_spacing: Distance of the strip roads in m, see `strip_roads`.
     """
 
     seed: int = 0
@@ -95,14 +114,23 @@ class Stand:
     diameter_shape: float = 2.5
     least_diameter: float = 0.06
     largest_diameter: float = 0.41
+    kind: str = "natural"
+    road_width: float = 0.0
+    road_spacing: float = 28.0
 
     def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"a stand is {', '.join(KINDS)}, not {self.kind!r}")
+        if not 0.0 <= self.road_width <= 8.0:
+            raise ValueError(f"strip roads are at most 8 m wide (0: no roads), not {self.road_width:g} m")
         if not min(self.length, self.width, self.density, self.diameter_scale, self.diameter_shape) > 0.0:
             raise ValueError("length, width, density, and scale and shape of the diameters of a stand are positive")
         if not 0.0 < self.least_diameter < self.largest_diameter:
             raise ValueError(
                 f"diameters lie between {self.least_diameter} and {self.largest_diameter} m: no such range"
             )
+        if self.kind == "plantation":
+            return
         coverage = self.density / HECTARE * pi * self.spacing**2 / 4.0
         if self.spacing < 0.0 or coverage > _LARGEST_COVERAGE:
             largest = 2.0 * (_LARGEST_COVERAGE * HECTARE / self.density / pi) ** 0.5
@@ -113,8 +141,23 @@ class Stand:
 
     @property
     def count(self) -> int:
-        """The number of trees."""
+        """The number of trees before roads are cleared."""
+        if self.kind == "plantation":
+            rows, columns = self._rows
+            return rows * columns
         return round(self.density * self.length * self.width / HECTARE)
+
+    @property
+    def _rows(self) -> tuple[int, int]:
+        """The numbers of rows of a plantation, and of trees in each row."""
+        rows = max(1, round(self.width / _ROWS))
+        return rows, max(1, round(self.density * self.length * self.width / HECTARE / rows))
+
+    def routes(self) -> tuple[Route, ...]:
+        """Return the routes along the strip roads; none without roads."""
+        if self.road_width == 0.0:
+            return ()
+        return strip_roads(self.length, self.width, spacing=self.road_spacing, seed=self.seed)
 
     def diameters(self, uniform: Array) -> Array:
         """Return the diameters (m), (n,), at which the distribution has the probabilities ``uniform`` (n,)."""
@@ -127,11 +170,14 @@ class Stand:
     def trees(self) -> WorldModel:
         """Return the trees as they are: exact positions, trunk diameters and heights in m."""
         rng = np.random.default_rng([self.seed, _TREES])
-        places = self._places(rng)
+        places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
         diameters = self.diameters(rng.random(self.count))
+        free = np.full(len(places), np.inf)
+        for route in self.routes():
+            free = np.minimum(free, route.distances(places))
         objects = (
-            _tree(f"tree-{k}", place, diameter, source=f"stand {self.seed}")
-            for k, (place, diameter) in enumerate(zip(places, diameters, strict=True))
+            _tree(f"tree-{k}", places[k], diameters[k], source=f"stand {self.seed}")
+            for k in np.flatnonzero(free > 0.5 * (self.road_width + diameters))
         )
         return WorldModel(objects)
 
@@ -147,31 +193,83 @@ class Stand:
         """
         rng = np.random.default_rng([self.seed, _MAP, seed])
         truth = tuple(self.trees())
-        kept = rng.permutation(self.count)[: self.count - round(errors.missing * self.count)]
-        false = round(len(kept) * errors.wrong / (1.0 - errors.wrong))
-        places = np.array([truth[k].p_WoOo_W[:2] for k in kept]).reshape(-1, 2)
-        places += errors.position * _field(rng, places, errors.correlation)
-        places = np.vstack([places, rng.random((false, 2)) * [self.length, self.width]])
-        diameters = np.concatenate(
-            [[truth[k].number("trunk_diameter", unit="m") for k in kept], self.diameters(rng.random(false))]
+        places, diameters = surveyed(
+            rng,
+            np.array([one.p_WoOo_W[:2] for one in truth]).reshape(-1, 2),
+            np.array([one.number("trunk_diameter", unit="m") for one in truth]),
+            errors=errors,
+            area=(self.length, self.width),
+            false_diameters=self.diameters,
         )
-        # An error of several deviations must not make a diameter negative.
-        measured = diameters * np.maximum(1.0 + errors.diameter * rng.normal(size=len(diameters)), 0.1)
-        order = rng.permutation(len(places))
         return WorldModel(
-            _tree(f"map-{k}", places[row], measured[row], errors=errors, source=f"map {seed} of stand {self.seed}")
-            for k, row in enumerate(order)
+            _tree(f"map-{k}", place, diameter, errors=errors, source=f"map {seed} of stand {self.seed}")
+            for k, (place, diameter) in enumerate(zip(places, diameters, strict=True))
         )
 
     def _places(self, rng: np.random.Generator) -> Array:
+        """Return places of a hard-core process, (count, 2)."""
+        size = np.array([self.length, self.width])
+        clusters = round(_CLUSTERS * self.length * self.width / HECTARE) if self.kind == "clustered" else 0
+        parents = rng.random((clusters, 2)) * size
         places = np.empty((self.count, 2))
-        filled = 0
+        filled = attempts = 0
         while filled < self.count:
-            place = rng.random(2) * [self.length, self.width]
+            place = self._beside(parents, rng) if clusters else rng.random(2) * size
             if not filled or np.min(np.sum((places[:filled] - place) ** 2, axis=1)) >= self.spacing**2:
                 places[filled] = place
-                filled += 1
+                filled, attempts = filled + 1, 0
+            attempts += 1
+            if attempts > _ATTEMPTS:
+                raise ValueError(
+                    f"{self.density:g} trees/ha find no place in clusters {self.spacing:g} m apart: reduce one of them"
+                )
         return places
+
+    def _beside(self, parents: Array, rng: np.random.Generator) -> Array:
+        """Return a place (2,) of a cluster that lies in the stand."""
+        while True:
+            away, towards = _CLUSTER_RADIUS * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * pi)
+            place: Array = parents[rng.integers(len(parents))] + away * np.array([np.cos(towards), np.sin(towards)])
+            if (place >= 0.0).all() and (place <= [self.length, self.width]).all():
+                return place
+
+    def _planted(self, rng: np.random.Generator) -> Array:
+        """Return the places of a plantation, row by row, (count, 2)."""
+        rows, columns = self._rows
+        x = self.length * (np.arange(columns) + 0.5) / columns
+        y = self.width * (np.arange(rows) + 0.5) / rows
+        grid = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
+        return np.clip(grid + _JITTER * rng.normal(size=grid.shape), 0.0, [self.length, self.width])
+
+
+def surveyed(
+    rng: np.random.Generator,
+    places: Array,
+    diameters: Array,
+    *,
+    errors: MapErrors,
+    area: tuple[float, float],
+    false_diameters: Callable[[Array], Array],
+) -> tuple[Array, Array]:
+    """Return places (m, 2) and diameters (m,) as a survey with errors gives them, in random order.
+
+    Args:
+        rng: Of the survey.
+        places: x and y of what is there in m, shape (n, 2).
+        diameters: In m, shape (n,).
+        errors: What is wrong with the survey.
+        area: Extents in x and y in m, from 0 on, in which there are entries for nothing.
+        false_diameters: Gives the diameters of those in m from numbers that are uniform in [0, 1).
+    """
+    kept = rng.permutation(len(places))[: len(places) - round(errors.missing * len(places))]
+    false = round(len(kept) * errors.wrong / (1.0 - errors.wrong))
+    found = places[kept] + errors.position * _field(rng, places[kept], errors.correlation)
+    found = np.vstack([found, rng.random((false, 2)) * area])
+    sizes = np.concatenate([diameters[kept], false_diameters(rng.random(false))])
+    # An error of several deviations must not make a diameter negative.
+    measured = sizes * np.maximum(1.0 + errors.diameter * rng.normal(size=len(sizes)), 0.1)
+    order = rng.permutation(len(found))
+    return found[order], measured[order]
 
 
 def tree_height(diameter: float) -> float:

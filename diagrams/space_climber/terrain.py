@@ -34,12 +34,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common import MemoryFile
-from pydrake.geometry import Box, Convex, InMemoryMesh, Mesh, ProximityProperties
+from pydrake.geometry import Box, Convex, Mesh, ProximityProperties
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial import Delaunay
 from scipy.special import ndtr
+
+from vtbdrake.components.meshes import obj_mesh
 
 Array = NDArray[np.float64]
 
@@ -257,7 +258,9 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
         top = vertices[triangle]
         X_WT, prism = _prism(top)
         plant.RegisterCollisionGeometry(world, X_WT, prism, f"ground_{k}", default)
-    plant.RegisterVisualGeometry(world, RigidTransform(), Mesh(_surface(vertices, triangles), 1.0), "ground", _GREY)
+    plant.RegisterVisualGeometry(
+        world, RigidTransform(), Mesh(obj_mesh(vertices, triangles, name="terrain"), 1.0), "ground", _GREY
+    )
     for k, block in enumerate(crater.blocks):
         X_WB = RigidTransform(RollPitchYaw(block.rpy), [block.x, block.y, float(crater.height(block.x, block.y))])
         plant.RegisterCollisionGeometry(world, X_WB, Box(*block.size), f"boulder_{k}", default)
@@ -269,16 +272,5 @@ def _prism(top: Array) -> tuple[RigidTransform, Convex]:
     center = top.mean(axis=0)
     upper = top - center
     lower = upper - [0.0, 0.0, _THICKNESS]
-    faces = [(1, 2, 3), (6, 5, 4), (1, 4, 5, 2), (2, 5, 6, 3), (3, 6, 4, 1)]
-    return RigidTransform(center), Convex(_obj(np.vstack([upper, lower]), faces), 1.0)
-
-
-def _surface(vertices: Array, triangles: NDArray[np.int64]) -> InMemoryMesh:
-    return _obj(vertices, (triangles + 1).tolist())
-
-
-def _obj(vertices: Array, faces: list[tuple[int, ...]] | list[list[int]]) -> InMemoryMesh:
-    """Return a mesh in Wavefront's format; its faces count vertices from 1."""
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
-    lines += ["f " + " ".join(map(str, face)) for face in faces]
-    return InMemoryMesh(mesh_file=MemoryFile("\n".join(lines) + "\n", ".obj", "terrain"))
+    faces = [(0, 1, 2), (5, 4, 3), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0)]
+    return RigidTransform(center), Convex(obj_mesh(np.vstack([upper, lower]), faces, name="terrain"), 1.0)

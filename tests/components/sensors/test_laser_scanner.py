@@ -116,6 +116,17 @@ def at(x: float) -> RigidTransform:
     return RigidTransform([x, 0.0, 0.0])
 
 
+def test_beams_turn_together() -> None:
+    """Column by column: the elevation changes from ray to ray, the azimuth from column to column."""
+    (scan,) = world(wall(), config=replace(CONFIG, rows=4)).scans(0.2, X_WT=at(4.5))
+    assert raster_size(replace(CONFIG, rows=4)) == (4, 250)
+    x, y, z = scan.directions_L.reshape(250, 4, 3).T
+    np.testing.assert_allclose(np.arcsin(z), np.tile([[0.15], [0.05], [-0.05], [-0.15]], 250), atol=1e-9)
+    left = 0.6 * ((np.arange(250) + 0.5) / 250 - 0.5)
+    np.testing.assert_allclose(np.arctan2(y, x), np.tile(left, (4, 1)), atol=1e-9)
+    np.testing.assert_allclose(scan.points()[:, 0], 4.0, atol=EXACT)
+
+
 def test_scan_is_the_raster_on_a_wall() -> None:
     (scan,) = world(wall()).scans(0.2, X_WT=at(4.5))
     # 1000 rays: 26 rows with 38 rays each.

@@ -47,6 +47,41 @@ def test_defaults_lie_in_the_ranges_of_published_plots() -> None:
         assert min(heights) > 4.0 and max(heights) < 27.0
 
 
+def test_trees_of_a_clustered_stand_have_more_neighbours() -> None:
+    """By Ripley's K: natural stands have fewer neighbours within 3 m than chance, because of the spacing."""
+    neighbours = {}
+    for kind in ("natural", "clustered"):
+        stand = Stand(seed=1, kind=kind)
+        places = stand.trees().positions()
+        assert len(places) == 800 and pdist(places).min() >= stand.spacing
+        neighbours[kind] = 2.0 * (pdist(places) < 3.0).sum() / 800
+    by_chance = 0.08 * np.pi * 9.0
+    assert 0.7 * by_chance < neighbours["natural"] < by_chance
+    assert neighbours["clustered"] > 1.3 * by_chance
+
+
+def test_trees_of_a_plantation_stand_in_rows() -> None:
+    stand = Stand(seed=2, length=60.0, width=50.0, kind="plantation", density=1000.0)
+    places = stand.trees().positions()
+    assert len(places) == stand.count == 300
+    rows = places[:, 1] / 2.5 - 0.5
+    assert set(np.round(rows).tolist()) == set(range(20))
+    assert 2.5 * np.std(rows - np.round(rows)) == pytest.approx(0.15, rel=0.15)
+    gaps = np.diff(np.sort(places[np.round(rows) == 7, 0]))
+    assert gaps.mean() == pytest.approx(4.0, rel=0.05) and gaps.std() < 0.4
+
+
+def test_strip_roads_are_free_of_trees() -> None:
+    stand = Stand(seed=3, road_width=4.0)
+    trees = stand.trees()
+    for route in stand.routes():
+        assert (route.distances(trees.positions()[:, :2]) - 0.5 * diameters(trees)).min() > 2.0
+    # The other trees are those of the stand without roads, and the map has what is left.
+    everything = {tuple(p) for p in Stand(seed=3).trees().positions().tolist()}
+    assert {tuple(p) for p in trees.positions().tolist()} < everything
+    assert len(stand.map(ACCURATE)) == len(trees) > 0.7 * 800
+
+
 def test_seed_determines_the_stand() -> None:
     stand = Stand(seed=4, length=20.0)
     assert np.array_equal(stand.trees().positions(), stand.trees().positions())
@@ -112,6 +147,9 @@ def test_heights_are_plausible() -> None:
         ),
         (lambda: Stand(length=0.0), "are positive"),
         (lambda: Stand(least_diameter=0.5), "no such range"),
+        (lambda: Stand(kind="jungle"), "a stand is natural, clustered, plantation, not 'jungle'"),
+        (lambda: Stand(road_width=9.0), "at most 8 m wide"),
+        (lambda: Stand(kind="clustered", density=1500.0, spacing=1.9, length=30.0).trees(), "no place in clusters"),
         (lambda: MapErrors(position=-0.1), "at least 0"),
         (lambda: MapErrors(position=0.1, wrong=1.0), "shares from 0 to 1"),
     ],

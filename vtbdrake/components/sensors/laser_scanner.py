@@ -62,6 +62,9 @@ class LaserScannerConfig:
     azimuth: float = 0.7
     # Height of the field of view, in rad; 0 scans one row.
     elevation: float = 0.5
+    # Number of beams, one above the other, that turn together about z_L, as those of a spinning scanner; 0 for rows and
+    # columns at about equal angular distances, which are scanned row by row.
+    rows: int = 0
     # Distance below which nothing is reported, in m.
     min_range: float = 0.2
     # Distance at which a white, perpendicular surface is just detected in clear space, in m.
@@ -86,6 +89,10 @@ class LaserScannerConfig:
             "rays_per_second": (self.frequency <= self.rays_per_second < inf, "finite, and at least one ray per scan"),
             "azimuth": (0.0 < self.azimuth <= 2.0 * pi, "in rad, above 0 and at most 2 pi"),
             "elevation": (0.0 <= self.elevation <= pi, "in rad, between 0 and pi"),
+            "rows": (
+                0.0 <= self.rows * self.frequency <= self.rays_per_second and self.rows % 1 == 0,
+                "a whole number of beams, at most that of the rays of a scan",
+            ),
             "min_range": (0.0 < self.min_range < inf, "in m, positive and finite"),
             "max_range": (self.min_range < self.max_range < inf, "in m, finite and above min_range"),
             "reflectivity": (0.0 <= self.reflectivity <= 1.0, "a share between 0 and 1"),
@@ -147,7 +154,8 @@ class LaserScanner(LeafSystem):
 
     ``scan`` is the last complete `Scan`, in the scanner's frame L (x forward, z up), stamped with the time of its end;
     before the first, an empty one, stamped 0. A scan has n rays at equal intervals of 1 / (n frequency), row by row
-    from the top, each row from the right, where rows and columns have about the same angular distance. L starts where
+    from the top, each row from the right, where rows and columns have about the same angular distance. With ``rows``
+    given, there are so many beams, which scan column by column from the right, each column from the top. L starts where
     ``frame`` is on its body B; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of L in B, moves it.
 
     Time goes in slices. At the end of a slice all rays are cast that were fired during it, each at the poses at its own
@@ -174,8 +182,8 @@ class LaserScanner(LeafSystem):
     that is then below min_range is not reported.
 
     The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
-    ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``rows``, ``columns``
-    and ``fired`` (rays) of the present scan are state.
+    ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``scan_rows``,
+    ``scan_columns`` and ``fired`` (rays) of the present scan are state.
     """
 
     __slots__ = NO_DICT
@@ -239,6 +247,7 @@ class LaserScanner(LeafSystem):
             "rays_per_second": ("1/s", (0.0, inf)),
             "azimuth": ("rad", (0.0, 2.0 * pi)),
             "elevation": ("rad", (0.0, pi)),
+            "rows": ("1", (0.0, inf)),
             "min_range": ("m", (0.0, inf)),
             "max_range": ("m", (0.0, inf)),
             "reflectivity": ("1", (0.0, 1.0)),
@@ -264,7 +273,7 @@ class LaserScanner(LeafSystem):
         self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
         self.codecs = {int(self._progress): _PROGRESS_CODEC}
         # Of the present scan; without rows, none has begun.
-        names = {"scan_start": "s", "scan_period": "s", "rows": "1", "columns": "1", "fired": "1"}
+        names = {"scan_start": "s", "scan_period": "s", "scan_rows": "1", "scan_columns": "1", "fired": "1"}
         self._present = int(self.DeclareDiscreteState(len(names)))
         self.DeclareStateOutputPort("scan", self._scan)
         return tuple(
@@ -305,7 +314,9 @@ class LaserScanner(LeafSystem):
             rays = rows * columns
             due = min(rays, int((now + _ROUNDING - start) / period * rays + 0.5))
             if due > fired:
-                directions = raster(rows, columns, settings.config.azimuth, settings.config.elevation)[fired:due]
+                config = settings.config
+                rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=config.rows > 0)
+                directions = rays_L[fired:due]
                 times = (np.arange(fired, due) + 0.5) * (period / rays)
                 kept, ranges = self._fire(context, settings, generator, directions, times + (start - now))
                 slices = (*slices, np.column_stack((directions[kept], ranges, times[kept])))
@@ -383,14 +394,14 @@ def connect_laser_scanner(
 
 
 def raster_size(config: LaserScannerConfig) -> tuple[int, int]:
-    """Return the numbers of rows and columns of a scan, whose angular distances are about equal."""
+    """Return the numbers of rows and columns of a scan: as many rows as given, or at about equal angular distances."""
     rays = config.rays_per_second / config.frequency
-    rows = max(1, round(sqrt(rays * config.elevation / config.azimuth)))
+    rows = int(config.rows) or max(1, round(sqrt(rays * config.elevation / config.azimuth)))
     return rows, max(1, round(rays / rows))
 
 
 @lru_cache(16)
-def raster(rows: int, columns: int, azimuth: float, elevation: float) -> Array:
+def raster(rows: int, columns: int, azimuth: float, elevation: float, *, by_columns: bool = False) -> Array:
     """Return the directions of a scan's rays in the order in which they are fired, read-only, shape (rows columns, 3).
 
     Args:
@@ -398,10 +409,14 @@ def raster(rows: int, columns: int, azimuth: float, elevation: float) -> Array:
         columns: Number of rays in each row, which follow each other from the right.
         azimuth: Width of the field of view about z, in rad.
         elevation: Its height, in rad.
+        by_columns: Whether all rays of a column are fired before those of the next, instead of row by row.
     """
     up = elevation * (0.5 - (np.arange(rows) + 0.5) / rows)
     left = azimuth * ((np.arange(columns) + 0.5) / columns - 0.5)
-    up, left = np.repeat(up, columns), np.tile(left, rows)
+    if by_columns:
+        up, left = np.tile(up, columns), np.repeat(left, rows)
+    else:
+        up, left = np.repeat(up, columns), np.tile(left, rows)
     directions = np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
     directions.flags.writeable = False
     return directions

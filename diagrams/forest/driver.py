@@ -1,0 +1,122 @@
+"""The driver of the carrier, who follows the route that the localization unit advises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, hypot, sin
+
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+
+from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake_diagrams.forest.carrier import rotation_matrix
+from vtbdrake_diagrams.forest.routes import Route
+
+# The driver looks so far ahead along the route, in m, and looks for the route again if it is farther away than this.
+_LOOK_AHEAD, _LOST = 3.0, 2.5
+# Two routes are the same road where they are nearer to each other than this, in m.
+_SAME_ROAD = 0.2
+
+
+class Driver(LeafSystem):
+    """A driver who follows the advised route as a human does who sees the road: by the true pose.
+
+    .. pydrake_system::
+
+        name: Driver
+        input_ports:
+        - state
+        - route
+        output_ports:
+        - controls
+
+    ``state`` is the plant's [q; v], ``route`` the number of the advised route. ``controls``, the speed (m/s) and the
+    curvature (1/m, to the left) of the path of the middle of the rear axle, are those of pure pursuit: of the circle
+    through a point some metres ahead on the route (Coulter, "Implementation of the pure pursuit path tracking
+    algorithm", CMU-RI-TR-92-01, 1992).
+
+    The driver takes the advised route at once if it is the same road here as the present one, and otherwise when it is
+    (all `strip_roads` begin alike). After ``laps`` rounds, the driver stops.
+
+    The driver is sampled. State: ``route``, the way ``along`` it (m), ``lap``, and the controls.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        body: RigidBody,
+        routes: Sequence[Route],
+        *,
+        wheel_base: float,
+        period: float,
+        speed: float,
+        laps: int,
+        route: int = 0,
+        along: float = 0.0,
+    ) -> None:
+        """Declare the driver.
+
+        Args:
+            plant: The finalized plant.
+            body: The carrier's body B.
+            routes: The routes by number.
+            wheel_base: Distance of the carrier's axles in m.
+            period: Sample period in s.
+            speed: The speed at which the driver drives, in m/s.
+            laps: The number of rounds after which the driver stops.
+            route: The number of the route on which the drive begins.
+            along: How far along this route it begins, in m.
+        """
+        super().__init__()
+        self._routes, self._laps, self._rear = tuple(routes), int(laps), wheel_base / 2.0
+        self._q = body.floating_positions_start()
+        self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._advice = self.DeclareVectorInputPort("route", 1)
+        progress = int(self.DeclareDiscreteState([float(route), along, 0.0]))
+        controls = DiscreteStateIndex(self.DeclareDiscreteState(2))
+        self.DeclareStateOutputPort("controls", controls)
+        self.DeclareNumericParameter(BasicVector([speed]))
+        self.variables = (
+            discrete_state("route", progress, bounds=(0.0, len(self._routes) - 1.0)),
+            discrete_state("along", progress, start=1, unit="m"),
+            discrete_state("lap", progress, start=2),
+            discrete_state("wanted_speed", int(controls), unit="m/s"),
+            discrete_state("wanted_curvature", int(controls), start=1, unit="1/m"),
+            parameter("speed", 0, unit="m/s", bounds=(0.0, 3.0)),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        number, along, lap = context.get_discrete_state(0).value().tolist()
+        x = self._state.Eval(context)[self._q : self._q + 7]
+        forward = rotation_matrix(x[:4])[:2, 0]
+        forward = forward / hypot(*forward.tolist())
+        place = x[4:6] - self._rear * forward
+
+        number = self._chosen(int(number), along, self._advice.Eval(context).item(0))
+        route = self._routes[number]
+        heading = route.heading(along)
+        off = place - route.position(along)
+        if hypot(*off.tolist()) > _LOST:
+            along = route.nearest(place)
+        else:
+            along += float(off @ (cos(heading), sin(heading)))
+        if along >= route.length:
+            along, lap = along - route.length, lap + 1.0
+        ahead = route.position(along + _LOOK_AHEAD) - place
+        sideways = forward[0] * ahead[1] - forward[1] * ahead[0]
+        speed = 0.0 if lap >= self._laps else context.get_numeric_parameter(0).value().item()
+        state.set_value(0, [number, along, lap])
+        state.set_value(1, [speed, 2.0 * float(sideways) / float(ahead @ ahead)])
+
+    def _chosen(self, present: int, along: float, advised: float) -> int:
+        """Return the number of the route to follow from here."""
+        number = min(max(round(advised), 0), len(self._routes) - 1)
+        if number == present:
+            return present
+        apart = self._routes[number].position(along) - self._routes[present].position(along)
+        return number if hypot(*apart.tolist()) < _SAME_ROAD else present

@@ -1,0 +1,277 @@
+"""The testbeds of the localization unit: a carrier with a laser scanner in a forest."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import PassThrough
+
+from vtbdrake.components.sensors import ErrorModel, Imu
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
+from vtbdrake.components.world_model import WorldModel, load_geojson
+from vtbdrake.scan import Scan
+from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.routes import Route
+from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
+from vtbdrake_diagrams.forest.vegetation import Vegetation
+
+PERIOD = 0.02
+"""The period of IMU, odometry and driver in s."""
+
+
+def plant_config() -> MultibodyPlantConfig:
+    """Return the configuration of the plant: discrete, as the wheels are stepped with it."""
+    return MultibodyPlantConfig(time_step=0.01, discrete_contact_approximation="sap", use_sampled_output_ports=False)
+
+
+def scanner_config() -> LaserScannerConfig:
+    """Return a scanner with 16 beams over 30 deg that turns five times per second and fires 20,000 rays per turn."""
+    return LaserScannerConfig(
+        frequency=5.0,
+        rays_per_second=100_000.0,
+        azimuth=2.0 * np.pi,
+        elevation=np.radians(30.0),
+        rows=16,
+        min_range=0.5,
+        max_range=50.0,
+    )
+
+
+@dataclass
+class CarrierScenario(Scenario):
+    """A carrier with scanner, IMU and wheel odometry drives on routes among landmarks.
+
+    The driver follows the route that the DPS advises, which the command ``u.route`` sets. The true pose of the carrier
+    is ``sim.sys.carrier.base.pose``.
+    """
+
+    plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
+    # Determines landmarks, ground, roads, clutter and map.
+    seed: int = 0
+    # The area is from (0, 0) to (length, width), in m.
+    length: float = 100.0
+    width: float = 100.0
+    # Acceleration of free fall in m/s^2.
+    gravity: float = 9.81
+    # Standard deviations of the heights of hills and bumps in m, see `Ground`.
+    relief: float = 0.8
+    bumps: float = 0.04
+    # The global map of the DPS: exact, accurate, remote or poor, see `MAPS`; its errors have a seed of their own.
+    map: str = "accurate"
+    map_seed: int = 0
+    # A GeoJSON file to take the global map from instead; empty for none.
+    map_file: str = ""
+    # The laser scanner, and the errors of its ranges in m.
+    scanner: LaserScannerConfig = field(default_factory=scanner_config)
+    scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
+    # Height of the scanner over the ground in m, its distance in front of the middle of the carrier in m, and its tilt
+    # towards the ground in deg.
+    scanner_height: float = 2.0
+    scanner_forward: float = 0.9
+    scanner_tilt_deg: float = 0.0
+    # Errors of the IMU: noise, bias and drift are those of gyros (rad/s) and accelerometers (m/s^2) alike.
+    imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=2e-3, bias=5e-4, drift=1e-5))
+    # Errors of the wheels' speed in m/s, and by which factor it is wrong.
+    odometry_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
+    odometry_scale: float = 1.01
+    # The drive: speed in m/s, the route on which it begins and that is advised at first, how far along it in m, and the
+    # number of rounds after which the driver stops.
+    speed: float = 1.0
+    route: int = 0
+    start: float = 0.0
+    laps: int = 100
+
+    def validate(self) -> None:
+        super().validate()
+        self.require(
+            plant_config=(self.plant_config.time_step > 0.0, "of a discrete plant, as the wheels are stepped with it"),
+            seed=(self.seed >= 0, "not negative"),
+            gravity=(self.gravity > 0.0, "positive, in m/s^2"),
+            map=(self.map in MAPS, f"one of {', '.join(MAPS)}"),
+            map_seed=(self.map_seed >= 0, "not negative"),
+            scanner_height=(1.3 <= self.scanner_height <= 6.0, "within [1.3, 6] m: over the carrier's roof"),
+            scanner_forward=(abs(self.scanner_forward) <= 1.25, "within [-1.25, 1.25] m: on the carrier"),
+            scanner_tilt_deg=(abs(self.scanner_tilt_deg) <= 45.0, "within [-45, 45] deg"),
+            odometry_scale=(0.5 <= self.odometry_scale <= 2.0, "within [0.5, 2]"),
+            speed=(0.0 <= self.speed <= 3.0, "within [0, 3] m/s"),
+            start=(self.start >= 0.0, "not negative, in m"),
+            laps=(self.laps >= 1, "at least 1"),
+        )
+        try:
+            self.ground()
+            for name in ("scanner_errors", "imu_errors", "odometry_errors"):
+                getattr(self, name).check(f"{type(self).__name__}.{name}")
+            routes = self.routes()
+        except ValueError as error:
+            raise ScenarioError(f"{type(self).__name__}: {error}") from None
+        self.require(route=(0 <= self.route < len(routes), f"the number of one of {len(routes)} routes, from 0 on"))
+
+    def ground(self) -> Ground:
+        """Return the ground."""
+        return Ground(self.seed, relief=self.relief, bumps=self.bumps)
+
+    @property
+    def X_BL(self) -> RigidTransform:
+        """The pose of the scanner L on the carrier B."""
+        tilt = RollPitchYaw(0.0, np.radians(self.scanner_tilt_deg), 0.0)
+        return RigidTransform(tilt, [self.scanner_forward, 0.0, self.scanner_height])
+
+    @abstractmethod
+    def routes(self) -> tuple[Route, ...]:
+        """Return the routes by number."""
+
+    @abstractmethod
+    def truth(self) -> WorldModel:
+        """Return the landmarks as they are."""
+
+    @abstractmethod
+    def surveyed_map(self) -> WorldModel:
+        """Return the map of the landmarks that ``map`` and ``map_seed`` describe."""
+
+    @abstractmethod
+    def add_landscape(self, plant: MultibodyPlant) -> None:
+        """Add ground, landmarks and clutter to a plant that is not finalized."""
+
+    def global_map(self) -> WorldModel:
+        """Return the map that the DPS has: that of ``map_file``, or a survey with errors.
+
+        Raises:
+            GeoJsonError: The file is no map.
+        """
+        return load_geojson(self.map_file) if self.map_file else self.surveyed_map()
+
+    def interface(self) -> Interface:
+        last = len(self.routes()) - 1.0
+        return Interface(
+            sense=[
+                Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency),
+                Signal("imu", size=6, unit="rad/s, m/s^2", lower=-50.0, upper=50.0, max_age=5 * PERIOD),
+                Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD),
+            ],
+            act=[Signal("route", size=1, lower=0.0, upper=last, idle=float(self.route))],
+            commands=[Signal("route", size=1, lower=0.0, upper=last, default=float(self.route))],
+        )
+
+    def make_dps(self) -> Diagram:
+        """Return a DPS that advises the commanded route, whatever its sensors say."""
+        builder = DiagramBuilder()
+        for signal in self.interface().sense:
+            value = signal.abstract_value() if signal.name == "scan" else None
+            sink = PassThrough(value) if value is not None else PassThrough(signal.size)
+            builder.AddNamedSystem(signal.name, sink)
+            builder.ExportInput(sink.get_input_port(), signal.name)
+        route = builder.AddNamedSystem("route", PassThrough(1))
+        builder.ExportInput(route.get_input_port(), "route")
+        builder.ExportOutput(route.get_output_port(), "route")
+        return builder.Build()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        # Imported here: the DPS on the carrier runs without a plant.
+        from vtbdrake.components.ray_casting import RayCaster
+        from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
+        from vtbdrake_diagrams.forest.carrier import Carrier, WheelOdometer, Wheels, add_carrier, standing_pose
+        from vtbdrake_diagrams.forest.driver import Driver
+
+        plant, scene_graph = builder.add_plant(self.plant_config)
+        plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
+        carrier, ground, routes = Carrier(), self.ground(), self.routes()
+        self.add_landscape(plant)
+        base = add_carrier(plant, carrier, self.X_BL)
+        route = routes[self.route]
+        X_WB = standing_pose(carrier, ground, position=route.position(self.start), heading=route.heading(self.start))
+        plant.SetDefaultFloatingBaseBodyPose(base, X_WB)
+        plant.Finalize()
+
+        wheels = builder.add("act", "wheels", Wheels(plant, base, carrier, ground))
+        driver = Driver(
+            plant,
+            base,
+            routes,
+            wheel_base=carrier.wheel_base,
+            period=PERIOD,
+            speed=self.speed,
+            laps=self.laps,
+            route=self.route,
+            along=self.start,
+        )
+        builder.add("act", "driver", driver)
+        for system in (wheels, driver):
+            builder.connect(plant.get_state_output_port(), system.GetInputPort("state"))
+        builder.connect(driver.GetOutputPort("controls"), wheels.GetInputPort("controls"))
+        builder.connect(wheels.GetOutputPort("spatial_force"), plant.get_applied_spatial_force_input_port())
+        builder.sim_actuator("route", driver.GetInputPort("route"))
+
+        builder.add_sensor("imu", Imu(plant, base.body_frame(), period=PERIOD, errors=self.imu_errors))
+        odometer = WheelOdometer(period=PERIOD, scale=self.odometry_scale, errors=self.odometry_errors)
+        builder.add("sense", "odometry", odometer)
+        builder.connect(wheels.GetOutputPort("speed"), odometer.GetInputPort("speed"))
+        builder.sim_sensor("odometry", odometer.get_output_port())
+        frame = plant.GetFrameByName("scanner")
+        caster = RayCaster(plant, scene_graph)
+        scanner = LaserScanner(plant, frame, caster, config=self.scanner, errors=self.scanner_errors)
+        builder.add("sense", "scanner", scanner)
+        connect_laser_scanner(builder.diagram_builder, scanner, plant)
+        builder.sim_sensor("scan", scanner.GetOutputPort("scan"))
+
+
+@dataclass
+class ForestScenario(CarrierScenario):
+    """A carrier in a forest stand with strip roads; the landmarks are trees."""
+
+    # natural, clustered or plantation, see `Stand`.
+    stand_kind: str = "natural"
+    # Trees per hectare, before the roads are cleared.
+    density: float = 800.0
+    # Width of the strip roads and distance between them, in m.
+    road_width: float = 4.0
+    road_spacing: float = 28.0
+    # Bushes per hectare, and dead branches per tree.
+    undergrowth: float = 300.0
+    branches: float = 6.0
+
+    def validate(self) -> None:
+        self.require(
+            stand_kind=(self.stand_kind in KINDS, f"one of {', '.join(KINDS)}"),
+            road_width=(self.road_width >= 3.0, "at least 3 m: the carrier is 1.5 m wide"),
+        )
+        super().validate()
+        try:
+            self.vegetation()
+        except ValueError as error:
+            raise ScenarioError(f"{type(self).__name__}: {error}") from None
+
+    def stand(self) -> Stand:
+        """Return the stand."""
+        return Stand(
+            self.seed,
+            length=self.length,
+            width=self.width,
+            density=self.density,
+            kind=self.stand_kind,
+            road_width=self.road_width,
+            road_spacing=self.road_spacing,
+        )
+
+    def vegetation(self) -> Vegetation:
+        """Return the clutter."""
+        return Vegetation(self.seed, undergrowth=self.undergrowth, branches=self.branches)
+
+    def routes(self) -> tuple[Route, ...]:
+        return self.stand().routes()
+
+    def truth(self) -> WorldModel:
+        return self.stand().trees()
+
+    def surveyed_map(self) -> WorldModel:
+        return self.stand().map(MAPS[self.map], seed=self.map_seed)
+
+    def add_landscape(self, plant: MultibodyPlant) -> None:
+        from vtbdrake_diagrams.forest.world import add_forest
+
+        add_forest(plant, self.stand(), self.ground(), self.vegetation())

@@ -1,0 +1,172 @@
+"""What grows in a forest, as meshes for scanners and cameras: trunks, crowns, dead branches and undergrowth.
+
+Everything of one kind is one mesh, because geometries cost time one by one. Trunks are landmarks; the rest is clutter:
+it hides trunks, and looks like them at times. All dimensions that the world model does not give are assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.components.meshes import Surface, copies, unit_cone, unit_sphere
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake_diagrams.forest.ground import Ground
+
+Array = NDArray[np.float64]
+
+BREAST_HEIGHT = 1.3
+"""The height over the ground in m at which the diameter of a trunk is measured."""
+
+# Facets of a trunk; how deep it stands in the ground, in m.
+_FACETS, _ROOTED = 24, 0.5
+# Of a crown, as shares of the tree's height.
+_CROWN_BASE, _CROWN_DIAMETER = 0.45, 0.2
+# Of dead branches: heights where they leave the trunk, lengths and radii in m, and their elevation in rad.
+_BRANCH_HEIGHT, _BRANCH_LENGTH, _BRANCH_RADIUS, _BRANCH_ELEVATION = (0.4, 5.0), (0.3, 1.3), (0.004, 0.012), 0.35
+# Of undergrowth: blades of a bush, its radius and height, the width of a blade, in m.
+_BLADES, _BUSH_RADIUS, _BUSH_HEIGHT, _BLADE_WIDTH = 30, (0.2, 0.6), (0.3, 1.3), (0.01, 0.06)
+
+# Streams of random numbers, beside those of `stand`, `ground` and `routes`.
+_BRANCHES, _UNDERGROWTH = 4, 5
+
+# A flat, pointed leaf in the plane of x and z.
+_BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]), np.array([(0, 1, 2)]))
+
+
+@dataclass(frozen=True)
+class Vegetation:
+    """How much clutter grows in a forest.
+
+    Attributes:
+        seed: Determines where.
+        undergrowth: Bushes per hectare.
+        branches: Dead branches of a tree below its crown, on average.
+    """
+
+    seed: int = 0
+    undergrowth: float = 300.0
+    branches: float = 6.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.undergrowth <= 5000.0 and 0.0 <= self.branches <= 50.0):
+            raise ValueError(
+                "undergrowth is within [0, 5000] bushes per hectare and branches within [0, 50] per tree, not "
+                f"{self.undergrowth:g} and {self.branches:g}"
+            )
+
+
+def feet(trees: WorldModel, ground: Ground) -> Array:
+    """Return where the trees stand, (n, 3) in m: at their x and y in W, on the ground."""
+    p = trees.positions()
+    return np.column_stack([p[:, :2], ground.height(p[:, 0], p[:, 1])])
+
+
+def trunks(trees: WorldModel, ground: Ground) -> Surface:
+    """Return the trunks: upright cones from below the ground to the top of the tree.
+
+    A cone has the diameter of its tree at `BREAST_HEIGHT` over the ground.
+    """
+    diameters, heights = _sizes(trees)
+    length = heights + _ROOTED
+    radius = 0.5 * diameters * length / (heights - BREAST_HEIGHT)
+    return copies(unit_cone(_FACETS), _scaled(radius, radius, length), feet(trees, ground) - [0.0, 0.0, _ROOTED])
+
+
+def crowns(trees: WorldModel, ground: Ground) -> Surface:
+    """Return the crowns, each a coarse ellipsoid."""
+    _, heights = _sizes(trees)
+    radius, half = 0.5 * _CROWN_DIAMETER * heights, 0.5 * (1.0 - _CROWN_BASE) * heights
+    centres = feet(trees, ground) + np.multiply.outer(heights - half, [0.0, 0.0, 1.0])
+    return copies(unit_sphere(1), _scaled(radius, radius, half), centres)
+
+
+def branches(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surface:
+    """Return dead branches that stick out of the trunks below the crowns; straight, thin, and pointed."""
+    rng = np.random.default_rng([vegetation.seed, _BRANCHES])
+    of = np.repeat(np.arange(len(trees)), rng.poisson(vegetation.branches, len(trees)))
+    _, heights = _sizes(trees)
+    low, high = _BRANCH_HEIGHT
+    start = feet(trees, ground)[of]
+    start[:, 2] += rng.uniform(low, np.minimum(high, _CROWN_BASE * heights[of]))
+    directions = _directions(
+        rng.uniform(0.0, 2.0 * np.pi, len(of)), _BRANCH_ELEVATION * rng.uniform(-1.0, 1.0, len(of))
+    )
+    length, radius = _between(rng, _BRANCH_LENGTH, len(of)), _between(rng, _BRANCH_RADIUS, len(of))
+    return copies(unit_cone(3), _along(directions, radius, radius, length), start)
+
+
+def undergrowth(
+    ground: Ground, vegetation: Vegetation, *, lower: Array, upper: Array, roads: tuple[Array, float]
+) -> Surface:
+    """Return bushes: bundles of blades that stand up and lean outwards.
+
+    Args:
+        ground: What they grow on.
+        vegetation: How many.
+        lower: The least x and y of the area in m, shape (2,).
+        upper: The largest x and y of the area in m, shape (2,).
+        roads: Points of the roads in m, (n, 2), and how far from them nothing grows, in m.
+    """
+    rng = np.random.default_rng([vegetation.seed, _UNDERGROWTH])
+    count = rng.poisson(vegetation.undergrowth * float(np.prod(upper - lower)) / 1e4)
+    centres = rng.uniform(lower, upper, (count, 2))
+    radius, height = _between(rng, _BUSH_RADIUS, count), _between(rng, _BUSH_HEIGHT, count)
+    points, clearance = roads
+    if len(points):
+        from scipy.spatial import cKDTree
+
+        free = cKDTree(points).query(centres)[0] > clearance
+        centres, radius, height = centres[free], radius[free], height[free]
+    of = np.repeat(np.arange(len(centres)), _BLADES)
+    azimuth, share = rng.uniform(0.0, 2.0 * np.pi, len(of)), np.sqrt(rng.random(len(of)))
+    away = (0.5 * radius[of] * share)[:, np.newaxis] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
+    root = centres[of] + away
+    start = np.column_stack([root, ground.height(root[:, 0], root[:, 1])])
+    # The outermost blades lean as far as the bush is wide.
+    lean = np.arctan2(0.5 * radius[of] * share, height[of])
+    directions = _directions(azimuth + rng.normal(0.0, 0.5, len(of)), 0.5 * np.pi - lean)
+    length = height[of] * rng.uniform(0.5, 1.0, len(of))
+    width = _between(rng, _BLADE_WIDTH, len(of))
+    return copies(_BLADE, _along(directions, width, width, length, turn=rng.uniform(0.0, np.pi, len(of))), start)
+
+
+def _sizes(trees: WorldModel) -> tuple[Array, Array]:
+    """Return diameters and heights in m, (n,) each."""
+    sizes = [(one.number("trunk_diameter", unit="m"), one.number("height", unit="m")) for one in trees]
+    for one, (_, height) in zip(trees, sizes, strict=True):
+        if height <= 2.0 * BREAST_HEIGHT:
+            raise ValueError(
+                f"the tree {one.identity} of {height:g} m is too low: trees are above {2 * BREAST_HEIGHT} m"
+            )
+    diameters, heights = np.array(sizes).reshape(-1, 2).T
+    return diameters, heights
+
+
+def _scaled(x: Array, y: Array, z: Array) -> Array:
+    """Return the matrices that scale along the axes, (n, 3, 3)."""
+    return np.eye(3) * np.stack([x, y, z], axis=-1)[:, np.newaxis]
+
+
+def _directions(azimuth: Array, elevation: Array) -> Array:
+    level = np.cos(elevation)
+    return np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
+
+def _along(directions: Array, x: Array, y: Array, z: Array, *, turn: Array | float = 0.0) -> Array:
+    """Return the matrices that scale along the axes, turn about z, and turn z into unit vectors (n, 3)."""
+    # Any direction across; a direction along this vector has probability zero.
+    across = np.cross(directions, np.array([0.6, 0.64, 0.48]))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    other = np.cross(directions, across)
+    c, s = (np.broadcast_to(f(turn), len(x))[:, np.newaxis] for f in (np.cos, np.sin))
+    columns = ((c * across + s * other) * x[:, np.newaxis], (c * other - s * across) * y[:, np.newaxis])
+    return np.stack([*columns, directions * z[:, np.newaxis]], axis=-1)
+
+
+def _between(rng: np.random.Generator, limits: tuple[float, float], count: int) -> Array:
+    """Return numbers between two limits whose logarithms are uniform, (count,)."""
+    low, high = np.log(limits)
+    return np.exp(rng.uniform(low, high, count))

@@ -1,0 +1,75 @@
+"""The simulated forest: ground, trees, branches and undergrowth as geometry of a plant."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Mesh
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+
+from vtbdrake.components.meshes import Surface, obj_mesh
+from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.stand import Stand
+from vtbdrake_diagrams.forest.vegetation import Vegetation, branches, crowns, trunks, undergrowth
+
+Array = NDArray[np.float64]
+
+# How far the ground goes on around a stand, in m.
+_MARGIN = 15.0
+
+_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES = (
+    np.array(color)
+    for color in (
+        (0.35, 0.3, 0.2, 1.0),
+        (0.36, 0.27, 0.2, 1.0),
+        (0.15, 0.32, 0.17, 1.0),
+        (0.4, 0.37, 0.33, 1.0),
+        (0.3, 0.5, 0.2, 1.0),
+    )
+)
+
+
+def add_surface(plant: MultibodyPlant, name: str, surface: Surface, color: Array) -> None:
+    """Register a surface in W on the world body, for scanners, cameras and Meshcat; nothing collides with it.
+
+    Args:
+        plant: A plant that is registered with a SceneGraph, and not finalized.
+        name: Of the geometry.
+        surface: Vertices and triangles; one without triangles is left out.
+        color: Red, green, blue and opacity, from 0 to 1, shape (4,).
+    """
+    vertices, triangles = surface
+    if len(triangles):
+        mesh = Mesh(obj_mesh(vertices, triangles, name=name), 1.0)
+        plant.RegisterVisualGeometry(plant.world_body(), RigidTransform(), mesh, name, color)
+
+
+def add_ground(plant: MultibodyPlant, ground: Ground, *, length: float, width: float) -> None:
+    """Register the ground of an area from (0, 0) to (length, width) in m, and some around it, like `add_surface`."""
+    lower, upper = np.full(2, -_MARGIN), np.array([length, width]) + _MARGIN
+    add_surface(plant, "ground", ground.mesh(lower, upper), _SOIL)
+
+
+def add_forest(plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: Vegetation) -> None:
+    """Register a stand on its ground, with branches and undergrowth, on the world body of a plant.
+
+    Scanners, cameras and Meshcat see it. Nothing collides with it: a driver keeps away from trees, and the wheels of a
+    carrier know the ground.
+
+    Args:
+        plant: A plant that is registered with a SceneGraph, and not finalized.
+        stand: The trees as they are.
+        ground: What they stand on.
+        vegetation: Branches and undergrowth.
+    """
+    add_ground(plant, ground, length=stand.length, width=stand.width)
+    trees, routes = stand.trees(), stand.routes()
+    if len(trees):
+        add_surface(plant, "trunks", trunks(trees, ground), _BARK)
+        add_surface(plant, "crowns", crowns(trees, ground), _NEEDLES)
+        add_surface(plant, "branches", branches(trees, ground, vegetation), _DEAD)
+    roads = np.concatenate([np.zeros((0, 2)), *(route.points for route in routes)])
+    area = {"lower": np.zeros(2), "upper": np.array([stand.length, stand.width])}
+    bushes = undergrowth(ground, vegetation, **area, roads=(roads, 0.5 * stand.road_width))
+    add_surface(plant, "undergrowth", bushes, _LEAVES)

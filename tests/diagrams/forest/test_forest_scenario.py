@@ -1,0 +1,192 @@
+"""Tests of the simulated forest: what the scanner sees against analytic geometry, what the sensors tell, bad fields."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from vtbdrake.components.ray_casting import Hits, RayCaster
+from vtbdrake.components.sensors.laser_scanner import raster
+from vtbdrake.components.world_model import (
+    LocalFrame,
+    Quantity,
+    WorldModel,
+    WorldObject,
+    position_estimate,
+    save_geojson,
+)
+from vtbdrake.scan import Scan
+from vtbdrake.testbed import ScenarioError, VirtualTestbed
+from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stand import Stand
+from vtbdrake_diagrams.forest.vegetation import BREAST_HEIGHT, Vegetation, branches, crowns, trunks, undergrowth
+from vtbdrake_diagrams.forest.world import add_ground, add_surface
+
+GROUND = Ground(seed=6)
+AT_REST = SpatialVelocity(np.zeros(3), np.zeros(3))
+
+
+def tree(x: float, y: float, diameter: float = 0.3, height: float = 20.0) -> WorldObject:
+    attributes = {"trunk_diameter": Quantity(diameter, "m"), "height": Quantity(height, "m")}
+    return WorldObject(f"tree at {x}", "tree", position_estimate([x, y, 0.0]), attributes=attributes)
+
+
+def cast(directions: np.ndarray, p_WLo: np.ndarray, trees: WorldModel) -> Hits:
+    """Cast rays at trunks on the ground."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)
+    add_ground(plant, GROUND, length=40.0, width=40.0)
+    add_surface(plant, "trunks", trunks(trees, GROUND), np.ones(4))
+    plant.Finalize()
+    caster = RayCaster(plant, scene_graph)
+    return caster.cast(
+        directions, np.zeros(len(directions)), X_WL=RigidTransform(p_WLo), V_WL=AT_REST, X_WB=[RigidTransform()],
+        V_WB=[AT_REST], reach=30.0,
+    )  # fmt: skip
+
+
+def test_scan_of_a_trunk_is_that_of_a_cylinder() -> None:
+    """Within the band of a trunk about breast height, where its cone has nearly the given radius."""
+    p_WLo = np.array([10.0, 20.0, float(GROUND.height(10.0, 20.0)) + 1.5])
+    foot = np.array([18.0, 20.0, float(GROUND.height(18.0, 20.0))])
+    directions = raster(8, 4000, 0.1, 0.1)
+    hits = cast(directions, p_WLo, WorldModel([tree(18.0, 20.0)]))
+    points = p_WLo + hits.distances[:, np.newaxis] * directions
+    band = np.abs(points[:, 2] - foot[2] - BREAST_HEIGHT) < 0.1
+    assert band.sum() > 500
+    # |p + t d - c| = r in the plane.
+    d, p = directions[band][:, :2], p_WLo[:2] - foot[:2]
+    a, b, c = (d**2).sum(axis=1), d @ p, p @ p - 0.15**2
+    analytic = (-b - np.sqrt(b**2 - a * c)) / a
+    inside = np.isfinite(analytic)
+    np.testing.assert_allclose(hits.distances[band][inside], analytic[inside], atol=0.01)
+    assert np.mean(hits.distances[band][inside] - analytic[inside]) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_rays_beside_the_trunk_hit_the_ground() -> None:
+    p_WLo = np.array([10.0, 20.0, float(GROUND.height(10.0, 20.0)) + 2.0])
+    directions = raster(16, 1250, 2.0 * np.pi, np.radians(30.0))
+    hits = cast(directions, p_WLo, WorldModel([tree(12.0, 35.0)]))
+    seen = np.isfinite(hits.distances) & (directions[:, 2] < -0.15)
+    points = p_WLo + hits.distances[seen][:, np.newaxis] * directions[seen]
+    assert seen.sum() > 3000
+    np.testing.assert_allclose(points[:, 2], GROUND.height(points[:, 0], points[:, 1]), atol=0.02)
+
+
+def test_vegetation_is_where_it_grows() -> None:
+    stand, vegetation = Stand(seed=1, length=40.0, width=40.0, road_width=4.0), Vegetation(seed=1)
+    trees = stand.trees()
+    feet = trees.positions()[:, :2]
+    roads = np.concatenate([route.points for route in stand.routes()])
+
+    vertices, triangles = branches(trees, GROUND, vegetation)
+    assert len(triangles) == 3 * 6 * len(trees) or abs(len(triangles) / len(trees) / 18.0 - 1.0) < 0.1
+    nearest = np.linalg.norm(vertices[:, np.newaxis, :2] - feet, axis=2).min(axis=1)
+    assert nearest.max() < 1.4
+
+    vertices, _ = undergrowth(GROUND, vegetation, lower=np.zeros(2), upper=np.array([40.0, 40.0]), roads=(roads, 2.0))
+    over = vertices[:, 2] - GROUND.height(vertices[:, 0], vertices[:, 1])
+    assert over.min() > -0.3 and 0.5 < over.max() < 1.6
+    assert np.linalg.norm(vertices[::50, np.newaxis, :2] - roads, axis=2).min() > 1.0
+
+    vertices, _ = crowns(trees, GROUND)
+    assert (vertices[:, 2] - GROUND.height(vertices[:, 0], vertices[:, 1])).min() > 2.0
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[VirtualTestbed, list[Scan], np.ndarray]:
+    """Three seconds on the main road: all scans, and times, poses, and readings of IMU and odometry."""
+    scenario = ForestScenario(seed=1, length=60.0, width=60.0, speed=1.0)
+    testbed = scenario.build()
+    simulator = testbed.simulator(testbed.default_context())
+    scans, rows = [], []
+    for k in range(1, 151):
+        simulator.AdvanceTo(0.02 * k)
+        context = simulator.get_context()
+        read = [testbed.read(context, f"sim.{name}") for name in (
+            "sys.carrier.base.pose", "sys.carrier.base.velocity", "sense.imu.imu", "sense.odometry.odometry",
+        )]  # fmt: skip
+        rows.append(np.concatenate([np.ravel(value) for value in read]))
+        scan = testbed.diagram.GetSubsystemByName("sim.sense.scanner")
+        value = scan.GetOutputPort("scan").Eval(scan.GetMyContextFromRoot(context))
+        if not scans or scans[-1].stamp != value.stamp:
+            scans.append(value)
+    return testbed, scans, np.array(rows)
+
+
+def test_scanner_sees_ground_and_trunks(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    _, scans, rows = drive
+    # An empty one first, then five per second; 16 beams.
+    assert len(scans) in (15, 16)
+    scan = scans[-1]
+    assert 5_000 < len(scan.ranges) < 20_000
+    assert len(np.unique(np.round(np.arcsin(scan.directions_L[:, 2]), 6))) == 16
+    # The ground in front of the carrier is 2 m below the scanner.
+    points = scan.points()
+    near = (np.hypot(points[:, 0] - 8.0, points[:, 1]) < 1.5) & (points[:, 2] < -1.0)
+    assert points[near, 2].mean() == pytest.approx(-2.0, abs=0.4)
+
+
+def test_gyro_measures_the_turning(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    _, _, rows = drive
+    roll, pitch, yaw = rows[:, 3:6].T
+    rates = np.array(
+        [
+            RollPitchYaw(*rpy).ToRotationMatrix().matrix().T @ w
+            for rpy, w in zip(rows[:, 3:6], rows[:, 6:9], strict=True)
+        ]
+    )
+    measured = rows[:, 12:15]
+    # The gyro shows means over a period, up to two periods late, with a bias of 5e-4 and a noise of 2e-3 rad/s.
+    assert (measured[2:] - rates[1:-1]).mean(axis=0) == pytest.approx(np.full(3, 5e-4), abs=1e-3)
+    assert np.abs(rates).max() > 0.05
+    assert (measured[2:] - rates[1:-1]).std() < 0.02
+
+
+def test_odometer_is_wrong_by_its_scale(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    _, _, rows = drive
+    true = np.linalg.norm(rows[100:, 9:12], axis=1)
+    assert rows[100:, -1].mean() / true.mean() == pytest.approx(1.01, abs=0.02)
+    assert rows[100:, -1].std() == pytest.approx(0.02, rel=0.4)
+
+
+def test_command_reaches_the_driver(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    testbed, _, _ = drive
+    context = testbed.default_context()
+    testbed.write(context, {"u.route": 1.0})
+    driver = testbed.diagram.GetSubsystemByName("sim.act.driver")
+    assert driver.GetInputPort("route").Eval(driver.GetMyContextFromRoot(context)) == [1.0]
+
+
+def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
+    scenario = ForestScenario(seed=2, map="exact")
+    truth = {tuple(p) for p in scenario.truth().positions()[:, :2].tolist()}
+    assert {tuple(p) for p in scenario.global_map().positions()[:, :2].tolist()} == truth
+    path = tmp_path / "map.geojson"
+    save_geojson(WorldModel([tree(3.0, 4.0)]), path, frame=LocalFrame(61.19, 25.11, 130.0))
+    loaded = ForestScenario(map_file=str(path)).global_map()
+    assert loaded.positions() == pytest.approx(np.array([[3.0, 4.0, 0.0]]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"stand_kind": "jungle"}, "stand_kind must be one of natural, clustered, plantation, not 'jungle'"),
+        ({"map": "perfect"}, "map must be one of exact, accurate, remote, poor"),
+        ({"route": 99}, "route must be the number of one of 6 routes, from 0 on, not 99"),
+        ({"scanner_height": 0.5}, "over the carrier's roof, not 0.5"),
+        ({"speed": 9.0}, r"speed must be within \[0, 3\] m/s"),
+        ({"road_width": 1.0}, "the carrier is 1.5 m wide"),
+        ({"length": 20.0}, "a stand with roads is at least 40 m long"),
+        ({"bumps": 1.0}, "so that a carrier can drive there"),
+        ({"undergrowth": -1.0}, "bushes per hectare"),
+        ({"laps": 0}, "laps must be at least 1"),
+    ],
+)
+def test_impossible_fields_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        ForestScenario(**fields).validate()

@@ -1,0 +1,56 @@
+"""Tests of the ground: slopes against finite differences, the mesh against the height, and its statistics."""
+
+import numpy as np
+import pytest
+
+from vtbdrake_diagrams.forest.ground import Ground
+
+X, Y = np.random.default_rng(0).uniform(0.0, 100.0, (2, 50))
+
+
+def test_slope_is_the_derivative_of_height() -> None:
+    ground, h = Ground(seed=3), 1e-5
+    numerical = [
+        (ground.height(X + h, Y) - ground.height(X - h, Y)) / (2.0 * h),
+        (ground.height(X, Y + h) - ground.height(X, Y - h)) / (2.0 * h),
+    ]
+    np.testing.assert_allclose(ground.slope(X, Y), np.column_stack(numerical), atol=1e-7)
+
+
+def test_normal_is_perpendicular_to_tangents() -> None:
+    ground = Ground(seed=4)
+    normal, slope = ground.normal(X, Y), ground.slope(X, Y)
+    for k in range(2):
+        tangent = np.column_stack([np.eye(2)[k] + np.zeros((50, 2)), slope[:, k]])
+        np.testing.assert_allclose((normal * tangent).sum(axis=1), 0.0, atol=1e-12)
+    assert (normal[:, 2] > 0.8).all()
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)
+
+
+def test_mesh_lies_on_the_ground() -> None:
+    ground = Ground(seed=5)
+    vertices, triangles = ground.mesh([-5.0, 0.0], [7.0, 20.0])
+    np.testing.assert_allclose(vertices[:, 2], ground.height(*vertices[:, :2].T), atol=1e-12)
+    corners = vertices[triangles]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2.0
+    assert (area > 0.0).all() and area.sum() == pytest.approx(240.0)
+    # Between the vertices, it is off by less than the noise of a scanner.
+    middles = corners.mean(axis=1)
+    assert np.abs(middles[:, 2] - ground.height(*middles[:, :2].T)).max() < 0.02
+
+
+def test_heights_have_the_given_deviations() -> None:
+    x, y = np.random.default_rng(1).uniform(0.0, 2000.0, (2, 20_000))
+    assert Ground(bumps=0.0).height(x, y).std() == pytest.approx(0.8, rel=0.1)
+    assert Ground(relief=0.0).height(x, y).std() == pytest.approx(0.04, rel=0.1)
+    assert not Ground(relief=0.0, bumps=0.0).height(x, y).any()
+
+
+def test_seed_determines_the_ground() -> None:
+    assert np.array_equal(Ground(seed=1).height(X, Y), Ground(seed=1).height(X, Y))
+    assert not np.allclose(Ground(seed=1).height(X, Y), Ground(seed=2).height(X, Y))
+
+
+def test_impassable_ground_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"so that a carrier can drive there, not 1 and 0.5"):
+        Ground(relief=1.0, bumps=0.5)

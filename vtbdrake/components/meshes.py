@@ -1,0 +1,102 @@
+"""Meshes of triangles made in memory: many copies of one shape in a single mesh, and shapes that Drake reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, pi, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pydrake.geometry import InMemoryMesh
+
+Array = NDArray[np.float64]
+Triangles = NDArray[np.int64]
+# Vertices in m, shape (v, 3), and triangles of vertices counted from 0, shape (t, 3), counterclockwise from outside.
+Surface = tuple[Array, Triangles]
+
+
+def obj_mesh(vertices: Array, faces: Sequence[Sequence[int]] | Triangles, *, name: str = "mesh") -> InMemoryMesh:
+    """Return a mesh in Wavefront's format, which Drake's `Mesh` and `Convex` read.
+
+    Args:
+        vertices: In m, shape (n, 3).
+        faces: The vertices of each face, counted from 0, counterclockwise from outside.
+        name: A hint that appears in Drake's messages.
+    """
+    from pydrake.common import MemoryFile
+    from pydrake.geometry import InMemoryMesh
+
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices).tolist()]
+    rows = faces.tolist() if isinstance(faces, np.ndarray) else faces
+    lines += ["f " + " ".join([str(k + 1) for k in face]) for face in rows]
+    return InMemoryMesh(mesh_file=MemoryFile("\n".join(lines) + "\n", ".obj", name))
+
+
+def copies(surface: Surface, shapes: Array, positions: Array) -> Surface:
+    """Return n copies of a surface as one surface; copy k has the vertices A_k p + b_k for the vertices p.
+
+    Args:
+        surface: What is copied; all is as one mesh, because Drake's geometries cost time one by one.
+        shapes: The matrices A_k, which scale, shear and turn, shape (n, 3, 3), with positive determinants.
+        positions: The vectors b_k in m, shape (n, 3).
+    """
+    vertices, triangles = surface
+    moved = np.einsum("nij,vj->nvi", shapes, vertices) + np.asarray(positions)[:, np.newaxis]
+    first = len(vertices) * np.arange(len(moved))[:, np.newaxis, np.newaxis]
+    return moved.reshape(-1, 3), (triangles + first).reshape(-1, 3)
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Return several surfaces as one."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+    triangles = [part + k for (_, part), k in zip(surfaces, first, strict=False)]
+    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(triangles)
+
+
+def unit_cone(sides: int) -> Surface:
+    """Return a cone, open below, whose base is a circle of mean radius 1 around the origin and whose tip is at z = 1.
+
+    Args:
+        sides: The number of facets. Half of the polygon lies outside of the circle, half within, so that what is fitted
+            to points on the facets has no bias.
+    """
+    # The mean radius of a polygon between corners at the radius r is r (1 - (pi / sides)^2 / 3) to second order.
+    r = 1.0 / (1.0 - (pi / sides) ** 2 / 3.0)
+    angles = [2.0 * pi * k / sides for k in range(sides)]
+    vertices = np.array([*((r * cos(a), r * sin(a), 0.0) for a in angles), (0.0, 0.0, 1.0)])
+    return vertices, np.array([(k, (k + 1) % sides, sides) for k in range(sides)])
+
+
+def unit_sphere(subdivisions: int = 1) -> Surface:
+    """Return a sphere of radius 1 around the origin: an icosahedron, each of whose triangles is divided repeatedly."""
+    from scipy.spatial import ConvexHull
+
+    g = (1.0 + 5.0**0.5) / 2.0
+    corners = np.array([(a, b, 0.0) for b in (-g, g) for a in (-1.0, 1.0)])
+    vertices = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)])
+    triangles = _outward(vertices, ConvexHull(vertices).simplices.astype(np.int64))
+    for _ in range(subdivisions):
+        vertices, triangles = _divided(vertices, triangles)
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), triangles
+
+
+def _divided(vertices: Array, triangles: Triangles) -> Surface:
+    """Return the surface with four triangles for each; the middles of the edges are new vertices."""
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    unique, places = np.unique(edges, axis=0, return_inverse=True)
+    ab, bc, ca = (len(vertices) + places.reshape(3, -1)).astype(np.int64)
+    a, b, c = triangles.T
+    parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return (
+        np.concatenate([vertices, vertices[unique].mean(axis=1)]),
+        np.concatenate([np.column_stack(part) for part in parts]),
+    )
+
+
+def _outward(vertices: Array, triangles: Triangles) -> Triangles:
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0.0
+    return np.where(inward[:, np.newaxis], triangles[:, ::-1], triangles)
