@@ -1,0 +1,183 @@
+"""Trunks in scans of exact cylinders, against these and against bounds from the rays that hit them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.components.localization.scans import BREAST, Scene, hills, pairs, raster, trunk_ranges
+from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
+
+EYE = np.array([0.2, -0.1, 2.0])
+# The cylinders of these tests have neither bark nor a bend.
+EXACT = TrunkDetector(roughness=0.0, position_floor=0.0, diameter_floor=0.0)
+
+
+def ring(seed: int, *, count: int = 12, distance: tuple[float, float] = (3.0, 20.0), **options) -> Scene:
+    """Return trunks all around the scanner, none behind another one."""
+    rng = np.random.default_rng(seed)
+    bearings = 2.0 * np.pi * (np.arange(count) + 0.6 * rng.random(count)) / count
+    away = rng.uniform(*distance, (count, 1))
+    places = EYE[:2] + away * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    return Scene(places, rng.uniform(0.1, 0.4, count), **options)
+
+
+def stand(seed: int, *, count: int = 200, bushes: int = 0, height=hills) -> Scene:
+    """Return trunks at least 1 m apart on uneven ground, 800 to the hectare, and spheres that touch it."""
+    rng = np.random.default_rng(seed)
+    places: list[np.ndarray] = []
+    while len(places) < count:
+        place = rng.uniform(-25.0, 25.0, 2)
+        if np.linalg.norm(place - EYE[:2]) > 1.5 and all(np.linalg.norm(place - other) > 1.0 for other in places):
+            places.append(place)
+    centers = rng.uniform(-25.0, 25.0, (bushes, 2))
+    centers = centers[np.linalg.norm(centers - EYE[:2], axis=1) > 2.0]
+    radii = rng.uniform(0.2, 0.6, len(centers))
+    spheres = np.column_stack([centers, height(centers) + 0.5 * radii, radii])
+    leans = 0.02 * rng.normal(size=(count, 2))
+    return Scene(np.array(places), rng.uniform(0.08, 0.4, count), leans, spheres, height)
+
+
+def found_errors(scenes, detector=EXACT, *, noise=0.02):
+    """Return, for all trunks found: distance, errors along and across the ray and of the diameter, NEES; the count."""
+    rows, count = [], 0
+    for seed, scene in enumerate(scenes):
+        points, _ = scene.scan(EYE, noise=noise, turn=0.01 * seed, seed=seed)
+        trunks = detect_trunks(points, detector, p_HoLo_H=EYE)
+        which, truth = pairs(trunks.positions, scene.places, within=0.4)
+        assert len(which) == len(trunks)
+        count += len(scene.places)
+        errors = trunks.positions - scene.places[truth]
+        arms = scene.places[truth] - EYE[:2]
+        distances = np.linalg.norm(arms, axis=1)
+        e = arms / distances[:, None]
+        nees = np.einsum("ki,kij,kj->k", errors, np.linalg.inv(trunks.covariances), errors)
+        across = errors[:, 1] * e[:, 0] - errors[:, 0] * e[:, 1]
+        thick = trunks.diameters - scene.diameters[truth]
+        rows.append(np.stack([distances, np.sum(errors * e, axis=1), across, thick, nees], axis=1))
+    return np.vstack(rows), count
+
+
+def test_trunks_are_where_they_stand():
+    errors, count = found_errors([ring(seed) for seed in range(20)])
+    assert len(errors) >= 0.97 * count
+    for low, high, limit in ((3.0, 8.0, 0.005), (8.0, 20.0, 0.01)):
+        some = errors[(errors[:, 0] > low) & (errors[:, 0] < high)]
+        assert len(some) >= 50
+        # Of the position, and of the diameter, which algebraic fits make 2 to 5 cm too small.
+        assert np.abs(some[:, 1:4].mean(axis=0)).max() < limit
+    nees = errors[:, 4]
+    # Of two coordinates; the expected mean is 2, and 95 % lie below 5.99.
+    assert 1.2 < nees.mean() < 2.3
+    assert np.mean(nees < 5.99) > 0.94
+
+
+def test_variances_reach_the_bound_of_the_ranges():
+    scenes = [ring(seed, count=12, distance=(5.0, 5.0)) for seed in range(20)]
+    for scene in scenes:
+        scene.diameters[:] = 0.3
+    errors, _ = found_errors(scenes)
+    bound = range_bound(5.0, 0.3, noise=0.02, detector=EXACT)
+    variances = np.mean(errors[:, 1:4] ** 2, axis=0)
+    # The edges say more than the ranges alone, but no fit with so few rays reaches the bound exactly.
+    assert variances[0] < 1.25 * bound[0]
+    assert variances[1] < 1.25 * bound[1]
+    assert variances[2] < 1.25 * bound[2]
+    trunks = detect_trunks(scenes[0].scan(EYE, noise=0.02)[0], EXACT, p_HoLo_H=EYE)
+    claimed = np.mean(np.trace(trunks.covariances, axis1=1, axis2=2))
+    assert 0.5 < claimed / variances[:2].sum() < 2.0
+    assert 0.5 < np.mean(trunks.diameter_deviations**2) / variances[2] < 2.0
+
+
+def range_bound(distance, diameter, *, noise, detector):
+    """Return the Cramér-Rao bounds of the variances of x, y and diameter from ranges, by differences of exact ones."""
+    rays, eye = raster(), np.array([0.0, 0.0, EYE[2]])
+
+    def ranges(parameters):
+        x, y, thickness, lean_x, lean_y = parameters
+        return trunk_ranges(eye, rays, np.array([x, y, BREAST]), thickness, np.array([lean_x, lean_y]))
+
+    truth, h = np.array([distance, 0.0, diameter, 0.0, 0.0]), 1e-4
+    heights = eye[2] + rays[:, 2] * np.minimum(ranges(truth), 1e3)
+    # Rays at the very edge miss the trunk when it moves.
+    inner = np.abs(np.arctan2(rays[:, 1], rays[:, 0])) < np.arcsin(0.95 * diameter / 2.0 / distance)
+    seen = inner & (heights > detector.heights[0]) & (heights < detector.heights[1])
+    columns = [(ranges(truth + h * step)[seen] - ranges(truth - h * step)[seen]) / (2.0 * h) for step in np.eye(5)]
+    derivatives = np.stack(columns, axis=1)
+    information = derivatives.T @ derivatives / noise**2
+    information[[3, 4], [3, 4]] += 1.0 / detector.lean**2
+    return np.diagonal(np.linalg.inv(information))[:3]
+
+
+def test_leaning_trunks_are_found_at_breast_height():
+    leans = np.array([[0.08, 0.0], [0.0, 0.08], [-0.06, 0.06], [0.0, -0.1]])
+    places = EYE[:2] + 5.0 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    points, _ = Scene(places, np.full(4, 0.25), leans).scan(EYE, noise=0.01)
+    trunks = detect_trunks(points, TrunkDetector(range_noise=0.01), p_HoLo_H=EYE)
+    which, truth = pairs(trunks.positions, places, within=0.06)
+    assert sorted(truth) == [0, 1, 2, 3]
+    np.testing.assert_allclose(trunks.diameters[which], 0.25, atol=0.03)
+
+
+@pytest.mark.parametrize(("bushes", "recall", "precision"), [(0, 0.95, 0.99), (100, 0.93, 0.97)])
+def test_stands_on_uneven_ground(bushes, recall, precision):
+    shown = found = claimed = right = 0
+    for seed in range(4):
+        scene = stand(seed, bushes=bushes)
+        points, hit = scene.scan(EYE, noise=0.02, seed=seed)
+        trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+        # Those in sight: by at least ten points in a slice that is a little smaller than that of the detector.
+        over = points[:, 2] - hills(points[:, :2])
+        counts = np.bincount(hit[(hit >= 0) & (over > 0.9) & (over < 2.5)], minlength=len(scene.places))
+        counts = counts[: len(scene.places)]
+        near = np.linalg.norm(scene.places - EYE[:2], axis=1) < 18.0
+        which, truth = pairs(trunks.positions, scene.places, within=0.25)
+        shown += np.sum(near & (counts >= 10))
+        found += len(set(truth) & set(np.flatnonzero(near & (counts >= 10))))
+        claimed, right = claimed + len(trunks), right + len(which)
+    assert found >= recall * shown
+    assert right >= precision * claimed
+
+
+def test_a_hidden_edge_is_not_taken_for_the_trunks_own():
+    # The nearer trunk hides the left half of the farther one.
+    places = np.array([[5.0, 0.2], [10.0, 0.2]]) + EYE[:2]
+    diameters = np.array([0.2, 0.4])
+    points, _ = Scene(places, diameters).scan(EYE, noise=0.02)
+    trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+    alone, _ = Scene(places[1:], diameters[1:]).scan(EYE, noise=0.02)
+    (whole,) = detect_trunks(alone, TrunkDetector(), p_HoLo_H=EYE).covariances
+    (far,) = np.flatnonzero(trunks.positions[:, 0] > 8.0)
+    error = trunks.positions[far] - places[1]
+    assert error @ np.linalg.solve(trunks.covariances[far], error) < 9.21
+    assert trunks.covariances[far][1, 1] > 4.0 * whole[1, 1]
+    assert abs(trunks.diameters[far] - 0.4) < 2.5 * trunks.diameter_deviations[far]
+
+
+def test_what_is_no_trunk_is_not_found():
+    nothing = Scene(np.zeros((0, 2)), np.zeros(0), height=hills)
+    ground, _ = nothing.scan(EYE, noise=0.02)
+    wall = np.stack(np.meshgrid([6.0], np.linspace(-2, 2, 60), np.linspace(0, 3, 20)), axis=-1).reshape(-1, 3)
+    for points in (np.zeros((0, 3)), ground, np.vstack([ground, wall]), wall[:1]):
+        assert len(detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)) == 0
+
+
+def test_the_order_of_points_does_not_matter():
+    scene = ring(3)
+    points, _ = scene.scan(EYE, noise=0.02)
+    mixed = np.random.default_rng(0).permutation(points)
+    one, other = (detect_trunks(some, TrunkDetector(), p_HoLo_H=EYE) for some in (points, mixed))
+    np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
+
+
+def test_bad_input_is_rejected():
+    points = np.ones((3, 3))
+    points[1, 1] = np.nan
+    with pytest.raises(ValueError, match="finite numbers"):
+        detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+    with pytest.raises(ValueError, match="shape"):
+        detect_trunks(np.ones((3, 2)), TrunkDetector(), p_HoLo_H=EYE)
+    with pytest.raises(ValueError, match="range_noise must be in m, positive, not 0"):
+        TrunkDetector(range_noise=0.0)
+    with pytest.raises(ValueError, match="two positive heights"):
+        TrunkDetector(heights=(2.0, 1.0))
