@@ -30,7 +30,7 @@ from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, wrap
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, gathered
-from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE, Stand
+from vtbdrake_diagrams.forest.stand import MAPS, Stand
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,6 @@ LARGEST_TURN = np.radians(10.0)
 DRIVE = 40.0
 """Length in m of the drive over which landmarks are gathered."""
 DENSITIES = (300.0, 600.0, 1000.0)
-MAPS = {"accurate": ACCURATE, "remote": REMOTE, "poor": POOR}
 GOALS = {"accurate": 0.97, "remote": 0.95, "poor": 0.90}
 """The least share of places inside that are recognized: right and sure."""
 LARGEST_WRONG = 1e-3
@@ -96,10 +95,10 @@ def cases() -> list[Case]:
     natural = [
         Case("natural", density, name, place)
         for place in ("inside", "edge", "outside")
-        for name in MAPS
+        for name in GOALS
         for density in DENSITIES
     ]
-    return natural + [Case("plantation", 1000.0, name, place) for place in ("inside", "outside") for name in MAPS]
+    return natural + [Case("plantation", 1000.0, name, place) for place in ("inside", "outside") for name in GOALS]
 
 
 def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Odometry | None = None) -> Trial:
@@ -116,9 +115,10 @@ def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Od
     errors = MAPS[case.map]
     detector = detector or Detector(false=rng.uniform(0.3, 0.4))
     wood = Wood.of(_stand(case, seed + 10**6) if case.place == "outside" else stand, false=detector.false, rng=rng)
-    poses = _drive(case, stand, rng) if errors is POOR else _place(case, stand, rng)[np.newaxis]
+    poses = _drive(case, stand, rng) if case.map == "poor" else _place(case, stand, rng)[np.newaxis]
     local, _ = gathered(wood, poses, detector, odometry or Odometry(), rng)
-    return judged(ConstellationMap(map_landmarks(stand.map(errors))), local, poses[-1], case)
+    constellation = ConstellationMap(map_landmarks(stand.map(errors)), correlation=errors.correlation)
+    return judged(constellation, local, poses[-1], case)
 
 
 def judged(constellation: ConstellationMap, local: Landmarks, X_WH: Array, case: Case) -> Trial:
@@ -136,18 +136,7 @@ def judged(constellation: ConstellationMap, local: Landmarks, X_WH: Array, case:
 
 
 def _stand(case: Case, seed: int) -> Stand:
-    return (Rows if case.stand == "plantation" else Stand)(seed=seed, density=case.density)
-
-
-class Rows(Stand):
-    """A plantation: rows 2.5 m apart, the trees in a row as close as the density asks, all 0.15 m off per axis."""
-
-    def _places(self, rng: np.random.Generator) -> Array:
-        rows = round(self.width / 2.5)
-        per_row = int(np.ceil(self.count / rows))
-        x, y = np.meshgrid((np.arange(per_row) + 0.5) / per_row * self.length, (np.arange(rows) + 0.5) * 2.5)
-        places = np.column_stack([x.ravel(), y.ravel()])[: self.count]
-        return np.clip(places + 0.15 * rng.normal(size=places.shape), 0.0, [self.length, self.width])
+    return Stand(seed=seed, density=case.density, kind=case.stand)
 
 
 def _place(case: Case, stand: Stand, rng: np.random.Generator) -> Array:

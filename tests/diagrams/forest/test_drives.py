@@ -1,0 +1,79 @@
+"""Tests of the scores of drives, with errors that are drawn from the covariances that are claimed."""
+
+import numpy as np
+import pytest
+
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
+from vtbdrake_diagrams.forest.drives import GOALS, Drive, Track, nees_bounds, score, simulated_drive
+from vtbdrake_diagrams.forest.stand import Stand
+
+COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 0.0], [0.0, 0.0, 1e-6]])
+
+
+def track(seed: int, *, factor: float = 1.0, searching: int = 10, lost: slice = slice(0, 0)) -> Track:
+    """Return a track along 50 m at 1 m/s, whose errors are ``factor`` times what they are said to be."""
+    n = 251
+    truth = np.column_stack([np.linspace(0.0, 50.0, n), np.full(n, 7.0), np.full(n, np.pi - 1e-4)])
+    errors = factor * np.random.default_rng(seed).multivariate_normal(np.zeros(3), COVARIANCE, n)
+    status = np.full(n, TRACKING)
+    status[:searching] = SEARCHING
+    status[lost] = LOST
+    poses = np.where((status == TRACKING)[:, np.newaxis], truth + errors, np.nan)
+    poses[:, 2] -= np.where(poses[:, 2] > np.pi, 2.0 * np.pi, 0.0)
+    drive = Drive(np.arange(n) / 5.0, truth, truth, (Landmarks.empty(),) * n)
+    return Track(drive, poses, np.tile(COVARIANCE, (n, 1, 1)), status)
+
+
+def test_errors_are_those_that_were_drawn() -> None:
+    found = score([track(seed) for seed in range(20)], deviation=0.1)
+    assert found.forests == 20 and found.path == pytest.approx(1000.0)
+    assert found.position == pytest.approx(np.sqrt(13e-4), rel=0.03)
+    assert found.heading == pytest.approx(1e-3, rel=0.03)
+    assert found.nees == pytest.approx(3.0, rel=0.05)
+    assert found.is_consistent and not found.wrong
+    assert GOALS["accurate"].is_met(found)
+
+
+def test_covariances_that_are_too_small_show() -> None:
+    found = score([track(seed, factor=1.4) for seed in range(20)], deviation=0.1)
+    assert found.independent_nees > found.bounds[1]
+    assert not found.is_consistent and not GOALS["accurate"].is_met(found)
+
+
+def test_search_and_loss_are_counted() -> None:
+    one = track(0, lost=slice(100, 120))
+    found = score([one, track(1, searching=30)], deviation=0.1)
+    assert one.first_fix == (pytest.approx(2.0), pytest.approx(2.0))
+    assert found.first_fix == (pytest.approx(4.0), pytest.approx(6.0))
+    assert found.losses == 1
+    assert found.localized == pytest.approx((251 - 30 + 251 - 30) / 502)
+
+
+def test_wrong_claim_is_counted() -> None:
+    one = track(0)
+    one.poses[50] += [1.0, 0.0, 0.0]
+    assert score([one], deviation=0.1).wrong == 1
+    assert score([one], deviation=0.35).wrong == 0
+
+
+def test_independent_poses_are_apart() -> None:
+    one = track(0)
+    places = one.drive.truth[one.is_localized][one.independent, 0]
+    assert places[-1] == 50.0
+    assert np.diff(places).min() >= 20.0 - 0.2
+    assert len(places) == 3
+
+
+def test_bounds_hold_for_95_percent_of_means() -> None:
+    means = (np.random.default_rng(0).normal(size=(4000, 60, 3)) ** 2).sum(axis=2).mean(axis=1)
+    low, high = nees_bounds(60)
+    assert np.mean((means >= low) & (means <= high)) == pytest.approx(0.95, abs=0.01)
+
+
+def test_simulated_drive_stays_in_the_stand() -> None:
+    drive = simulated_drive(Stand(seed=1, density=300.0), seed=1, length=20.0)
+    assert drive.travelled[-1] == pytest.approx(20.0, rel=1e-3)
+    assert (drive.truth[:, :2] > 0.0).all() and (drive.truth[:, :2] < 100.0).all()
+    assert len(drive.landmarks) == len(drive.times) == 101
+    assert np.diff(drive.times) == pytest.approx(0.2)
