@@ -1,9 +1,10 @@
-"""The testbeds of the localization unit: a carrier with a laser scanner in a forest."""
+"""The testbeds of the localization unit: a carrier with a laser scanner in a forest, or on a plain with rocks."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -17,6 +18,7 @@ from vtbdrake.components.world_model import WorldModel, load_geojson
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.plain import RockField
 from vtbdrake_diagrams.forest.routes import Route
 from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
 from vtbdrake_diagrams.forest.vegetation import Vegetation
@@ -43,6 +45,13 @@ def scanner_config() -> LaserScannerConfig:
     )
 
 
+def plain_scanner_config() -> LaserScannerConfig:
+    """Return a scanner for low landmarks: 32 beams over 40 deg, otherwise as that of the forest."""
+    config = scanner_config()
+    config.rows, config.elevation = 32, np.radians(40.0)
+    return config
+
+
 @dataclass
 class CarrierScenario(Scenario):
     """A carrier with scanner, IMU and wheel odometry drives on routes among landmarks.
@@ -50,6 +59,9 @@ class CarrierScenario(Scenario):
     The driver follows the route that the DPS advises, which the command ``u.route`` sets. The true pose of the carrier
     is ``sim.sys.carrier.base.pose``.
     """
+
+    # The class of the landmarks in truth and map.
+    landmark: ClassVar[str]
 
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
     # Determines landmarks, ground, roads, clutter and map.
@@ -224,6 +236,8 @@ class CarrierScenario(Scenario):
 class ForestScenario(CarrierScenario):
     """A carrier in a forest stand with strip roads; the landmarks are trees."""
 
+    landmark: ClassVar[str] = "tree"
+
     # natural, clustered or plantation, see `Stand`.
     stand_kind: str = "natural"
     # Trees per hectare, before the roads are cleared.
@@ -275,3 +289,51 @@ class ForestScenario(CarrierScenario):
         from vtbdrake_diagrams.forest.world import add_forest
 
         add_forest(plant, self.stand(), self.ground(), self.vegetation())
+
+
+@dataclass
+class PlainScenario(CarrierScenario):
+    """A carrier on a rock-strewn plain of Mars with cleared tracks; the landmarks are rocks."""
+
+    landmark: ClassVar[str] = "rock"
+
+    gravity: float = 3.71
+    relief: float = 0.5
+    bumps: float = 0.02
+    scanner: LaserScannerConfig = field(default_factory=plain_scanner_config)
+    # The share of the ground that rocks cover, and the diameter of the least rocks in m, see `RockField`.
+    abundance: float = 0.05
+    least_diameter: float = 0.3
+    # Width of the tracks and distance between them, in m.
+    track_width: float = 4.0
+    track_spacing: float = 28.0
+
+    def validate(self) -> None:
+        self.require(track_width=(self.track_width >= 3.0, "at least 3 m: the carrier is 1.5 m wide"))
+        super().validate()
+
+    def rock_field(self) -> RockField:
+        """Return the rocks of the plain."""
+        return RockField(
+            self.seed,
+            length=self.length,
+            width=self.width,
+            abundance=self.abundance,
+            least_diameter=self.least_diameter,
+            track_width=self.track_width,
+            track_spacing=self.track_spacing,
+        )
+
+    def routes(self) -> tuple[Route, ...]:
+        return self.rock_field().routes()
+
+    def truth(self) -> WorldModel:
+        return self.rock_field().rocks()
+
+    def surveyed_map(self) -> WorldModel:
+        return self.rock_field().map(MAPS[self.map], seed=self.map_seed)
+
+    def add_landscape(self, plant: MultibodyPlant) -> None:
+        from vtbdrake_diagrams.forest.world import add_plain
+
+        add_plain(plant, self.rock_field(), self.ground())

@@ -1,4 +1,4 @@
-"""The simulated forest: ground, trees, branches and undergrowth as geometry of a plant."""
+"""The simulated world as geometry of a plant: forest or plain, on uneven ground."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pydrake.geometry import Mesh
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from vtbdrake.components.meshes import Surface, obj_mesh
+from vtbdrake.components.meshes import Surface, surface_mesh
 from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.plain import RockField, rock_surface
 from vtbdrake_diagrams.forest.stand import Stand
 from vtbdrake_diagrams.forest.vegetation import Vegetation, branches, crowns, trunks, undergrowth
 
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 # How far the ground goes on around a stand, in m.
 _MARGIN = 15.0
 
-_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES = (
+_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
     np.array(color)
     for color in (
         (0.35, 0.3, 0.2, 1.0),
@@ -26,6 +27,8 @@ _SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES = (
         (0.15, 0.32, 0.17, 1.0),
         (0.4, 0.37, 0.33, 1.0),
         (0.3, 0.5, 0.2, 1.0),
+        (0.6, 0.42, 0.28, 1.0),
+        (0.42, 0.32, 0.26, 1.0),
     )
 )
 
@@ -39,16 +42,29 @@ def add_surface(plant: MultibodyPlant, name: str, surface: Surface, color: Array
         surface: Vertices and triangles; one without triangles is left out.
         color: Red, green, blue and opacity, from 0 to 1, shape (4,).
     """
-    vertices, triangles = surface
-    if len(triangles):
-        mesh = Mesh(obj_mesh(vertices, triangles, name=name), 1.0)
+    if len(surface[1]):
+        mesh = Mesh(surface_mesh(surface, name=name), 1.0)
         plant.RegisterVisualGeometry(plant.world_body(), RigidTransform(), mesh, name, color)
 
 
-def add_ground(plant: MultibodyPlant, ground: Ground, *, length: float, width: float) -> None:
+def add_ground(plant: MultibodyPlant, ground: Ground, *, length: float, width: float, color: Array = _SOIL) -> None:
     """Register the ground of an area from (0, 0) to (length, width) in m, and some around it, like `add_surface`."""
     lower, upper = np.full(2, -_MARGIN), np.array([length, width]) + _MARGIN
-    add_surface(plant, "ground", ground.mesh(lower, upper), _SOIL)
+    add_surface(plant, "ground", ground.mesh(lower, upper), color)
+
+
+def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> None:
+    """Register rocks on their ground on the world body of a plant, like `add_forest`; nothing collides with them.
+
+    Args:
+        plant: A plant that is registered with a SceneGraph, and not finalized.
+        rock_field: The rocks as they are.
+        ground: What they lie on.
+    """
+    add_ground(plant, ground, length=rock_field.length, width=rock_field.width, color=_SAND)
+    rocks = rock_field.rocks()
+    if len(rocks):
+        add_surface(plant, "rocks", rock_surface(rocks, ground), _STONE)
 
 
 def add_forest(plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: Vegetation) -> None:

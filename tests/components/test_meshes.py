@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from pydrake.geometry import Mesh
 
-from vtbdrake.components.meshes import Surface, copies, joined, obj_mesh, unit_cone, unit_sphere
+from vtbdrake.components.meshes import (
+    Surface,
+    copies,
+    joined,
+    obj_mesh,
+    surface_mesh,
+    unit_cone,
+    unit_sphere,
+    vertex_normals,
+)
 
 
 def volume(surface: Surface) -> float:
@@ -43,8 +52,16 @@ def test_copies_scale_turn_and_move() -> None:
     assert volume(joined([several, one])) == pytest.approx(14.0 * volume(one))
 
 
+def test_normals_of_a_sphere_are_its_radii() -> None:
+    vertices, triangles = unit_sphere(3)
+    normals = vertex_normals((3.0 * vertices + np.array([1.0, 2.0, 3.0]), triangles))
+    np.testing.assert_allclose(normals, vertices, atol=0.01)
+
+
 def test_drake_reads_the_mesh() -> None:
     vertices, triangles = unit_sphere(2)
     hull = Mesh(obj_mesh(vertices + np.array([5.0, 0.0, 0.0]), triangles), 1.0).GetConvexHull()
     assert hull.num_vertices() == len(vertices)
+    with_normals = Mesh(surface_mesh((vertices, triangles)), 1.0)
+    assert with_normals.GetConvexHull().num_vertices() == len(vertices)
     assert np.mean([hull.vertex(k) for k in range(len(vertices))], axis=0) == pytest.approx([5.0, 0.0, 0.0])

@@ -18,21 +18,46 @@ Triangles = NDArray[np.int64]
 Surface = tuple[Array, Triangles]
 
 
-def obj_mesh(vertices: Array, faces: Sequence[Sequence[int]] | Triangles, *, name: str = "mesh") -> InMemoryMesh:
+def obj_mesh(
+    vertices: Array, faces: Sequence[Sequence[int]] | Triangles, *, normals: Array | None = None, name: str = "mesh"
+) -> InMemoryMesh:
     """Return a mesh in Wavefront's format, which Drake's `Mesh` and `Convex` read.
 
     Args:
         vertices: In m, shape (n, 3).
         faces: The vertices of each face, counted from 0, counterclockwise from outside.
+        normals: The normal of the surface at each vertex, shape (n, 3). Cameras need them.
         name: A hint that appears in Drake's messages.
     """
     from pydrake.common import MemoryFile
     from pydrake.geometry import InMemoryMesh
 
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices).tolist()]
+    marks = [str(k + 1) for k in range(len(lines))]
+    if normals is not None:
+        lines += [f"vn {x:.3g} {y:.3g} {z:.3g}" for x, y, z in normals.tolist()]
+        marks = [f"{mark}//{mark}" for mark in marks]
     rows = faces.tolist() if isinstance(faces, np.ndarray) else faces
-    lines += ["f " + " ".join([str(k + 1) for k in face]) for face in rows]
+    lines += ["f " + " ".join([marks[k] for k in face]) for face in rows]
     return InMemoryMesh(mesh_file=MemoryFile("\n".join(lines) + "\n", ".obj", name))
+
+
+def surface_mesh(surface: Surface, *, name: str = "mesh") -> InMemoryMesh:
+    """Return a surface as a mesh that cameras, scanners and Meshcat show, smoothly shaded."""
+    vertices, triangles = surface
+    return obj_mesh(vertices, triangles, normals=vertex_normals(surface), name=name)
+
+
+def vertex_normals(surface: Surface) -> Array:
+    """Return the unit normals at the vertices, (v, 3): means over the triangles around, weighted by area."""
+    vertices, triangles = surface
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    corners = triangles.T.ravel()
+    sums = [np.bincount(corners, np.tile(weighted[:, k], 3), len(vertices)) for k in range(3)]
+    normals = np.column_stack(sums)
+    unit: Array = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return unit
 
 
 def copies(surface: Surface, shapes: Array, positions: Array) -> Surface:
