@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import PassThrough
+from pydrake.systems.framework import Diagram
 
+from vtbdrake.components.localization.constellation import ConstellationMap
+from vtbdrake.components.localization.dead_reckoning import DriftModel
+from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.tracking import Tracker
+from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
+from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.sensors import ErrorModel, Imu
-from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
 from vtbdrake.components.world_model import WorldModel, load_geojson
+from vtbdrake.deployment import Deployment
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
 from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
 from vtbdrake_diagrams.forest.plain import RockField
 from vtbdrake_diagrams.forest.routes import Route
 from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
 from vtbdrake_diagrams.forest.vegetation import Vegetation
 
-PERIOD = 0.02
-"""The period of IMU, odometry and driver in s."""
+Array = NDArray[np.float64]
+
+# What a detector assumes of a scanner whose ranges are exact, in m.
+_LEAST_RANGE_NOISE = 0.005
 
 
 def plant_config() -> MultibodyPlantConfig:
@@ -98,6 +110,8 @@ class CarrierScenario(Scenario):
     route: int = 0
     start: float = 0.0
     laps: int = 100
+    # From the sample of a scan in the DPS to its pose, in s.
+    localizer_latency: float = 0.1
 
     def validate(self) -> None:
         super().validate()
@@ -114,6 +128,7 @@ class CarrierScenario(Scenario):
             speed=(0.0 <= self.speed <= 3.0, "within [0, 3] m/s"),
             start=(self.start >= 0.0, "not negative, in m"),
             laps=(self.laps >= 1, "at least 1"),
+            localizer_latency=(self.localizer_latency >= PERIOD, f"at least {PERIOD:g} s, the period of the DPS"),
         )
         try:
             self.ground()
@@ -151,7 +166,7 @@ class CarrierScenario(Scenario):
         """Add ground, landmarks and clutter to a plant that is not finalized."""
 
     def global_map(self) -> WorldModel:
-        """Return the map that the DPS has: that of ``map_file``, or a survey with errors.
+        """Return the map that the DPS has: that of ``map_file``, which has errors as ``map`` says, or a survey.
 
         Raises:
             GeoJsonError: The file is no map.
@@ -170,18 +185,32 @@ class CarrierScenario(Scenario):
             commands=[Signal("route", size=1, lower=0.0, upper=last, default=float(self.route))],
         )
 
+    def sight(self) -> Callable[[Scan, Array, float], Landmarks]:
+        """Return how the DPS finds landmarks in scans, see `Localizer`."""
+        rows, columns = raster_size(self.scanner)
+        detector = TrunkDetector(
+            azimuth_step=self.scanner.azimuth / columns,
+            elevation_step=self.scanner.elevation / rows,
+            range_noise=max(self.scanner_errors.noise, _LEAST_RANGE_NOISE),
+        )
+        return ScanLandmarks(detect_trunks, detector, self.X_BL)
+
+    def unit(self, world_map: WorldModel) -> LocalizationUnit:
+        """Return how the DPS localizes itself on a map, which has errors as ``map`` says."""
+        landmarks, correlation = map_landmarks(world_map, self.landmark), MAPS[self.map].correlation
+        x, y, _ = self.X_BL.translation().tolist()
+        return LocalizationUnit(
+            ConstellationMap(landmarks, correlation=correlation),
+            Tracker(landmarks, sensor=(x, y), correlation=correlation),
+        )
+
     def make_dps(self) -> Diagram:
-        """Return a DPS that advises the commanded route, whatever its sensors say."""
-        builder = DiagramBuilder()
-        for signal in self.interface().sense:
-            value = signal.abstract_value() if signal.name == "scan" else None
-            sink = PassThrough(value) if value is not None else PassThrough(signal.size)
-            builder.AddNamedSystem(signal.name, sink)
-            builder.ExportInput(sink.get_input_port(), signal.name)
-        route = builder.AddNamedSystem("route", PassThrough(1))
-        builder.ExportInput(route.get_input_port(), "route")
-        builder.ExportOutput(route.get_output_port(), "route")
-        return builder.Build()
+        world_map = self.global_map()
+        localizer = Localizer(self.sight(), self.unit(world_map))
+        return make_dps(world_map, localizer, latency=self.localizer_latency, drift=DriftModel())
+
+    def deployment(self) -> Deployment:
+        return make_deployment(scan_period=1.0 / self.scanner.frequency)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.

@@ -85,7 +85,7 @@ def show_world_model(
             meshcat.SetObject(f"{path}/covariance", shape, Rgba(red, green, blue, _ELLIPSOID_OPACITY))
             meshcat.SetTransform(f"{path}/covariance", X_WE)
         if label_height:
-            start, end = _strokes(one.identity, label_height)
+            start, end = text_strokes(one.identity, label_height)
             meshcat.SetLineSegments(f"{path}/label", start, end, 1.0, Rgba(red, green, blue, 1.0))
             meshcat.SetTransform(f"{path}/label", RigidTransform(one.p_WoOo_W + np.array([0.0, 0.0, 2.0 * marker])))
     return Scene(meshcat, legend={kind: chosen.get(kind, _OTHERS) for kind in sorted({one.kind for one in shown})})
@@ -102,7 +102,7 @@ def covariance_ellipsoid(one: WorldObject) -> tuple[RigidTransform, NDArray[np.f
     return RigidTransform(RotationMatrix(axes), one.p_WoOo_W), np.sqrt(np.maximum(variances, 0.0))
 
 
-def _strokes(text: str, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def text_strokes(text: str, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return begin and end of the line segments, each (3, n), of a text in the plane of x and z."""
     polygons: list[NDArray[np.float64]] = [np.array(p) for p in TextPath((0.0, 0.0), text, size=height).to_polygons()]
     outlines = [polygon[:, [0, 0, 1]] * np.array([1.0, 0.0, 1.0]) for polygon in polygons]

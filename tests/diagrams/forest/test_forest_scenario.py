@@ -158,6 +158,7 @@ def test_command_reaches_the_driver(drive: tuple[VirtualTestbed, list[Scan], np.
     testbed, _, _ = drive
     context = testbed.default_context()
     testbed.write(context, {"u.route": 1.0})
+    testbed.simulator(context).AdvanceTo(0.03)  # The DPS passes it on in its next period.
     driver = testbed.diagram.GetSubsystemByName("sim.act.driver")
     assert driver.GetInputPort("route").Eval(driver.GetMyContextFromRoot(context)) == [1.0]
 

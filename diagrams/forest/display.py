@@ -1,0 +1,150 @@
+"""The driver's display: map, pose, covariance, landmarks and status of a running localization unit, live in Meshcat.
+
+``python -m vtbdrake_diagrams.forest.display SCENARIO --url URL`` is a process of its own. It watches the live values of
+a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and has the map from the scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.cli.options import option, parse_field, scenario_argument, settings, timeout_option, url_option
+from vtbdrake.components.localization.planar import transform
+from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake.monitoring.live.client import watch
+from vtbdrake.testbed import Scenario
+from vtbdrake.visualization import make_meshcat, show_world_model
+from vtbdrake.visualization.world_model import text_strokes
+
+Array = NDArray[np.float64]
+
+POSITION, HEADING, COVARIANCE, STATUS = (
+    f"dps.env.pose.{name}" for name in ("position", "heading", "covariance", "status")
+)
+FOUND_AT, LANDMARKS = "dps.env.localizer.pose", "dps.env.localizer.landmarks"
+WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS)
+"""The addresses that the display reads."""
+
+DEVIATIONS = 3.0
+"""Size of the ellipse of the position, in standard deviations."""
+
+# By status: what is written over the carrier, in which colour (of Okabe and Ito's palette).
+_LOOKS = {
+    SEARCHING: ("searching", Rgba(0.94, 0.89, 0.26, 1.0)),
+    TRACKING: ("tracking", Rgba(0.0, 0.62, 0.45, 1.0)),
+    LOST: ("lost", Rgba(0.84, 0.37, 0.0, 1.0)),
+}
+_TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.4)
+_TRUNK_HEIGHT, _LETTERS = 1.5, 1.0
+
+
+class DriverDisplay:
+    """Draws what a localization unit knows into Meshcat, under ``display``.
+
+    The carrier stands where the pose says, with the ellipse of its position (`DEVIATIONS`) around it and the landmarks
+    of the last scan as cylinders. Without a pose there are neither: the status stands where the last pose was, or in
+    the middle of the map.
+    """
+
+    def __init__(self, meshcat: Meshcat, world_map: WorldModel) -> None:
+        """Draw the map.
+
+        Args:
+            meshcat: The server that shows it.
+            world_map: The map of the unit.
+        """
+        self._meshcat = meshcat
+        self._status: int | None = None
+        self._landmarks = self._shown = 0
+        show_world_model(meshcat, world_map, prefix="display/map", deviations=0.0, label_height=0.0)
+        middle = world_map.positions().mean(axis=0)
+        self._place = middle
+        meshcat.SetCameraPose(middle + np.array([0.0, -25.0, 45.0]), middle)
+        meshcat.SetObject("display/carrier/body", Box(2.5, 1.5, 1.0), _LOOKS[TRACKING][1])
+        meshcat.SetObject("display/carrier/ahead", Box(1.5, 0.15, 0.15), _LOOKS[TRACKING][1])
+        meshcat.SetTransform("display/carrier/ahead", RigidTransform([2.0, 0.0, 0.0]))
+        meshcat.SetObject("display/ellipse", Sphere(1.0), _ELLIPSE)
+
+    def show(self, values: Mapping[str, ArrayLike]) -> None:
+        """Show the present values of the unit, by the addresses of `WATCHED`."""
+        known = {address: np.asarray(values[address], dtype=float) for address in WATCHED}
+        status = int(known[STATUS])
+        pose = np.append(known[POSITION], known[HEADING])
+        has_pose = bool(np.isfinite(pose).all())
+        for path in ("carrier", "ellipse"):
+            self._meshcat.SetProperty(f"display/{path}", "visible", has_pose)
+        if has_pose:
+            self._place = np.append(pose[:2], 0.0)
+            X_WH = RigidTransform(RotationMatrix.MakeZRotation(pose[2]), self._place)
+            self._meshcat.SetTransform("display/carrier", X_WH @ RigidTransform([0.0, 0.0, 0.5]))
+            self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], known[COVARIANCE][:2, :2]))
+        self._show_landmarks(known[FOUND_AT], known[LANDMARKS].reshape(-1, 3))
+        self._show_status(status)
+
+    def _show_landmarks(self, X_WH: Array, landmarks: Array) -> None:
+        """Draw landmarks, rows of [x, y (m, in H), diameter (m)], where they were seen from the pose X_WH."""
+        seen = landmarks[np.isfinite(landmarks).all(axis=1)]
+        if not np.isfinite(X_WH).all():
+            seen = seen[:0]
+        for k, (place, diameter) in enumerate(zip(transform(X_WH, seen[:, :2]), seen[:, 2], strict=True)):
+            path = f"display/landmarks/{k}"
+            if k >= self._landmarks:
+                self._meshcat.SetObject(path, Cylinder(1.0, _TRUNK_HEIGHT), _TRUNK)
+                self._landmarks = k + 1
+            scaled = np.diag([diameter / 2.0, diameter / 2.0, 1.0, 1.0])
+            scaled[:3, 3] = [*place, _TRUNK_HEIGHT / 2.0]
+            self._meshcat.SetTransform(path, scaled)
+        low, high = sorted((len(seen), self._shown))
+        for k in range(low, high):
+            self._meshcat.SetProperty(f"display/landmarks/{k}", "visible", len(seen) > self._shown)
+        self._shown = len(seen)
+
+    def _show_status(self, status: int) -> None:
+        if status != self._status:
+            text, color = _LOOKS[status]
+            self._meshcat.SetLineSegments("display/status", *text_strokes(text, _LETTERS), 2.0, color)
+            self._status = status
+        self._meshcat.SetTransform("display/status", RigidTransform(self._place + np.array([0.0, 0.0, 3.0])))
+
+
+def ellipse(place: Array, covariance: Array) -> Array:
+    """Return the matrix (4, 4) that turns the unit sphere into the ellipse of a position in the plane.
+
+    Args:
+        place: The middle, (2,) in m.
+        covariance: Of the position, (2, 2) in m^2.
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    matrix = np.eye(4)
+    matrix[:2, :2] = DEVIATIONS * axes * np.sqrt(np.maximum(variances, 0.0))
+    matrix[2, 2] = 0.02
+    matrix[:2, 3] = place
+    return matrix
+
+
+@click.command()
+@scenario_argument
+@url_option
+@option("--field NAME=VALUE", "Set a field of the scenario.", name="fields", parse=parse_field, multiple=True)
+@option("--every N", "Read every Nth cycle.", type=click.IntRange(min=1), default=10)
+@timeout_option
+def main(scenario: Scenario, url: str, fields: tuple[tuple[str, Any], ...], every: int, timeout: float) -> None:
+    """Show a running localization unit in a browser, until Ctrl-C or its end."""
+    meshcat = make_meshcat()
+    scenario = scenario.with_fields(settings(fields))
+    display = DriverDisplay(meshcat, scenario.global_map())
+    click.echo(f"the display is at {meshcat.web_url()}")
+    for _, values in watch(url, WATCHED, every=every, timeout=timeout):
+        display.show(values)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""The data processing system of the localization unit: one function builds it for testbed, copies and carrier."""
+
+from __future__ import annotations
+
+import numpy as np
+from drake import lcmt_scope
+from pydrake.common.value import Value
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantValueSource,
+    ConstantVectorSource,
+    Demultiplexer,
+    Multiplexer,
+    ZeroOrderHold,
+)
+
+from vtbdrake.components.localization.dead_reckoning import DeadReckoning, DriftModel
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake.control.fallback import Hold
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.drake_messages import scan_map
+from vtbdrake.lcm.maps import vector_map
+from vtbdrake.lcm.protocol import Protocol
+from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_localizer
+
+PERIOD = 0.02
+"""The period of the DPS, of its IMU and of its wheel odometry, in s."""
+AXLE = -0.8
+"""Where the rear axle, which is not steered, is on x_B, in m."""
+
+
+def make_deployment(*, scan_period: float) -> Deployment:
+    """Return how the localization unit runs on its carrier: after a fault, the advised route stays.
+
+    Signals of numbers travel as ``lcmt_scope``; scans leave before them in the cycle of the carrier.
+
+    Args:
+        scan_period: Time from scan to scan, in s.
+    """
+    return Deployment(
+        protocol=Protocol(
+            sense=[
+                scan_map("SCAN", "scan"),
+                vector_map("ODOMETRY", lcmt_scope, {"odometry": "value"}),
+                vector_map("IMU", lcmt_scope, {"imu": "value"}),
+            ],
+            act=[vector_map("ROUTE_COMMAND", lcmt_scope, {"route": "value"})],
+            commands=[vector_map("ROUTE", lcmt_scope, {"route": "value"})],
+            periods={"SCAN": scan_period},
+        ),
+        period=PERIOD,
+        guards={"fallback": {"route": Hold()}},
+    )
+
+
+def make_dps(world_map: WorldModel, localizer: Localizer, *, latency: float, drift: DriftModel) -> Diagram:
+    """Return the DPS: ``sense`` calibrates, ``env`` localizes, ``impl`` advises the driver.
+
+    Input ports: ``scan`` (a `Scan`), ``imu`` (6), ``odometry`` (1), and the command ``route`` (1: the number of the
+    route that is advised). Output port: ``route`` (1).
+
+    ``env`` has the map as a constant, ``map``: it is part of the DPS, and stays when the simulated world is left out.
+    Every part is sampled and shows its own state: no input feeds through.
+
+    Args:
+        world_map: What the carrier knows of the world, as the localizer uses it.
+        localizer: How scans are evaluated.
+        latency: From the sample of a scan to its pose, in s.
+        drift: How the dead reckoning drifts.
+    """
+    builder = DiagramBuilder()
+    sense = builder.AddNamedSystem("sense", _make_sense())
+    env = builder.AddNamedSystem("env", _make_env(world_map, localizer, latency=latency, drift=drift))
+    impl = builder.AddNamedSystem("impl", _make_impl())
+    for signal in ("imu", "odometry"):
+        builder.ExportInput(sense.GetInputPort(signal), signal)
+        builder.Connect(sense.GetOutputPort(signal), env.GetInputPort(signal))
+    builder.ExportInput(env.GetInputPort("scan"), "scan")
+    builder.ExportInput(impl.GetInputPort("route"), "route")
+    builder.ExportOutput(impl.GetOutputPort("route"), "route")
+    dps = builder.Build()
+    dps.set_name("dps")
+    return dps
+
+
+def _make_sense() -> Diagram:
+    """Return the system that adds the parameter ``offset`` to the raw values of IMU and odometry."""
+    builder = DiagramBuilder()
+    sizes = [6, 1]
+    raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
+    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
+    measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
+    split = builder.AddNamedSystem("split", Demultiplexer(sizes))
+    builder.Connect(raw.get_output_port(), measured.get_input_port(0))
+    builder.Connect(offset.get_output_port(), measured.get_input_port(1))
+    builder.Connect(measured.get_output_port(), split.get_input_port())
+    for k, signal in enumerate(("imu", "odometry")):
+        builder.ExportInput(raw.get_input_port(k), signal)
+        builder.ExportOutput(split.get_output_port(k), signal)
+    return builder.Build()
+
+
+def _make_env(world_map: WorldModel, localizer: Localizer, *, latency: float, drift: DriftModel) -> Diagram:
+    """Return the perceived environment: the map, and where the carrier is on it."""
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
+    reckoning = builder.AddNamedSystem("dead_reckoning", DeadReckoning(period=PERIOD, axle=AXLE))
+    part = add_localizer(builder, reckoning, localizer, period=PERIOD, latency=latency)
+    pose = builder.AddNamedSystem("pose", PresentPose(period=PERIOD, drift=drift))
+    builder.Connect(reckoning.GetOutputPort("motion"), pose.GetInputPort("motion"))
+    for port in ("pose", "covariance", "status", "odometry", "time"):
+        builder.Connect(part.GetOutputPort(port), pose.GetInputPort(port))
+    for signal in ("imu", "odometry"):
+        builder.ExportInput(reckoning.GetInputPort(signal), signal)
+    return builder.Build()
+
+
+def _make_impl() -> Diagram:
+    """Return the system that passes the advice on, one period later."""
+    builder = DiagramBuilder()
+    route = builder.AddNamedSystem("route", ZeroOrderHold(PERIOD, 1))
+    builder.ExportInput(route.get_input_port(), "route")
+    builder.ExportOutput(route.get_output_port(), "route")
+    return builder.Build()

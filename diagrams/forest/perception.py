@@ -1,0 +1,247 @@
+"""The perception in the DPS of the localization unit: scans become landmarks, and landmarks the pose on the map.
+
+A scan is dated by the clock of the DPS when it arrives (`Arrival`). The slow part ``localizer`` takes it one period
+later: the history of the dead reckoning, which then ends one period before the arrival, reaches the scan's time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+
+from vtbdrake.components.arrival import Arrival
+from vtbdrake.components.localization.dead_reckoning import (
+    MOTION,
+    DeadReckoning,
+    DriftModel,
+    body_rotation,
+    carrier_pose_at,
+    deskewed,
+    history_size,
+)
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose, inverse, rotation
+from vtbdrake.components.localization.unit import (
+    UNIT_STATE_CODEC,
+    Localization,
+    LocalizationUnit,
+    UnitState,
+)
+from vtbdrake.scan import Scan
+from vtbdrake.state import discrete_state
+from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.testbed.slow_part import SlowPart
+
+Array = NDArray[np.float64]
+
+SHOWN = 64
+"""How many landmarks the port ``landmarks`` of the localizer shows at most: the nearest."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLandmarks:
+    """Landmarks from scans.
+
+    Attributes:
+        detect: The detector, such as `detect_trunks`.
+        settings: Its second argument, such as a `TrunkDetector`.
+        X_BL: Pose of the scanner, as the DPS knows it.
+    """
+
+    detect: Callable[..., Landmarks]
+    settings: Any
+    X_BL: RigidTransform
+
+    def __call__(self, scan: Scan, history: Array, time: float) -> Landmarks:
+        """Return the landmarks in the level frame H at the time of the scan.
+
+        Args:
+            scan: What was measured.
+            history: The port ``history`` of the `DeadReckoning`.
+            time: When the scan was complete, by the clock of the DPS, in s.
+        """
+        points_H = deskewed(scan, history, self.X_BL, time=time)
+        _, roll, pitch, *_ = carrier_pose_at(history, time)
+        p_HoLo_H = body_rotation(roll, pitch) @ self.X_BL.translation()
+        return self.detect(points_H, self.settings, p_HoLo_H=p_HoLo_H)
+
+
+@dataclass(frozen=True, eq=False)
+class Localizer:
+    """The localization from landmarks to the pose: the function of the slow part ``localizer``.
+
+    Attributes:
+        see: Returns the landmarks in a scan, such as `ScanLandmarks`.
+        unit: The localization on the map.
+    """
+
+    see: Callable[[Scan, Array, float], Landmarks]
+    unit: LocalizationUnit
+
+    def __call__(
+        self, *, scan: Scan, scan_time: Array, request: Array, history: Array, memory: UnitState
+    ) -> tuple[dict[str, Any], UnitState]:
+        """Return the outputs of the slow part, and the memory of the unit."""
+        taken = float(scan_time[0])
+        landmarks = self.see(scan, history, taken)
+        found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
+        outputs = {
+            "pose": found.pose,
+            "covariance": found.covariance.ravel(),
+            "status": [found.status],
+            "time": [found.time],
+            "odometry": found.X_OH,
+            "detected": [len(landmarks)],
+            "matched": [found.matched],
+            "nis": [found.nis],
+            "range_bias": [found.range_bias],
+            "landmarks": shown(landmarks),
+        }
+        return outputs, memory
+
+
+def shown(landmarks: Landmarks) -> Array:
+    """Return the nearest landmarks as rows of [x, y (m, in H), diameter (m)], (3 `SHOWN`,); rows of NaN fill up."""
+    rows = np.full((SHOWN, 3), np.nan)
+    nearest = np.argsort(np.linalg.norm(landmarks.positions, axis=1), kind="stable")[:SHOWN]
+    rows[: len(nearest), :2] = landmarks.positions[nearest]
+    rows[: len(nearest), 2] = landmarks.diameters[nearest]
+    return rows.ravel()
+
+
+class PresentPose(LeafSystem):
+    r"""The pose of the carrier on the map at present: what the localizer found, and the way since then.
+
+    .. pydrake_system::
+
+        name: PresentPose
+        input_ports:
+        - motion
+        - pose
+        - covariance
+        - status
+        - odometry
+        - time
+        output_ports:
+        - pose_estimate
+
+    ``motion`` is that of a `DeadReckoning`; the other inputs are those of the slow part ``localizer``: the pose X_WH
+    (3,) with its covariance (9,), the status, and the pose X_OH (3,) and the time (s) for which they hold. With the
+    present pose in O, which continues with the last speed and turn rate until the time of the update,
+
+        X_WH(now) = X_WH X_OH^-1 X_OH(now),
+
+    and the covariance grows as the `DriftModel` says. ``pose_estimate`` is [time (s), x, y (m), heading (rad),
+    covariance (9,), status]. Without a pose on the map, the pose is NaN and its variances are
+    infinite, as the localizer says.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float, drift: DriftModel) -> None:
+        """Declare the system, with the period of its updates in s, and how the dead reckoning drifts."""
+        super().__init__()
+        self._drift = drift
+        sizes = {"motion": MOTION, "pose": 3, "covariance": 9, "status": 1, "odometry": 3, "time": 1}
+        self._ports = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
+        first = Localization.unknown()
+        estimate = self.DeclareDiscreteState(np.array([0.0, *first.pose, *first.covariance.ravel(), first.status]))
+        self.DeclareStateOutputPort("pose_estimate", estimate)
+        index = int(estimate)
+        self.variables = (
+            discrete_state("time", index, unit="s"),
+            discrete_state("position", index, start=1, shape=(2,), unit="m"),
+            discrete_state("heading", index, start=3, unit="rad"),
+            discrete_state("covariance", index, start=4, shape=(3, 3), unit="m^2, rad^2"),
+            discrete_state("status", index, start=13),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        motion, pose, covariance, status, X_OH, time = (port.Eval(context) for port in self._ports.values())
+        now = context.get_time()
+        if np.isfinite(covariance).all():
+            since, _, _, x, y, heading, speed, turn_rate = motion.tolist()
+            turn = turn_rate * (now - since)
+            way = speed * (now - since)
+            X_OH_now = compose([x, y, heading], [way * np.cos(turn / 2), way * np.sin(turn / 2), turn])
+            X_HH_now = compose(inverse(X_OH), X_OH_now)
+            pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - float(time[0]))
+        state.set_value(0, [now, *pose, *covariance.ravel(), status[0]])
+
+
+def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, duration: float) -> tuple[Array, Array]:
+    """Return the pose (3,) after a motion by dead reckoning, and its covariance (3, 3).
+
+    Args:
+        X_WH: The pose before, (3,) in m and rad.
+        covariance: Its covariance, (3, 3).
+        motion: From there, (3,) in m and rad.
+        drift: How the dead reckoning drifts.
+        duration: How long the motion took, in s.
+    """
+    pose = compose(X_WH, motion)
+    by_pose, by_motion = np.eye(3), np.eye(3)
+    by_pose[:2, 2] = [X_WH[1] - pose[1], pose[0] - X_WH[0]]
+    by_motion[:2, :2] = rotation(float(X_WH[2]))
+    return pose, by_pose @ covariance @ by_pose.T + by_motion @ drift.covariance(motion, duration) @ by_motion.T
+
+
+def add_localizer(
+    builder: DiagramBuilder, reckoning: DeadReckoning, localizer: Localizer, *, period: float, latency: float
+) -> SlowPart:
+    """Add the slow part ``localizer`` with its ``scan_arrival``, and the input port ``scan`` of their Diagram.
+
+    Args:
+        builder: Of the Diagram ``env`` of the DPS.
+        reckoning: Remembers the poses of the carrier.
+        localizer: What is computed.
+        period: The period of the DPS, in s.
+        latency: From the sample of a scan to its pose, in s.
+
+    Returns:
+        The part, with the outputs of `Localizer`.
+    """
+    first = Localization.unknown()
+    part = SlowPart(
+        localizer,
+        inputs={"scan": Scan.empty(), "scan_time": 1, "history": history_size(period)},
+        outputs={
+            "pose": 3,
+            "covariance": 9,
+            "status": 1,
+            "time": 1,
+            "odometry": 3,
+            "detected": 1,
+            "matched": 1,
+            "nis": 1,
+            "range_bias": 1,
+            "landmarks": 3 * SHOWN,
+        },
+        initial={
+            "pose": first.pose,
+            "covariance": first.covariance.ravel(),
+            "status": [first.status],
+            "time": [first.time],
+            "landmarks": shown(Landmarks.empty()),
+        },
+        memory=localizer.unit.start(),
+        codecs={"memory": UNIT_STATE_CODEC},
+        period=period,
+        latency=latency,
+        offset=period,
+        on_request=True,
+    )
+    arrival = builder.AddNamedSystem("scan_arrival", Arrival(Scan.empty(), period=period, age=period))
+    builder.AddNamedSystem("localizer", part)
+    for output, port in {"sample": "scan", "time": "scan_time", "number": "request"}.items():
+        builder.Connect(arrival.GetOutputPort(output), part.GetInputPort(port))
+    builder.Connect(reckoning.GetOutputPort("history"), part.GetInputPort("history"))
+    builder.ExportInput(arrival.GetInputPort("signal"), "scan")
+    return part

@@ -1,0 +1,227 @@
+"""The DPS of the localization unit: simulated, beside a machine, and replayed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context
+
+from tests.diagrams.forest.riding import SCAN_PERIOD, RidingScenario, pose
+from tests.visualization.meshcat_page import messages
+from vtbdrake.components.localization.landmarks import map_landmarks
+from vtbdrake.components.localization.planar import wrap
+from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.monitoring.live.client import LiveWatch
+from vtbdrake.recording import read_log
+from vtbdrake.recording.replay import replay
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
+from vtbdrake.visualization import make_meshcat
+from vtbdrake_diagrams.forest.carrier import Carrier
+from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay
+from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+
+POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
+CYCLES = 200
+TIMEOUT = 60.0  # s; for a computer that is busy with other things
+
+
+@cache
+def built(**fields: float) -> VirtualTestbed:
+    return RidingScenario(**fields).build()
+
+
+def error(system: VirtualTestbed | DpsAlone, context: Context) -> tuple[float, float]:
+    """Return by how much position (m) and heading (rad) of the present pose are off."""
+    truth = pose(float(system.read(context, f"{POSE}.time")))
+    heading = float(system.read(context, f"{POSE}.heading"))
+    return float(np.linalg.norm(system.read(context, f"{POSE}.position") - truth[:2])), abs(wrap(heading - truth[2]))
+
+
+def test_pose_is_found_without_a_guess_and_followed() -> None:
+    testbed = built()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(SCAN_PERIOD + PERIOD)
+    assert testbed.read(context, f"{POSE}.status") == SEARCHING
+    assert np.isnan(testbed.read(context, f"{POSE}.position")).all()
+    assert np.isinf(np.diag(testbed.read(context, f"{POSE}.covariance"))).all()
+    errors = []
+    while context.get_time() < 6.0:
+        simulator.AdvanceTo(context.get_time() + 0.25)
+        if testbed.read(context, f"{POSE}.status") == TRACKING:
+            errors.append(error(testbed, context))
+            deviations = np.sqrt(np.diag(testbed.read(context, f"{POSE}.covariance")))
+            assert errors[-1][0] < 4.0 * np.hypot(*deviations[:2])
+    assert len(errors) > 15
+    position, heading = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert position < 0.05
+    assert heading < np.radians(0.2)
+    assert testbed.read(context, f"{LOCALIZER}.matched") > 20.0
+
+
+def test_carrier_localizes_itself_in_a_forest() -> None:
+    testbed = ForestScenario(seed=1, length=50.0, width=50.0, start=12.0).build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(1.7)
+    assert testbed.read(context, f"{POSE}.status") == TRACKING
+    x, y, _, *_, yaw = testbed.read(context, "sim.sys.carrier.base.pose")
+    assert np.linalg.norm(testbed.read(context, f"{POSE}.position") - [x, y]) < 0.08
+    assert abs(wrap(float(testbed.read(context, f"{POSE}.heading")) - yaw)) < np.radians(0.4)
+
+
+def test_axle_of_the_carrier_is_the_one_that_the_dps_knows() -> None:
+    assert Carrier().wheel_base / 2.0 == -AXLE
+
+
+def test_pose_is_of_the_present() -> None:
+    testbed = built()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(4.005)
+    assert testbed.read(context, f"{POSE}.time") == 4.0
+    # The last scan is older, and was seen from a place some decimetres behind.
+    found = testbed.read(context, f"{LOCALIZER}.time")
+    assert 4.0 - found > 0.15
+    assert np.linalg.norm(testbed.read(context, f"{POSE}.position") - pose(float(found))[:2]) > 0.15
+    assert error(testbed, context)[0] < 0.05
+
+
+def test_without_trees_in_sight_the_unit_is_lost_and_recovers() -> None:
+    testbed = built(blind_from=3.0, blind_until=7.0)
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    seen = {}
+    for time in (2.9, 6.9, 10.0):
+        simulator.AdvanceTo(time)
+        seen[time] = int(testbed.read(context, f"{POSE}.status"))
+    assert (seen[2.9], seen[10.0]) == (TRACKING, TRACKING)
+    assert seen[6.9] in (TRACKING, LOST)
+    assert error(testbed, context)[0] < 0.1
+
+
+@pytest.mark.parametrize("broken", [2, 6])
+def test_numbers_that_are_not_finite_do_no_harm(broken: int) -> None:
+    testbed = built(broken=broken)
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(3.0)
+    assert testbed.read(context, "dps.env.dead_reckoning.ignored") == 5.0
+    assert testbed.read(context, f"{POSE}.status") == TRACKING
+    assert error(testbed, context)[0] < 0.1
+
+
+def test_map_stays_when_the_world_is_left_out() -> None:
+    scenario = RidingScenario()
+    dps = DpsAlone(scenario)
+    env = dps.dps.GetSubsystemByName("env")
+    world_map = env.GetSubsystemByName("map")
+    held = world_map.get_output_port().Eval(world_map.CreateDefaultContext())
+    assert isinstance(held, WorldModel)
+    assert len(held) == len(scenario.global_map())
+
+
+def test_advice_reaches_the_driver_one_period_later() -> None:
+    testbed = built()
+    context = testbed.default_context()
+    testbed.write(context, {"u.route": 3.0})
+    testbed.simulator(context).AdvanceTo(2.5 * PERIOD)
+    assert testbed.read(context, "dps.impl.route") == 3.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive in lock-step with a machine: the DPS and its context in the end, the log, and what a client has seen."""
+
+    dps: DpsAlone
+    context: Context
+    log: Path
+    seen: dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    scenario, log = RidingScenario(), tmp_path_factory.mktemp("drive") / "drive.lcm"
+    dps = DpsAlone(scenario)
+    context = dps.default_context()
+    with (
+        Hub(port=0) as hub,
+        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        scenario.deploy(
+            hub.url,
+            target=dps,
+            context=context,
+            deployment=Deployment.of(scenario).in_lock_step("imu"),
+            record=log,
+            live=True,
+        ) as runtime,
+        LiveWatch(hub.url, WATCHED, timeout=TIMEOUT) as live,
+    ):
+        assert runtime.slow_parts.wait(TIMEOUT)
+        runtime.take_over()
+        # A machine in lock-step leaves no time to compute. The first cycle receives; the second commands.
+        runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
+        assert not runtime.guards.latched
+        live.wait(10, timeout=TIMEOUT)
+        return Drive(dps, context, log, live.arrays())
+
+
+def test_unit_beside_a_machine_localizes_as_in_simulation(drive: Drive) -> None:
+    testbed = built()
+    simulated = testbed.default_context()
+    testbed.simulator(simulated).AdvanceTo((CYCLES - 1) * PERIOD)
+    assert drive.dps.read(drive.context, f"{POSE}.status") == TRACKING
+    # Points travel with 32 bits.
+    for name in ("position", "heading"):
+        expected = testbed.read(simulated, f"{POSE}.{name}")
+        np.testing.assert_allclose(drive.dps.read(drive.context, f"{POSE}.{name}"), expected, atol=1e-3)
+
+
+def test_log_of_a_drive_is_replayed_to_the_last_bit(drive: Drive) -> None:
+    report = replay(read_log(drive.log))
+    assert report.identical
+    assert report.digests > 0
+
+
+def drawn(meshcat: Meshcat, kind: str) -> dict[str, Any]:
+    """Return what the page sets, by path below ``display``: matrices (4, 4) of transforms, or values of visibility."""
+    found = [
+        m for m in messages(meshcat.StaticHtml()) if m["type"] == kind and m.get("property", "visible") == "visible"
+    ]
+    value = {"set_transform": lambda m: np.reshape(m["matrix"], (4, 4)).T, "set_property": lambda m: m["value"]}[kind]
+    return {m["path"].removeprefix("/drake/display/"): value(m) for m in found}
+
+
+def test_display_follows_the_pose(drive: Drive) -> None:
+    meshcat = make_meshcat()
+    display = DriverDisplay(meshcat, RidingScenario().global_map())
+    before, *_, last = np.flatnonzero(drive.seen[STATUS] == TRACKING)
+    searching = np.flatnonzero(drive.seen[STATUS] == SEARCHING)[0]
+    display.show({address: drive.seen[address][searching] for address in WATCHED})
+    assert drawn(meshcat, "set_property")["carrier"] is False
+    for k in (before, last):
+        display.show({address: drive.seen[address][k] for address in WATCHED})
+        matrices = drawn(meshcat, "set_transform")
+        truth = pose(round(drive.seen["time"][k] / PERIOD) * PERIOD)
+        X_WH = matrices["carrier"]
+        assert np.linalg.norm(X_WH[:2, 3] - truth[:2]) < 0.1
+        assert np.arctan2(X_WH[1, 0], X_WH[0, 0]) == pytest.approx(truth[2], abs=0.02)
+        np.testing.assert_allclose(matrices["status"][:2, 3], X_WH[:2, 3])
+        # Nine of ten landmarks stand where a tree is; the others may be of the scan before.
+        places = np.array([m[:2, 3] for path, m in matrices.items() if path.startswith("landmarks")])
+        trees = map_landmarks(RidingScenario().truth()).positions
+        nearest = np.linalg.norm(places[:, None] - trees, axis=2).min(axis=1)
+        assert len(places) > 10
+        assert np.quantile(nearest, 0.9) < 0.3
+        ellipse = matrices["ellipse"][:2, :2]
+        covariance = drive.seen["dps.env.pose.covariance"][k][:2, :2]
+        np.testing.assert_allclose(ellipse @ ellipse.T, 9.0 * covariance, rtol=1e-6)
+    assert drawn(meshcat, "set_property")["carrier"] is True
