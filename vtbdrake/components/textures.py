@@ -35,25 +35,31 @@ def textured_mesh(
         triangles: Indices of three vertices each, counterclockwise seen from outside, shape (t, 3).
         image: Colours, shape (h, w, 3), or greys, shape (h, w).
     """
+    corners = np.repeat(np.asarray(triangles, dtype=np.int64)[..., np.newaxis], 3, axis=2)
+    return _mesh(vertices, coordinates, normals, corners, image)
+
+
+def _mesh(
+    vertices: ArrayLike, coordinates: ArrayLike, normals: ArrayLike, corners: ArrayLike, image: NDArray[np.uint8]
+) -> Mesh:
+    """Return a mesh of triangles whose corners have a vertex, coordinates and a normal each: indices (t, 3, 3)."""
     from pydrake.common import MemoryFile
     from pydrake.geometry import InMemoryMesh, Mesh
 
-    corners = np.repeat(np.asarray(triangles, dtype=np.int64) + 1, 3, axis=1)
-    lines = ["mtllib texture.mtl", "usemtl texture"]
+    obj = "mtllib texture.mtl\nusemtl texture\n"
     for line, rows in (
-        ("v %.9f %.9f %.9f", vertices),
-        ("vn %.9f %.9f %.9f", normals),
-        ("vt %.9f %.9f", coordinates),
-        ("f %d/%d/%d %d/%d/%d %d/%d/%d", corners),
+        ("v %.9f %.9f %.9f\n", np.asarray(vertices)),
+        ("vt %.9f %.9f\n", np.asarray(coordinates)),
+        ("vn %.9f %.9f %.9f\n", np.asarray(normals)),
+        ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.asarray(corners) + 1),
     ):
-        lines += [line % tuple(row) for row in np.asarray(rows).tolist()]
+        obj += line * len(rows) % tuple(rows.ravel().tolist())
     material = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n"
     files = {
         "texture.mtl": MemoryFile(material.encode(), ".mtl", "texture.mtl"),
         "texture.png": MemoryFile(png(image), ".png", "texture.png"),
     }
-    obj = MemoryFile("\n".join([*lines, ""]).encode(), ".obj", "texture.obj")
-    return Mesh(InMemoryMesh(mesh_file=obj, supporting_files=files))
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(obj.encode(), ".obj", "texture.obj"), supporting_files=files))
 
 
 def tiled_mesh(
@@ -73,11 +79,12 @@ def tiled_mesh(
     Raises:
         ValueError: A triangle is larger than the image.
     """
-    corners = np.asarray(vertices, dtype=float)[np.asarray(triangles, dtype=np.int64)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    indices = np.asarray(triangles, dtype=np.int64)
+    points = np.asarray(vertices, dtype=float)[indices]
+    normals = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(np.abs(normals), axis=1)]
-    across = np.take_along_axis(corners, axes[:, np.newaxis, :], axis=2) / tile
+    across = np.take_along_axis(points, axes[:, np.newaxis, :], axis=2) / tile
     folded = across - np.floor(across.min(axis=1, keepdims=True))
     if folded.max(initial=0.0) > 2.0:
         extent = np.ptp(across, axis=1).max(axis=0) * tile
@@ -85,14 +92,11 @@ def tiled_mesh(
             f"a triangle extends over {extent[0]:.3g} x {extent[1]:.3g} m, more than the image of {tile[0]:g} x "
             f"{tile[1]:g} m: give a larger tile, or divide the triangle"
         )
+    count = np.arange(len(indices))
+    of_triangles = np.repeat(count[:, np.newaxis], 3, axis=1)
+    corners = np.stack([indices, 3 * count[:, np.newaxis] + np.arange(3), of_triangles], axis=-1)
     # Renderers do not repeat an image: here it is twice as wide and high, so that a triangle may cross its edges.
-    return textured_mesh(
-        corners.reshape(-1, 3),
-        normals=np.repeat(normals, 3, axis=0),
-        coordinates=0.5 * folded.reshape(-1, 2),
-        triangles=np.arange(3 * len(corners)).reshape(-1, 3),
-        image=np.tile(image, (2, 2, 1)),
-    )
+    return _mesh(vertices, 0.5 * folded.reshape(-1, 2), normals, corners, np.tile(image, (2, 2, 1)))
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
