@@ -1,0 +1,225 @@
+"""Trunks of trees from the disparities of a pair of cameras: where their axes stand, and how thick they are.
+
+All pixels of a trunk have about the same disparity, and lie above each other. So pixels are counted by column and
+disparity, as a level camera at the same place would see them: a cell with enough of them, one above the other, belongs
+to an upright object. Neighbouring cells are one trunk, whose columns give its direction and its width, and whose mean
+disparity gives its distance. In this space the errors are the same near and far, which they are not in that of the
+points. Ground, which is spread over many disparities, and twigs fall out without being modelled.
+
+The disparities of one trunk do not err independently: the errors of its distance do not vanish with the number of
+pixels. The deviations that the detector states are calibrated, see `StereoTrunkDetector`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from scipy.ndimage import convolve1d, find_objects, label
+
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.perception.stereo import StereoCamera
+
+Array = NDArray[np.float64]
+
+# Cells per pixel of disparity. A trunk of one disparity is spread over three.
+_CELLS = 2
+_SPREAD = 3
+# How many columns beside a trunk are looked at.
+_BESIDE = 2
+# The face of a cylinder lies before its axis by pi / 4 of its radius, as a mean over the columns that show it.
+_FACE = pi / 4.0
+
+
+@dataclass(frozen=True)
+class StereoTrunkDetector:
+    """How trunks are found in disparities.
+
+    Attributes:
+        heights: The lower and the upper end of the slice that is looked at, in m above the camera.
+        extent: The least height in m of the part of an object that is seen within the slice.
+        reach: Distance in m up to which trunks are looked for.
+        least_diameter: The least diameter of a trunk in m.
+        largest_diameter: Its largest diameter in m.
+        disparity_deviation: Standard deviation of the mean disparity of a trunk, in pixels.
+        disparity_bias: What all disparities may be wrong by in common, in pixels: cameras are never quite aligned.
+        middle_deviation: Standard deviation of the column of the middle of a trunk, in pixels.
+        width_deviation: Standard deviation of its width, in pixels.
+        fattening: By how much trunks seem too wide, in pixels: matching spreads what is near.
+        floor: Standard deviation in m, per axis, that nothing improves: trunks are neither round nor upright.
+
+    Raises:
+        ValueError: A value that no detector can have.
+    """
+
+    heights: tuple[float, float] = (-1.3, 1.5)
+    extent: float = 1.8
+    reach: float = 16.0
+    least_diameter: float = 0.04
+    largest_diameter: float = 0.7
+    disparity_deviation: float = 0.2
+    disparity_bias: float = 0.05
+    middle_deviation: float = 1.2
+    width_deviation: float = 3.0
+    fattening: float = 1.0
+    floor: float = 0.02
+
+    def __post_init__(self) -> None:
+        low, high = self.heights
+        checks = {
+            "heights": (-inf < low < high < inf, "in m, two heights above the camera, the lower one first"),
+            "extent": (0.0 < self.extent < high - low, "in m, positive and less than the slice is high"),
+            "reach": (0.0 < self.reach < inf, "in m, positive"),
+            "least_diameter": (0.0 <= self.least_diameter < self.largest_diameter, "in m, below the largest_diameter"),
+            "largest_diameter": (self.largest_diameter < inf, "in m, finite"),
+            "disparity_deviation": (0.0 < self.disparity_deviation < inf, "in pixels, positive"),
+            "disparity_bias": (0.0 <= self.disparity_bias < inf, "in pixels, at least 0"),
+            "middle_deviation": (0.0 < self.middle_deviation < inf, "in pixels, positive"),
+            "width_deviation": (0.0 < self.width_deviation < inf, "in pixels, positive"),
+            "fattening": (0.0 <= self.fattening < inf, "in pixels, at least 0"),
+            "floor": (0.0 <= self.floor < inf, "in m, at least 0"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                raise ValueError(f"StereoTrunkDetector: {name} must be {expected}, not {getattr(self, name)!r}")
+
+
+def detect_stereo_trunks(
+    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetector, *, X_HC: RigidTransform
+) -> Landmarks:
+    """Find the trunks in the disparities of an image.
+
+    Args:
+        disparity: The disparity of each pixel of the left image, (h, w), NaN where it is unknown.
+        camera: The pair of cameras.
+        detector: How trunks are found.
+        X_HC: The pose of the left camera in the level frame H of the carrier. Its optical axis is about horizontal.
+
+    Returns:
+        The trunks in H, with the deviations that the detector states. Of a trunk that is partly hidden, the diameter is
+        not known.
+    """
+    ahead, right, heading = _level(disparity, camera, detector, X_HC)
+    if not len(ahead):
+        return Landmarks.empty()
+    grid = _Grid(camera, ahead, right)
+    found = [row for trunk in grid.trunks(detector.extent) if (row := _measured(trunk, camera, detector)) is not None]
+    if not found:
+        return Landmarks.empty()
+    distance, bearing, diameter, is_whole = np.array(found).T
+    return _landmarks(distance, heading - bearing, diameter, is_whole > 0.0, camera, detector, X_HC)
+
+
+def _level(
+    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetector, X_HC: RigidTransform
+) -> tuple[Array, Array, float]:
+    """Return the points of the slice as a level camera sees them: ahead and to its right (m), and its heading in H."""
+    axis_H = X_HC.rotation().matrix()[:, 2]
+    heading = float(np.arctan2(axis_H[1], axis_H[0]))
+    c, s = np.cos(heading), np.sin(heading)
+    R_LC = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, 1.0]]) @ X_HC.rotation().matrix()
+    near = disparity > camera.focal_length * camera.baseline / detector.reach
+    ahead, right, above = R_LC @ camera.points(disparity)[near].T
+    low, high = detector.heights
+    kept = (above > low) & (above < high) & (ahead > 2.0 * camera.baseline)
+    return ahead[kept], right[kept], heading
+
+
+@dataclass(frozen=True, eq=False)
+class _Trunk:
+    """An upright object: its width and the column of its middle from the optical axis (pixels), and its disparity."""
+
+    middle: float
+    width: float
+    disparity: float
+    is_hidden: bool
+
+
+class _Grid:
+    """The height (m) of what is seen in each column (pixels from the optical axis) at each disparity."""
+
+    def __init__(self, camera: StereoCamera, ahead: Array, right: Array) -> None:
+        f = camera.focal_length
+        disparity = f * camera.baseline / ahead
+        # Columns beyond the image, because it is rolled and pitched.
+        self._first = -int(1.2 * camera.center_x)
+        columns = np.floor(f * right / ahead).astype(int) - self._first
+        self._shape = (int(1.2 * camera.width) + 1, int(disparity.max() * _CELLS) + 2)
+        inside = (columns >= 0) & (columns < self._shape[0])
+        cells = columns[inside] * self._shape[1] + (disparity[inside] * _CELLS).astype(int)
+        height = ahead[inside] / f
+        self._height = self._sum(cells, height)
+        self._moment = self._sum(cells, height * disparity[inside])
+
+    def _sum(self, cells: NDArray[np.int64], values: Array) -> Array:
+        total = np.bincount(cells, values, minlength=self._shape[0] * self._shape[1])
+        return np.asarray(total, dtype=float).reshape(self._shape)
+
+    def trunks(self, extent: float) -> list[_Trunk]:
+        """Return the upright objects that are at least ``extent`` (m) high."""
+        upright = convolve1d(self._height, np.ones(_SPREAD), axis=1, mode="constant") > extent
+        labels, _ = label(upright, np.ones((3, 3)))
+        return [
+            self._trunk(labels[part] == number, part, upright) for number, part in enumerate(find_objects(labels), 1)
+        ]
+
+    def _trunk(self, own: NDArray[np.bool_], part: tuple[slice, slice], upright: NDArray[np.bool_]) -> _Trunk:
+        columns, cells = part
+        first, last = max(columns.start - _BESIDE, 0), columns.stop + _BESIDE
+        profile = self._height[first:last, cells].sum(axis=1)
+        share = np.minimum(profile / np.median(profile[columns.start - first : columns.stop - first]), 1.0)
+        width = float(share.sum())
+        middle = float(share @ np.arange(first, first + len(share))) / width + 0.5 + self._first
+        disparity = float((self._moment[part] * own).sum() / (self._height[part] * own).sum())
+        beside = np.r_[first : columns.start, columns.stop : min(last, self._shape[0])]
+        return _Trunk(middle, width, disparity, bool(upright[beside, cells.stop :].any()))
+
+
+def _measured(
+    trunk: _Trunk, camera: StereoCamera, detector: StereoTrunkDetector
+) -> tuple[float, float, float, float] | None:
+    """Return distance (m) and bearing to the right (rad) of an axis, its diameter (m), and 1 if all of it is seen."""
+    f, width = camera.focal_length, max(trunk.width - detector.fattening, 0.5)
+    slant = np.hypot(1.0, trunk.middle / f)
+    sine = np.sin(0.5 * width / f / slant**2)
+    distance = slant * float(camera.depth(trunk.disparity)) / (1.0 - _FACE * sine)
+    diameter = 2.0 * distance * sine
+    tolerance = 2.0 * detector.width_deviation * distance / f
+    if not detector.least_diameter - tolerance < diameter < detector.largest_diameter + tolerance:
+        return None
+    # The right camera does not see what is at the left edge of the left image.
+    left, right = trunk.disparity - camera.center_x + _BESIDE, camera.width - camera.center_x - _BESIDE
+    is_cut = trunk.middle - 0.5 * trunk.width < left or trunk.middle + 0.5 * trunk.width > right
+    return distance, float(np.arctan(trunk.middle / f)), diameter, float(not (is_cut or trunk.is_hidden))
+
+
+def _landmarks(
+    distance: Array,
+    direction: Array,
+    diameter: Array,
+    is_whole: NDArray[np.bool_],
+    camera: StereoCamera,
+    detector: StereoTrunkDetector,
+    X_HC: RigidTransform,
+) -> Landmarks:
+    """Return landmarks in H at distances (m) in directions (rad) from the camera."""
+    along = np.column_stack([np.cos(direction), np.sin(direction)])
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    disparity_deviation = np.hypot(detector.disparity_deviation, detector.disparity_bias)
+    range_variance = camera.depth_deviation(distance, disparity_deviation=disparity_deviation) ** 2
+    pixel = distance / camera.focal_length
+    # The hidden part of a trunk is between nothing and another half of it.
+    cross_variance = (detector.middle_deviation * pixel) ** 2 + np.where(is_whole, 0.0, (0.5 * diameter) ** 2)
+    covariances = detector.floor**2 * np.eye(2) + sum(
+        variance[:, None, None] * axis[:, :, None] * axis[:, None, :]
+        for variance, axis in ((range_variance, along), (cross_variance, across))
+    )
+    return Landmarks(
+        X_HC.translation()[:2] + distance[:, None] * along,
+        covariances,
+        diameter,
+        np.where(is_whole, np.hypot(detector.width_deviation * pixel, detector.floor), inf),
+    )
