@@ -32,16 +32,19 @@ def hills(places: Array) -> Array:
 
 @dataclass
 class Scene:
-    """Trunks at places (k, 2) at breast height, with diameters (k,) and leans (k, 2); spheres [x, y, z, radius]."""
+    """Trunks at places (k, 2) at breast height, with diameters (k,) and leans (k, 2); ellipsoids; the ground.
+
+    An ellipsoid is a row of its centre (3) and its three semi-axes, along x and y turned by an angle (rad), and z.
+    """
 
     places: Array
     diameters: Array
     leans: Array | None = None
-    spheres: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    ellipsoids: Array = field(default_factory=lambda: np.zeros((0, 7)))
     height: Callable[[Array], Array] = flat
 
     def scan(self, eye: Array, *, noise: float = 0.0, turn: float = 0.0, seed: int = 0) -> tuple[Array, Array]:
-        """Return the points that are hit, (n, 3), and by which trunk (k and above: a sphere; -1: the ground), (n,).
+        """Return the points that are hit, (n, 3), and by which trunk (k and above: an ellipsoid; -1: the ground), (n,).
 
         Args:
             eye: Where the rays come from, (3,).
@@ -57,7 +60,7 @@ class Scene:
             trunk_ranges(eye, rays, np.append(place, self.height(place) + BREAST), diameter, lean)
             for place, diameter, lean in zip(self.places, self.diameters, leans, strict=True)
         ]
-        shapes += [sphere_ranges(eye, rays, sphere[:3], sphere[3]) for sphere in self.spheres]
+        shapes += [ellipsoid_ranges(eye, rays, row[:3], row[3:6], row[6]) for row in self.ellipsoids]
         for k, distances in enumerate(shapes):
             hit[distances < ranges] = k
             ranges = np.minimum(ranges, distances)
@@ -99,11 +102,15 @@ def trunk_ranges(eye: Array, rays: Array, center: Array, diameter: float, lean: 
     return np.where((root > 0.0) & (distances > 0.0), distances, np.inf)
 
 
-def sphere_ranges(eye: Array, rays: Array, center: Array, radius: float) -> Array:
-    """Return the distances to a sphere; infinite beside it."""
-    b, c = rays @ (eye - center), np.sum((eye - center) ** 2) - radius**2
-    root = b**2 - c
-    distances = -b - np.sqrt(np.maximum(root, 0.0))
+def ellipsoid_ranges(eye: Array, rays: Array, center: Array, axes: Array, turn: float) -> Array:
+    """Return the distances to an ellipsoid; infinite beside it."""
+    c, s = np.cos(turn), np.sin(turn)
+    # In coordinates in which it is the unit sphere.
+    shrink = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) / axes
+    start, along = (eye - center) @ shrink, rays @ shrink
+    a, b, c = np.sum(along**2, axis=1), along @ start, start @ start - 1.0
+    root = b**2 - a * c
+    distances = (-b - np.sqrt(np.maximum(root, 0.0))) / a
     return np.where((root > 0.0) & (distances > 0.0), distances, np.inf)
 
 

@@ -23,7 +23,7 @@ def ring(seed: int, *, count: int = 12, distance: tuple[float, float] = (3.0, 20
 
 
 def stand(seed: int, *, count: int = 200, bushes: int = 0, height=hills) -> Scene:
-    """Return trunks at least 1 m apart on uneven ground, 800 to the hectare, and spheres that touch it."""
+    """Return trunks at least 1 m apart on uneven ground, 800 to the hectare, and bushes."""
     rng = np.random.default_rng(seed)
     places: list[np.ndarray] = []
     while len(places) < count:
@@ -33,9 +33,9 @@ def stand(seed: int, *, count: int = 200, bushes: int = 0, height=hills) -> Scen
     centers = rng.uniform(-25.0, 25.0, (bushes, 2))
     centers = centers[np.linalg.norm(centers - EYE[:2], axis=1) > 2.0]
     radii = rng.uniform(0.2, 0.6, len(centers))
-    spheres = np.column_stack([centers, height(centers) + 0.5 * radii, radii])
+    bushy = np.column_stack([centers, height(centers) + 0.5 * radii, radii, radii, radii, 0.0 * radii])
     leans = 0.02 * rng.normal(size=(count, 2))
-    return Scene(np.array(places), rng.uniform(0.08, 0.4, count), leans, spheres, height)
+    return Scene(np.array(places), rng.uniform(0.08, 0.4, count), leans, bushy, height)
 
 
 def found_errors(scenes, detector=EXACT, *, noise=0.02):

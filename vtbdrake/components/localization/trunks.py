@@ -5,16 +5,18 @@ ground, is as wide as a trunk, and has a surface as smooth as a cylinder's. Each
 horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0) with z0 at
 breast height.
 
-The fit is the most likely one for errors of the ranges along the rays. A ray at the azimuth a, with the horizontal unit
-vectors e along and n to the left of it, meets a circle with the centre c at the horizontal distance
+Errors are those of the ranges along the rays. A ray at the azimuth a, with the horizontal unit vectors e along it and n
+to the left of it, meets a circle with the centre c at the horizontal distance
 
-    c·e - sqrt(r² - (c·n)²)
+    c·e - r cos i,    cos i = sqrt(1 - (c·n / r)²)
 
-Circles that are fitted to points by algebra come out too small, because the errors are not normal to the circle. Beyond
-some metres the ranges say little of r, the angular width says more: the azimuths of rays in steps s that hit a trunk
-are spread evenly over its angular width w, so w² = 12 var + s², and each of its edges is known to s / sqrt(12). So the
-directions of both edges are measurements, too, asin(r / |c|) to either side of the axis, if no nearer object hides
-them. The lean l has a normal prior, and the slope of azimuths over heights for a measurement beside the ranges.
+under the angle i of incidence. Circles that are fitted to points by algebra come out too small, because the errors are
+not normal to the circle. So does the most likely circle, though less, because the distance is far from linear in r
+where rays graze the trunk: so ranges are weighted by cos² i. Beyond some metres the angular width says more of r. The
+azimuths of rays in steps s that hit a trunk are spread evenly over its angular width w, so w² = 12 var + s², and each
+of its edges is known to s / sqrt(12). The directions of both edges are measurements, asin(r / |c|) to either side of
+the axis, if no nearer object hides them. The lean l has a normal prior, and the slope of the azimuths over the heights
+for a measurement beside the ranges. Covariances are those of the weighted least squares, plus floors.
 """
 
 from __future__ import annotations
@@ -24,10 +26,10 @@ from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import label
 
 from vtbdrake.components.localization.ground import fit_ground
 from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.scene import Cells, Clusters, Scene
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -40,7 +42,7 @@ _ITERATIONS = (3, 4)
 _GATE = 4.0
 # The distance from the axis, as a share of r, up to which the range of a ray that hits a trunk is predicted as it is.
 _GRAZING = 0.98
-# Information in 1/m^2 that says nothing, but makes matrices regular.
+# Information in 1/m^2 that says nothing, but makes matrices regular where no point is left.
 _NEGLIGIBLE = 1e-3
 
 
@@ -67,7 +69,7 @@ class TrunkDetector:
         diameter_spread: Their standard deviation in m.
         lean: Standard deviation of the lean in rad, per axis, before anything is measured.
         cell: Edge length in m of the cells in which points are gathered; two trunks closer than this become one.
-        largest_misfit: The largest mean square of the errors of ranges, in units of their variance.
+        largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
         position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight.
         diameter_floor: Standard deviation in m of the diameter that no fit improves: taper, ovality.
 
@@ -137,301 +139,179 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: Arr
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    scene = polar_scene(points_H, p_HoLo_H, reach=detector.reach)
-    if not len(scene.z):
-        return Landmarks.empty()
     eye = np.asarray(p_HoLo_H, dtype=float)
-    center = np.array([0.0, 0.0, detector.ground_height - eye[2]])
-    ground = fit_ground(np.column_stack([scene.places, scene.z]), center, reach=detector.reach)
-    heights = scene.z - ground.at(scene.places)
-    in_slice = np.flatnonzero((heights >= detector.heights[0]) & (heights < detector.heights[1]))
-    rows, owners = _upright(scene, in_slice, heights[in_slice], detector)
-    if not len(rows):
+    scene = Scene.of(points_H, eye, reach=detector.reach)
+    if not len(scene):
         return Landmarks.empty()
-    points = _TrunkPoints(scene, rows, owners, heights[rows] - detector.reference_height, detector)
-    return points.fit().landmarks(eye[:2])
+    ground = fit_ground(scene.points, np.array([0.0, 0.0, detector.ground_height - eye[2]]), reach=detector.reach)
+    heights = scene.points[:, 2] - ground.at(scene.points[:, :2])
+    clusters = _upright(scene, heights, detector)
+    if not len(clusters.rows):
+        return Landmarks.empty()
+    return _Fit(clusters, heights[clusters.rows] - detector.reference_height, detector).trunks(eye[:2])
 
 
-@dataclass(frozen=True, eq=False)
-class PolarScene:
-    """The points of a scan around the scanner at the origin.
-
-    Attributes:
-        places: Their x and y in m, (n, 2).
-        z: Their heights in m, (n,).
-        distances: Their horizontal distances in m, (n,).
-        azimuths: Their directions in the plane in rad, (n,).
-        slopes: z / distance, (n,).
-    """
-
-    places: Array
-    z: Array
-    distances: Array
-    azimuths: Array
-    slopes: Array
-
-
-def polar_scene(points_H: ArrayLike, p_HoLo_H: ArrayLike, *, reach: float) -> PolarScene:
-    """Return points (n, 3) in H as seen from the scanner, up to the horizontal distance ``reach`` (m).
-
-    Raises:
-        ValueError: The points or the position have another shape, or are not finite.
-    """
-    points, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 3 or eye.shape != (3,):
-        raise ValueError(
-            f"points have the shape (n, 3) and the scanner's position (3,), not {points.shape}, {eye.shape}"
-        )
-    if not (np.isfinite(points).all() and np.isfinite(eye).all()):
-        raise ValueError("points and the scanner's position are finite numbers: leave rays without a return out")
-    relative = points - eye
-    distances = np.hypot(relative[:, 0], relative[:, 1])
-    near = np.flatnonzero((distances <= reach) & (distances > 0.0))
-    relative, distances = relative[near], distances[near]
-    azimuths = np.arctan2(relative[:, 1], relative[:, 0])
-    return PolarScene(relative[:, :2], relative[:, 2], distances, azimuths, relative[:, 2] / distances)
-
-
-def _upright(scene: PolarScene, chosen: Indices, heights: Array, detector: TrunkDetector) -> tuple[Indices, Indices]:
-    """Return the points that stand above each other, and the number of the cluster to which each belongs, in order.
-
-    Args:
-        scene: All points.
-        chosen: Those in the slice, (k,).
-        heights: Of these over the ground, in m, (k,).
-        detector: How trunks are found.
-    """
+def _upright(scene: Scene, heights: Array, detector: TrunkDetector) -> Clusters:
+    """Return the points that stand above each other in the slice; ``heights`` are those over the ground in m, (n,)."""
     low, high = detector.heights
-    m = int(2.0 * detector.reach / detector.cell) + 3
-    # One empty cell all around.
-    columns = ((scene.places[chosen] + detector.reach) / detector.cell).astype(np.intp) + 1
-    flat = columns @ [m, 1]
+    chosen = np.flatnonzero((heights >= low) & (heights < high))
+    heights, distances = heights[chosen], scene.distances[chosen]
+    cells = Cells.of(scene.points[chosen], size=detector.cell, reach=detector.reach)
     layer = (high - low) / _LAYERS
-    filled = np.zeros((m * m, _LAYERS), dtype=bool)
-    filled[flat, ((heights - low) / layer).astype(np.intp)] = True
-    bits = np.packbits(filled, axis=1).reshape(m, m)
-    for _ in range(2):  # along x, then along y
-        bits[1:-1] |= bits[2:] | bits[:-2]
-        bits = bits.T
-    seen = np.unpackbits(bits.reshape(-1, 1)[flat], axis=1).sum(axis=1)
+    filled = np.zeros((cells.side**2, _LAYERS), dtype=bool)
+    filled[cells.flat, np.minimum((heights - low) / layer, _LAYERS - 1).astype(np.intp)] = True
+    bits = np.packbits(filled, axis=1).reshape(cells.side, cells.side)
+    # With the neighbours of each cell, along x and along y.
+    bits[1:-1] = bits[1:-1] | bits[2:] | bits[:-2]
+    bits[:, 1:-1] = bits[:, 1:-1] | bits[:, 2:] | bits[:, :-2]
+    seen = np.unpackbits(bits.reshape(-1, 1)[cells.flat], axis=1).sum(axis=1)
     # The layers in which rays passed: no more than the field of view has rows there.
-    distances, eye_heights = scene.distances[chosen], heights - scene.z[chosen]
+    eye_heights = heights - scene.points[chosen, 2]
     top = np.minimum(eye_heights + distances * scene.slopes.max(), high)
     bottom = np.maximum(eye_heights + distances * scene.slopes.min(), low)
-    passed = np.minimum((top - bottom) / (detector.elevation_step * distances), (top - bottom) / layer)
-    upright = seen >= np.maximum(detector.upright_share * passed, 2.0)
-    chosen, flat = chosen[upright], flat[upright]
-    occupied = np.zeros(m * m, dtype=bool)
-    occupied[flat] = True
-    clusters, _ = label(occupied.reshape(m, m), structure=np.ones((3, 3)))
-    owners = clusters.ravel()[flat]
-    order = np.argsort(owners, kind="stable")
-    return chosen[order], owners[order] - 1
+    passed = (top - bottom) / np.maximum(detector.elevation_step * distances, layer)
+    upright = np.flatnonzero(seen >= np.maximum(detector.upright_share * passed, 2.0))
+    rows, owners = cells.connected(upright)
+    return Clusters(scene, chosen[rows], owners)
 
 
-class _TrunkPoints:
-    """The points of k possible trunks, and the cylinders fitted to them.
+class _Fit:
+    """The cylinders that are fitted to k clusters of points.
 
     Each has a frame of its own: x points from the scanner to its points, y to the left. A cylinder has the parameters
     [x, y, r, l_x, l_y]: its axis at the reference height, its radius, its lean.
     """
 
-    def __init__(
-        self, scene: PolarScene, rows: Indices, owners: Indices, heights: Array, detector: TrunkDetector
-    ) -> None:
-        """Sort points into clusters.
-
-        Args:
-            scene: All points.
-            rows: Those of the clusters, (n,).
-            owners: The numbers of their clusters, ascending from 0, (n,).
-            heights: Their heights over the reference height in m, (n,).
-            detector: How trunks are found.
-        """
-        self._detector, self._owners, self._heights = detector, owners, heights
-        self._starts = np.flatnonzero(np.diff(owners, prepend=-1))
-        self._distances = scene.distances[rows]
-        places = self._sums(scene.places[rows])
-        self._bearings = np.arctan2(places[:, 1], places[:, 0])
-        self._azimuths = _wrapped(scene.azimuths[rows] - self._bearings[owners])
-        growth = detector.range_noise_growth * self._distances**2
+    def __init__(self, clusters: Clusters, heights: Array, detector: TrunkDetector) -> None:
+        """Prepare the fit; ``heights`` are those of the n points over the reference height in m."""
+        self._clusters, self._heights, self._detector = clusters, heights, detector
+        growth = detector.range_noise_growth * clusters.distances**2
         self._variances = detector.range_noise**2 + detector.roughness**2 + growth**2
-        self._on = np.ones(len(rows))
-        self._hidden = self._hidden_edges(scene, rows)
+        self._cosines, self._sines = np.cos(clusters.azimuths), np.sin(clusters.azimuths)
+        self._hidden = clusters.hidden_edges(
+            azimuth_step=detector.azimuth_step,
+            elevation_step=detector.elevation_step,
+            gap=detector.cell + _GATE * np.sqrt(self._variances),
+        )
+        self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
 
-    def _sums(self, values: Array) -> Array:
-        """Return the sums of values of points (n, ...) over the clusters, (k, ...)."""
-        total: Array = np.add.reduceat(values, self._starts, axis=0)
-        return total
-
-    def _hidden_edges(self, scene: PolarScene, rows: Indices) -> NDArray[np.bool_]:
-        """Return whether something nearer begins where a cluster ends, to the right and to the left, (k, 2)."""
-        step, rise = self._detector.azimuth_step, self._detector.elevation_step
-        columns = int(2.0 * pi / step) + 1
-        lines = int((scene.slopes.max() - scene.slopes.min()) / rise) + 1
-        place = (((scene.azimuths + pi) / step).astype(np.intp) % columns) * lines
-        place += ((scene.slopes - scene.slopes.min()) / rise).astype(np.intp)
-        nearest = np.full(columns * lines, inf)
-        np.minimum.at(nearest, place, scene.distances)
-        line = place[rows] % lines
-        hidden = np.empty((len(self._starts), 2), dtype=bool)
-        gap = self._detector.cell + _GATE * np.sqrt(self._variances)
-        count = self._sums(np.ones(len(rows)))
-        for side, (extreme, sign) in enumerate(((np.minimum, -1.0), (np.maximum, 1.0))):
-            edge = extreme.reduceat(self._azimuths, self._starts) + self._bearings
-            before = np.zeros(len(rows), dtype=bool)
-            for beyond in (1.0, 2.0):
-                column = ((edge + sign * beyond * step + pi) / step).astype(np.intp) % columns
-                before |= nearest[column[self._owners] * lines + line] < self._distances - gap
-            hidden[:, side] = self._sums(before.astype(float)) > 0.25 * count
-        return hidden
-
-    def fit(self) -> _Trunks:
-        """Return the cylinders that are fitted to the points, and are trunks."""
-        detector, owners = self._detector, self._owners
-        middle = self._distances[np.lexsort((self._distances, owners))][
-            self._starts + np.diff(self._starts, append=len(owners)) // 2
-        ]
-        self._on = (np.abs(self._distances - middle[owners]) < detector.largest_diameter).astype(float)
-        width = self._edges(np.zeros(len(middle)), middle)[1]
-        radius = np.clip(0.5 * middle * width, *self._radii)
-        zero = np.zeros_like(middle)
-        cylinders = np.column_stack([middle + 0.8 * radius, zero, radius, zero, zero])
+    def trunks(self, origin: Array) -> Landmarks:
+        """Return the cylinders that are trunks, if the scanner is at ``origin`` (2,)."""
+        detector, clusters = self._detector, self._clusters
+        cylinders, on = self._start()
         for repeated in _ITERATIONS:
             for _ in range(repeated):
-                cylinders, information = self._improved(cylinders)
-            errors, variances, _ = self._errors(cylinders)
-            self._on = (errors**2 < _GATE**2 * variances).astype(float)
-        return self._trunks(cylinders, information)
+                cylinders, covariances = self._improved(cylinders, on)
+            errors, weights, _ = self._errors(cylinders)
+            squares = errors**2 * weights
+            on = squares < _GATE**2
+        count = np.maximum(clusters.sums(on.astype(float)), 1.0)
+        misfit = clusters.sums(on * squares) / count
+        diameters = 2.0 * cylinders[:, 2]
+        good = (count >= 3) & (count >= 0.6 * clusters.counts) & (misfit < detector.largest_misfit)
+        good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
+        good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
+        c, s = np.cos(clusters.bearings), np.sin(clusters.bearings)
+        R = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)[good]
+        positions = origin + np.einsum("kij,kj->ki", R, cylinders[good, :2])
+        P = R @ covariances[good, :2, :2] @ R.transpose(0, 2, 1) + detector.position_floor**2 * np.eye(2)
+        deviations = np.hypot(2.0 * np.sqrt(covariances[good, 2, 2]), detector.diameter_floor)
+        return Landmarks(positions, P, diameters[good], deviations)
 
-    @property
-    def _radii(self) -> tuple[float, float]:
-        return 0.4 * self._detector.least_diameter, 0.6 * self._detector.largest_diameter
+    def _start(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Return first cylinders (k, 5), and which points may be on them (n,)."""
+        clusters = self._clusters
+        ranked = clusters.distances[np.lexsort((clusters.distances, clusters.owners))]
+        middle = ranked[clusters.starts + clusters.counts // 2]
+        on = np.abs(clusters.distances - middle[clusters.owners]) < self._detector.largest_diameter
+        zero = np.zeros_like(middle)
+        _, width, *_ = self._edges(zero, middle, on)
+        radius = np.clip(0.5 * middle * width, *self._radii)
+        return np.column_stack([middle + 0.8 * radius, zero, radius, zero, zero]), on
 
     def _errors(self, cylinders: Array) -> tuple[Array, Array, Array]:
-        """Return errors of the ranges (n,) in m, their variances, and the derivatives of the ranges (n, 5)."""
-        x, y, r, lx, ly = cylinders[self._owners].T
-        z = self._heights
-        cosine, sine = np.cos(self._azimuths), np.sin(self._azimuths)
+        """Return the errors of the ranges (n,) in m, their weights (n,) in 1/m^2, and the derivatives (n, 5)."""
+        x, y, r, lx, ly = cylinders[self._clusters.owners].T
+        z, c, s = self._heights, self._cosines, self._sines
         x, y = x + lx * z, y + ly * z
-        beside = np.clip((y * cosine - x * sine) / r, -_GRAZING, _GRAZING)
-        root = np.sqrt(1.0 - beside**2)
-        tangent = beside / root
-        errors = self._distances - (x * cosine + y * sine - r * root)
-        dx, dy = cosine - tangent * sine, sine + tangent * cosine
-        derivatives = np.stack([dx, dy, -1.0 / root, dx * z, dy * z], axis=1)
-        return errors, self._variances / root**2, derivatives
+        sine = np.clip((y * c - x * s) / r, -_GRAZING, _GRAZING)
+        cosine = np.sqrt(1.0 - sine**2)
+        tangent = sine / cosine
+        dx, dy = c - tangent * s, s + tangent * c
+        errors = self._clusters.distances - (x * c + y * s - r * cosine)
+        return errors, cosine**2 / self._variances, np.stack([dx, dy, -1.0 / cosine, dx * z, dy * z], axis=1)
 
-    def _edges(self, lean: Array, distance: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def _edges(self, lean: Array, distance: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array, Array]:
         """Return what the azimuths of the points say of the k trunks.
 
         Args:
-            lean: Their leans to the left, in rad, (k,).
+            lean: The leans of the trunks to the left in rad, (k,).
             distance: The distances of their axes in m, (k,).
+            on: The points that count, (n,).
 
         Returns:
             The azimuth of the middle (rad), the angular width (rad), the mean height (m), the slope of the azimuth over
             the height (rad/m), and the standard deviation of the slope, each (k,).
         """
-        step, on = self._detector.azimuth_step, self._on
-        count = np.maximum(self._sums(on), 1.0)
-        z, a = self._heights, self._azimuths
-        sums = self._sums(np.stack([on * z, on * a, on * z * z, on * z * a, on * a * a], axis=1)) / count[:, None]
-        mean_z, mean_a = sums[:, 0], sums[:, 1]
-        zz, za, aa = sums[:, 2] - mean_z**2, sums[:, 3] - mean_z * mean_a, sums[:, 4] - mean_a**2
+        step = self._detector.azimuth_step
+        z, a = self._heights * on, self._clusters.azimuths * on
+        sums = self._clusters.sums(np.stack([on, z, a, z * z, z * a, a * a], axis=1))
+        count = np.maximum(sums[:, 0], 1.0)
+        mean_z, mean_a, zz, za, aa = (sums[:, 1:] / count[:, None]).T
+        zz, za, aa = np.maximum(zz - mean_z**2, 1e-6), za - mean_z * mean_a, aa - mean_a**2
         tilt = lean / distance
         width = np.sqrt(12.0 * np.maximum(aa - 2.0 * tilt * za + tilt**2 * zz, 0.0) + step**2)
-        zz = np.maximum(zz, 1e-6)
         rows = np.maximum(count * step / width, 1.0)
         return mean_a, width, mean_z, za / zz, step / np.sqrt(24.0 * rows * zz)
 
-    def _improved(self, cylinders: Array) -> tuple[Array, Array]:
-        """Return the cylinders after one step of Gauss and Newton, and the information of the measurements."""
-        detector = self._detector
-        errors, variances, derivatives = self._errors(cylinders)
-        weighted = derivatives * (self._on / variances)[:, None]
-        information = self._sums(np.einsum("ni,nj->nij", weighted, derivatives))
-        gradient = self._sums(weighted * errors[:, None])
-
-        x, y, r, _, ly = cylinders.T
-        middle, width, z, slope, deviation = self._edges(ly, x)
-        sine = np.minimum(r / x, 0.95)
-        cosine = np.sqrt(1.0 - sine**2)
-        zero = np.zeros_like(x)
-        one = zero + 1.0
-        edge = detector.azimuth_step**2 / 12.0 + (detector.roughness / x) ** 2
-        rows = []
-        for side, sign in enumerate((-1.0, 1.0)):
-            predicted = (y + ly * z) / x + sign * np.arcsin(sine)
-            jacobian = [-sign * sine / (x * cosine), 1.0 / x, sign / (x * cosine), zero, z / x]
-            seen = np.where(self._hidden[:, side], 0.0, 1.0 / edge)
-            rows.append((middle + sign * 0.5 * width - predicted, jacobian, seen))
-        whole = ~self._hidden.any(axis=1)
-        rows.append((slope - ly / x, [zero, zero, zero, zero, 1.0 / x], whole / deviation**2))
-        # The axis is behind the points.
-        rows.append((middle - y / x, [zero, 1.0 / x, zero, zero, zero], (2.0 * x / detector.largest_diameter) ** 2))
-        rows.append(
-            (
-                0.5 * detector.typical_diameter - r,
-                [zero, zero, one, zero, zero],
-                4.0 * one / detector.diameter_spread**2,
-            )
-        )
-        rows.append((-cylinders[:, 3], [zero, zero, zero, one, zero], one / detector.lean**2))
-        rows.append((-ly, [zero, zero, zero, zero, one], one / detector.lean**2))
-        for error, jacobian, weight in rows:
-            J = np.stack(jacobian, axis=1)
-            information += (J * weight[:, None])[:, :, None] * J[:, None, :]
-            gradient += J * (weight * error)[:, None]
-        # Where no point is left, nothing else is known.
+    def _improved(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return the cylinders after one step of Gauss and Newton, and their covariances (k, 5, 5)."""
+        clusters = self._clusters
+        errors, weights, derivatives = self._errors(cylinders)
+        weights = weights * on
+        weighted = derivatives * weights[:, None]
+        gradient = clusters.sums(weighted * errors[:, None])
+        normal = clusters.sums(weighted[:, :, None] * derivatives[:, None, :])
+        # The covariance of the gradient: less than the normal matrix, because grazing rays have less than their weight.
+        spread = clusters.sums((weighted * (weights * self._variances)[:, None])[:, :, None] * derivatives[:, None, :])
+        error, J, weight = self._constraints(cylinders, on)
+        gradient += np.einsum("kmi,km->ki", J, weight * error)
+        information = np.einsum("kmi,kmj->kij", J * weight[:, :, None], J)
         information[:, [0, 1], [0, 1]] += _NEGLIGIBLE
-        step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
-        improved = cylinders + np.clip(step, -0.3, 0.3)
+        inverse = np.linalg.inv(normal + information)
+        improved = cylinders + np.clip(np.einsum("kij,kj->ki", inverse, gradient), -0.3, 0.3)
         improved[:, 2] = np.clip(improved[:, 2], *self._radii)
         improved[:, 0] = np.maximum(improved[:, 0], 1.05 * improved[:, 2])
-        return improved, information
+        covariances: Array = inverse @ (spread + information) @ inverse
+        return improved, covariances
 
-    def _trunks(self, cylinders: Array, information: Array) -> _Trunks:
-        """Return those cylinders that are trunks."""
+    def _constraints(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        """Return errors (k, 7), derivatives (k, 7, 5) and weights (k, 7) of what is known beside the ranges.
+
+        That is the directions of both edges and the slope, where they are not hidden; that the axis is behind the
+        points; and what is expected of the radius and of the lean.
+        """
         detector = self._detector
-        errors, variances, _ = self._errors(cylinders)
-        ones = np.ones(len(errors))
-        total, on = self._sums(ones), self._sums(self._on)
-        misfit = self._sums(self._on * errors**2 / variances) / np.maximum(on, 1.0)
-        diameters = 2.0 * cylinders[:, 2]
-        good = (on >= 3) & (on >= 0.6 * total) & (misfit < detector.largest_misfit)
-        good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
-        good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
-        covariances = np.linalg.inv(information[good]).astype(float)
-        return _Trunks(cylinders[good], covariances, self._bearings[good], detector)
-
-
-@dataclass(frozen=True, eq=False)
-class _Trunks:
-    """Fitted cylinders in frames of their own.
-
-    Attributes:
-        cylinders: Their parameters, (k, 5).
-        covariances: Those of the parameters, (k, 5, 5).
-        bearings: The directions of the x axes of their frames in rad, (k,).
-        detector: How they were found.
-    """
-
-    cylinders: Array
-    covariances: Array
-    bearings: Array
-    detector: TrunkDetector
-
-    def landmarks(self, origin: Array) -> Landmarks:
-        """Return them as landmarks, if the scanner is at ``origin`` (2,)."""
-        c, s = np.cos(self.bearings), np.sin(self.bearings)
-        R = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-        positions = origin + np.einsum("kij,kj->ki", R, self.cylinders[:, :2])
-        covariances = R @ self.covariances[:, :2, :2] @ R.transpose(0, 2, 1)
-        covariances = covariances + self.detector.position_floor**2 * np.eye(2)
-        deviations = np.hypot(2.0 * np.sqrt(self.covariances[:, 2, 2]), self.detector.diameter_floor)
-        return Landmarks(positions, covariances, 2.0 * self.cylinders[:, 2], deviations)
-
-
-def _wrapped(angles: Array) -> Array:
-    return (angles + pi) % (2.0 * pi) - pi
+        x, y, r, lx, ly = cylinders.T
+        middle, width, z, slope, deviation = self._edges(ly, x, on)
+        sine = np.minimum(r / x, 0.95)
+        cosine = np.sqrt(1.0 - sine**2)
+        edge = 1.0 / (detector.azimuth_step**2 / 12.0 + (detector.roughness / x) ** 2)
+        error, J, weight = np.zeros((len(x), 7)), np.zeros((len(x), 7, 5)), np.empty((len(x), 7))
+        for side, sign in enumerate((-1.0, 1.0)):
+            error[:, side] = middle + sign * 0.5 * width - (y + ly * z) / x - sign * np.arcsin(sine)
+            J[:, side, 0] = -sign * sine / (x * cosine)
+            J[:, side, 1] = 1.0 / x
+            J[:, side, 2] = sign / (x * cosine)
+            J[:, side, 4] = z / x
+            weight[:, side] = np.where(self._hidden[:, side], 0.0, edge)
+        error[:, 2], J[:, 2, 4] = slope - ly / x, 1.0 / x
+        weight[:, 2] = np.where(self._hidden.any(axis=1), 0.0, deviation**-2)
+        error[:, 3], J[:, 3, 1] = middle - y / x, 1.0 / x
+        weight[:, 3] = (2.0 * x / detector.largest_diameter) ** 2
+        error[:, 4], J[:, 4, 2] = 0.5 * detector.typical_diameter - r, 1.0
+        weight[:, 4] = 4.0 / detector.diameter_spread**2
+        error[:, 5], J[:, 5, 3] = -lx, 1.0
+        error[:, 6], J[:, 6, 4] = -ly, 1.0
+        weight[:, 5:] = detector.lean**-2
+        return error, J, weight

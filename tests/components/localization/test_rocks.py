@@ -1,0 +1,85 @@
+"""Rocks in scans of exact ellipsoids on a plain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.components.localization.scans import Scene, flat, hills, pairs
+from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
+
+EYE = np.array([0.1, 0.2, 1.5])
+
+
+def waves(places):
+    """Return the height of a slope of 3 degrees with waves of 0.2 m."""
+    return 0.5 * hills(places)
+
+
+def plain(seed: int, *, count: int = 30, elongation: float = 1.3, height=waves) -> Scene:
+    """Return rocks on a plain; one axis of their outlines is up to ``elongation`` times as long as the other one."""
+    rng = np.random.default_rng(seed)
+    away, bearings = rng.uniform(5.0, 20.0, count), 2.0 * np.pi * (np.arange(count) + 0.5 * rng.random(count)) / count
+    places = EYE[:2] + away[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    widths = rng.uniform(0.5, 1.6, count)
+    halves = 0.5 * widths * rng.uniform(1.0, elongation, count)
+    tall = rng.uniform(0.4, 0.9, count)
+    rocks = [places, height(places), halves, 0.5 * widths, tall, rng.uniform(0.0, np.pi, count)]
+    return Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.column_stack(rocks), height=height)
+
+
+def seen(scene: Scene, *, seed: int = 0):
+    points, hit = scene.scan(EYE, noise=0.02, seed=seed)
+    return detect_rocks(points, RockDetector(), p_HoLo_H=EYE), points, hit
+
+
+def test_rocks_are_found_on_uneven_ground():
+    shown = found = claimed = right = 0
+    nees, widths = [], []
+    for seed in range(6):
+        scene = plain(seed)
+        rocks, points, hit = seen(scene, seed=seed)
+        centers = scene.ellipsoids[:, :2]
+        over = points[:, 2] - waves(points[:, :2]) > 0.25
+        visible = np.bincount(hit[(hit >= 0) & over], minlength=len(centers)) >= 6
+        which, truth = pairs(rocks.positions, centers, within=0.7)
+        shown, found = shown + visible.sum(), found + len(set(truth) & set(np.flatnonzero(visible)))
+        claimed, right = claimed + len(rocks), right + len(which)
+        errors = rocks.positions[which] - centers[truth]
+        nees.append(np.einsum("ki,kij,kj->k", errors, np.linalg.inv(rocks.covariances[which]), errors))
+        widths.append((rocks.diameters[which] - 2.0 * scene.ellipsoids[truth, 4]) / rocks.diameter_deviations[which])
+    assert found >= 0.85 * shown
+    assert right >= 0.97 * claimed
+    # Two coordinates with honest covariances: 2 on average. Of some rocks only the top is seen.
+    assert 0.5 < np.concatenate(nees).mean() < 2.5
+    assert np.mean(np.abs(np.concatenate(widths)) < 2.0) > 0.85
+
+
+def test_round_rocks_are_where_they_lie():
+    scene = plain(1, elongation=1.0, count=12, height=flat)
+    rocks, _, _ = seen(scene)
+    which, truth = pairs(rocks.positions, scene.ellipsoids[:, :2], within=0.7)
+    assert len(which) >= 9
+    errors = np.linalg.norm(rocks.positions[which] - scene.ellipsoids[truth, :2], axis=1)
+    assert np.median(errors) < 0.1
+
+
+def test_a_rock_that_is_hidden_in_part_is_left_out():
+    far, near = [10.0, 0.2, 0.0, 0.6, 0.6, 0.8, 0.0], [6.0, 0.5, 0.0, 0.3, 0.3, 1.0, 0.0]
+    scene = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.array([far, near]))
+    alone = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.array([far]))
+    assert len(pairs(seen(alone)[0].positions, np.array([far[:2]]), within=0.5)[0]) == 1
+    assert len(pairs(seen(scene)[0].positions, np.array([far[:2]]), within=0.8)[0]) == 0
+
+
+def test_ground_alone_has_no_rocks():
+    ground, _ = Scene(np.zeros((0, 2)), np.zeros(0), height=waves).scan(EYE, noise=0.02)
+    for points in (ground, np.zeros((0, 3))):
+        assert len(detect_rocks(points, RockDetector(), p_HoLo_H=EYE)) == 0
+
+
+def test_bad_input_is_rejected():
+    with pytest.raises(ValueError, match="finite numbers"):
+        detect_rocks(np.full((3, 3), np.inf), RockDetector(), p_HoLo_H=EYE)
+    with pytest.raises(ValueError, match="least_points must be at least 2, not 1"):
+        RockDetector(least_points=1)
