@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+from threadpoolctl import ThreadpoolController
 
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.localization.dead_reckoning import (
@@ -84,13 +86,18 @@ class Localizer:
     see: Callable[[Scan, Array, float], Landmarks]
     unit: LocalizationUnit
 
+    def prepare(self) -> None:
+        """Look for the libraries of linear algebra."""
+        _blas()
+
     def __call__(
         self, *, scan: Scan, scan_time: Array, request: Array, history: Array, memory: UnitState
     ) -> tuple[dict[str, Any], UnitState]:
         """Return the outputs of the slow part, and the memory of the unit."""
         taken = float(scan_time[0])
-        landmarks = self.see(scan, history, taken)
-        found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
+        with _blas().limit(limits=1, user_api="blas"):
+            landmarks = self.see(scan, history, taken)
+            found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
         outputs = {
             "pose": found.pose,
             "covariance": found.covariance.ravel(),
@@ -104,6 +111,15 @@ class Localizer:
             "landmarks": shown(landmarks),
         }
         return outputs, memory
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Return what sets the number of threads of linear algebra.
+
+    With several, small matrices take longer, much longer on a busy computer, and their last bits differ.
+    """
+    return ThreadpoolController()
 
 
 def shown(landmarks: Landmarks) -> Array:
