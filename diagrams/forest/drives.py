@@ -1,8 +1,8 @@
 """Drives through many forests: how well the localization unit knows where it is, with each of the three maps.
 
-``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` drives 50 m in each forest, with
-simulated detections (`detections`), and localizes with one unit per map, from the same detections and odometry. Every
-third forest is a clustered one.
+``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each forest
+once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
+map localizes, as that of the DPS would. ``--simulated`` takes simulated detections (`detections`) instead.
 
 What counts, fixed before any result was seen:
 
@@ -10,14 +10,17 @@ What counts, fixed before any result was seen:
   to the end, over all forests; nothing is left out.
 * NEES is of 3 degrees of freedom. Its mean is compared with its 95 % bounds at places `INDEPENDENT` m of path apart,
   which are taken as independent: nearer ones share most of their trees, and with them the errors of the map.
+* What is searched for is no error: how much of the path has a pose is told beside it.
 * A claim is wrong if the pose is farther from the true one than 0.5 m plus four standard deviations of the map.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,20 +28,27 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from vtbdrake.cli.output import table
-from vtbdrake.components.localization.constellation import ConstellationMap
-from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
+from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import wrap
-from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
-from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.dps import PERIOD
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
+from vtbdrake_diagrams.forest.stand import MAPS, Stand
 
 Array = NDArray[np.float64]
 
 INDEPENDENT = 20.0
 """Distance in m along the path from which on estimates count as independent."""
+_POSE = "sim.sys.carrier.base.pose"
+_SCAN, _SCAN_TIME = "dps.env.scan_arrival.sample", "dps.env.scan_arrival.time"
+_HISTORY = "dps.env.dead_reckoning.history"
+
 SCANS = 5.0
 """Scans per second."""
+DENSITIES = (605.0, 1210.0)
+"""Trees per hectare of the plots that `stand` cites; roads are cleared of them afterwards."""
 SEED = 200_000
 """Of the first forest. No constant of the localization may be chosen by forests from this seed on."""
 
@@ -163,6 +173,42 @@ def simulated_drive(
     )
 
 
+def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
+    """Simulate a carrier, and return what its DPS detects in each scan, and its odometry.
+
+    Args:
+        scenario: The carrier in its world; its map does not matter.
+        length: How far it drives, in m.
+
+    Raises:
+        RuntimeError: The carrier does not get there in twice the time that it should take.
+    """
+    testbed, see = scenario.build(), scenario.sight()
+    pose, scan, time, history = (testbed.reader(address) for address in (_POSE, _SCAN, _SCAN_TIME, _HISTORY))
+    simulator = testbed.simulator()
+    context = simulator.get_context()
+    period = 1.0 / scenario.scanner.frequency
+    limit = 2.0 * length / scenario.speed + 10.0
+    rows: list[tuple[float, Array, Array]] = []
+    landmarks: list[Landmarks] = []
+    travelled = 0.0
+    while travelled < length:
+        due = (len(rows) + 1) * period
+        if due > limit:
+            raise RuntimeError(f"the carrier has driven {travelled:.1f} m of {length:g} m in {limit:.0f} s")
+        simulator.AdvanceTo(due)
+        truth = pose(context)[[0, 1, 5]]
+        # By then the scan has arrived, and its time lies within the history.
+        simulator.AdvanceTo(due + 2.0 * PERIOD)
+        taken, past = float(time(context)), history(context)
+        rows.append((taken, truth, carrier_pose_at(past, taken)[3:]))
+        landmarks.append(see(scan(context), past, taken))
+        if len(rows) > 1:
+            travelled += float(np.hypot(*(truth - rows[-2][1])[:2]))
+    times, truths, reckoned = (np.array(column) for column in zip(*rows, strict=True))
+    return Drive(times, truths, reckoned, tuple(landmarks))
+
+
 @dataclass(frozen=True)
 class Score:
     """What came of drives with one map.
@@ -270,13 +316,6 @@ GOALS = {
 }
 
 
-def unit_of(stand: Stand, errors: MapErrors) -> LocalizationUnit:
-    """Return a unit with a map of the stand that has these errors."""
-    landmarks = map_landmarks(stand.map(errors))
-    locator = ConstellationMap(landmarks, correlation=errors.correlation)
-    return LocalizationUnit(locator, Tracker(landmarks, correlation=errors.correlation))
-
-
 HEADER = ("map", "RMSE m", "deg", "NEES", "of places", "95 %", "first fix s", "localized", "lost", "wrong", "goal")
 
 
@@ -299,11 +338,61 @@ def row(name: str, found: Score) -> tuple[str, ...]:
     )
 
 
-def simulated(seed: int, *, length: float, range_bias: float = 0.0) -> dict[str, Track]:
-    """Return what units with each of the maps say along a simulated drive."""
-    stand = Stand(seed=seed, kind="clustered" if seed % 3 == 2 else "natural")
-    drive = simulated_drive(stand, seed=seed, length=length, detector=Detector(range_bias=range_bias))
-    return {name: localize(drive, unit_of(stand, MAPS[name])) for name in GOALS}
+def forest(seed: int, *, range_bias: float = 0.0) -> ForestScenario:
+    """Return the scenario of a drive: a stand as dense as published plots, every third one clustered.
+
+    Args:
+        seed: Determines stand, route and where on it the drive begins.
+        range_bias: Of the scanner, in m.
+    """
+    rng = np.random.default_rng([seed, 9])
+    scenario = ForestScenario(
+        seed=seed,
+        stand_kind="clustered" if seed % 3 == 2 else "natural",
+        density=float(rng.uniform(*DENSITIES)),
+    )
+    scenario.scanner_errors.bias = range_bias
+    routes = scenario.routes()
+    number = int(rng.integers(len(routes)))
+    return replace(scenario, route=number, start=float(rng.uniform(0.0, routes[number].length)))
+
+
+@dataclass(frozen=True)
+class Drives:
+    """The drives of the command, one per forest.
+
+    Attributes:
+        length: Of each, in m.
+        range_bias: Of the scanner, in m.
+        is_simulated: Whether detections are simulated, instead of the scanner.
+    """
+
+    length: float = 50.0
+    range_bias: float = 0.0
+    is_simulated: bool = False
+
+    def __call__(self, seed: int) -> dict[str, Track]:
+        """Return what units with each of the maps say in the forest of a seed."""
+        scenario = forest(seed, range_bias=self.range_bias)
+        # One thread: matrices are small, and threads that wait for each other take most of the time.
+        with threadpool_limits(1):
+            if self.is_simulated:
+                detector = Detector(range_bias=self.range_bias)
+                drive = simulated_drive(scenario.stand(), seed=seed, length=self.length, detector=detector)
+            else:
+                drive = recorded_drive(scenario, length=self.length)
+            surveys = {name: replace(scenario, map=name) for name in GOALS}
+            return {name: localize(drive, one.unit(one.global_map())) for name, one in surveys.items()}
+
+    def through(self, seeds: Sequence[int], *, workers: int = 2) -> Iterator[dict[str, Track]]:
+        """Drive through the forests of some seeds in processes, and yield the tracks by map in the order of seeds."""
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            yield from pool.map(self, seeds)
+
+
+def scores(found: Sequence[Mapping[str, Track]]) -> dict[str, Score]:
+    """Return the scores by map of the tracks by map, one per forest."""
+    return {name: score([tracks[name] for tracks in found], deviation=MAPS[name].position) for name in GOALS}
 
 
 def main() -> None:
@@ -313,24 +402,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--bias", type=float, default=0.0, help="of the ranges, in m")
     parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
+    parser.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
+    parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    length = 500.0 if chosen.full else 50.0
-    tracks: dict[str, list[Track]] = {name: [] for name in GOALS}
-    # One thread: matrices are small, and threads that wait for each other take most of the time.
-    with threadpool_limits(1):
-        for k in range(chosen.forests):
-            found = simulated(chosen.seed + k, length=length, range_bias=chosen.bias)
-            print(
-                f"forest {k + 1}: " + ", ".join(f"{n} {_rms(t.errors[:, :2]):.3f} m" for n, t in found.items()),
-                flush=True,
-            )
-            for name, track in found.items():
-                tracks[name].append(track)
-    scores = {name: score(tracks[name], deviation=MAPS[name].position) for name in GOALS}
-    print(table(HEADER, [row(name, found) for name, found in scores.items()]))
-    one = scores["accurate"]
-    print(f"{one.forests} forests, {one.path:.0f} m of path, range bias {chosen.bias:g} m")
+    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.simulated)
+    found = []
+    for tracks in drives.through(range(chosen.seed, chosen.seed + chosen.forests), workers=chosen.workers):
+        found.append(tracks)
+        told = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
+        print(f"forest {len(found)}: {told}", flush=True)
+    results = scores(found)
+    print(table(HEADER, [row(name, one) for name, one in results.items()]))
+    path = next(iter(results.values())).path
+    print(f"{len(found)} forests, {path:.0f} m of path, range bias {chosen.bias:g} m")
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, so that worker processes find its classes.
+    from vtbdrake_diagrams.forest.drives import main as program
+
+    program()

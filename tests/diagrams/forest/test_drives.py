@@ -1,11 +1,24 @@
 """Tests of the scores of drives, with errors that are drawn from the covariances that are claimed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
-from vtbdrake_diagrams.forest.drives import GOALS, Drive, Track, nees_bounds, score, simulated_drive
+from vtbdrake_diagrams.forest.drives import (
+    GOALS,
+    Drive,
+    Track,
+    forest,
+    localize,
+    nees_bounds,
+    recorded_drive,
+    score,
+    simulated_drive,
+)
+from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import Stand
 
 COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 0.0], [0.0, 0.0, 1e-6]])
@@ -77,3 +90,24 @@ def test_simulated_drive_stays_in_the_stand() -> None:
     assert (drive.truth[:, :2] > 0.0).all() and (drive.truth[:, :2] < 100.0).all()
     assert len(drive.landmarks) == len(drive.times) == 101
     assert np.diff(drive.times) == pytest.approx(0.2)
+
+
+def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
+    scenario = ForestScenario(seed=5, density=500.0, undergrowth=0.0)
+    drive = recorded_drive(scenario, length=1.5)
+    found = localize(drive, scenario.unit(scenario.global_map()))
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    # The result of the last scan is shown some periods later, and before that of the next.
+    simulator.AdvanceTo(drive.times[-1] + scenario.localizer_latency + 0.08)
+    pose = testbed.read(simulator.get_context(), "dps.env.localizer.pose")
+    assert found.is_localized[-1] and drive.travelled[-1] == pytest.approx(1.5, abs=0.3)
+    np.testing.assert_allclose(pose, found.poses[-1], atol=1e-9)
+    np.testing.assert_allclose(pose, drive.truth[-1], atol=0.2)
+
+
+def test_forests_differ_and_are_reproducible() -> None:
+    one = forest(1)
+    assert one == forest(1) and one != forest(2)
+    assert {forest(seed).stand_kind for seed in range(3)} == {"natural", "clustered"}
+    assert forest(1, range_bias=0.02) == replace(one, scanner_errors=replace(one.scanner_errors, bias=0.02))
