@@ -216,6 +216,7 @@ class CarrierScenario(Scenario):
         # Imported here: the DPS on the carrier runs without a plant.
         from vtbdrake.components.ray_casting import RayCaster
         from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
+        from vtbdrake_diagrams.forest.belief import declare_belief
         from vtbdrake_diagrams.forest.carrier import Carrier, WheelOdometer, Wheels, add_carrier, standing_pose
         from vtbdrake_diagrams.forest.driver import Driver
 
@@ -259,6 +260,8 @@ class CarrierScenario(Scenario):
         builder.add("sense", "scanner", scanner)
         connect_laser_scanner(builder.diagram_builder, scanner, plant)
         builder.sim_sensor("scan", scanner.GetOutputPort("scan"))
+        # So old are the samples of IMU and odometry.
+        declare_belief(builder, carrier, ground, routes, age=PERIOD)
 
 
 @dataclass

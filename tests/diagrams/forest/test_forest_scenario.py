@@ -1,5 +1,7 @@
 """Tests of the simulated forest: what the scanner sees against analytic geometry, what the sensors tell, bad fields."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -61,10 +63,10 @@ def test_scan_of_a_trunk_is_that_of_a_cylinder() -> None:
     # |p + t d - c| = r in the plane.
     d, p = directions[band][:, :2], p_WLo[:2] - foot[:2]
     a, b, c = (d**2).sum(axis=1), d @ p, p @ p - 0.15**2
-    analytic = (-b - np.sqrt(b**2 - a * c)) / a
-    inside = np.isfinite(analytic)
-    np.testing.assert_allclose(hits.distances[band][inside], analytic[inside], atol=0.01)
-    assert np.mean(hits.distances[band][inside] - analytic[inside]) == pytest.approx(0.0, abs=1e-3)
+    inside = b**2 > a * c
+    analytic = ((-b - np.sqrt(np.maximum(b**2 - a * c, 0.0))) / a)[inside]
+    np.testing.assert_allclose(hits.distances[band][inside], analytic, atol=0.01)
+    assert np.mean(hits.distances[band][inside] - analytic) == pytest.approx(0.0, abs=1e-3)
 
 
 def test_rays_beside_the_trunk_hit_the_ground() -> None:
@@ -163,6 +165,62 @@ def test_command_reaches_the_driver(drive: tuple[VirtualTestbed, list[Scan], np.
     assert driver.GetInputPort("route").Eval(driver.GetMyContextFromRoot(context)) == [1.0]
 
 
+def test_carrier_stands_where_it_is_believed_to_be(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    testbed, _, _ = drive
+    scenario = ForestScenario(seed=1, length=60.0, width=60.0)
+    right = scenario.routes()[1]
+    place, heading = right.position(50.0), right.heading(50.0)
+    context = testbed.default_context()
+    reckoning = "dps.env.dead_reckoning"
+    testbed.write(
+        context,
+        {
+            "dps.env.pose.position": place,
+            "dps.env.pose.heading": heading,
+            f"{reckoning}.roll": 0.05,
+            f"{reckoning}.pitch": -0.02,
+            f"{reckoning}.speed": 0.8,
+            f"{reckoning}.turn_rate": 0.1,
+        },
+    )
+    testbed.start_from_belief(context)
+    read = {name: testbed.read(context, f"sim.{name}") for name in (
+        "sys.carrier.base.pose", "sys.carrier.base.velocity", "act.driver.route", "act.driver.along",
+        "act.wheels.curvature",
+    )}  # fmt: skip
+    x, y, height, *rpy = read["sys.carrier.base.pose"]
+    assert [x, y] == pytest.approx(place) and rpy == pytest.approx([0.05, -0.02, heading])
+    assert height == pytest.approx(scenario.ground().height(x, y), abs=0.1)
+    # By default, route 0 is advised; but that is not where the carrier is.
+    assert read["act.driver.route"] == 1.0
+    assert read["act.driver.along"] == pytest.approx(50.0 - 0.8, abs=0.3)
+    assert read["act.wheels.curvature"] == pytest.approx(0.125)
+    w, v = read["sys.carrier.base.velocity"][:3], read["sys.carrier.base.velocity"][3:]
+    assert w == pytest.approx([0.0, 0.0, 0.1])
+    # The rear axle moves along x_B.
+    R_WB = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
+    assert R_WB.T @ (v + np.cross(w, R_WB @ [-0.8, 0.0, 0.0])) == pytest.approx([0.8, 0.0, 0.0], abs=2e-2)
+
+
+def test_nothing_is_believed_without_a_pose(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    testbed, _, _ = drive
+    with pytest.raises(ValueError, match="the carrier is not localized"):
+        testbed.start_from_belief(testbed.default_context())
+
+
+def test_drive_continues_exactly_from_a_fork(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+    testbed, _, _ = drive
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(0.53)
+    fork = testbed.fork(simulator)
+    other = testbed.default_context()
+    testbed.restore(other, fork)
+    testbed.simulator(other, restored=True).AdvanceTo(1.0)
+    simulator.AdvanceTo(1.0)
+    assert not testbed.snapshot(other).compare(testbed.snapshot(context))
+
+
 def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
     scenario = ForestScenario(seed=2, map="exact")
     truth = {tuple(p) for p in scenario.truth().positions()[:, :2].tolist()}
@@ -191,3 +249,12 @@ def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
 def test_impossible_fields_are_refused(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
         ForestScenario(**fields).validate()
+
+
+def test_testbed_is_freed() -> None:
+    testbed = ForestScenario(length=40.0, width=40.0).build()
+    testbed.simulator(testbed.default_context()).AdvanceTo(0.1)
+    left = weakref.ref(testbed.diagram)
+    del testbed
+    gc.collect()
+    assert left() is None
