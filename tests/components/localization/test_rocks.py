@@ -9,6 +9,8 @@ from tests.components.localization.scans import Scene, flat, hills, pairs
 from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
 
 EYE = np.array([0.1, 0.2, 1.5])
+# For waves of 0.2 m.
+HIGH = RockDetector(least_height=0.2)
 
 
 def waves(places):
@@ -28,9 +30,9 @@ def plain(seed: int, *, count: int = 30, elongation: float = 1.3, height=waves) 
     return Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.column_stack(rocks), height=height)
 
 
-def seen(scene: Scene, *, seed: int = 0):
+def seen(scene: Scene, detector: RockDetector = HIGH, *, seed: int = 0):
     points, hit = scene.scan(EYE, noise=0.02, seed=seed)
-    return detect_rocks(points, RockDetector(), p_HoLo_H=EYE), points, hit
+    return detect_rocks(points, detector, p_HoLo_H=EYE), points, hit
 
 
 def test_rocks_are_found_on_uneven_ground():
@@ -64,6 +66,19 @@ def test_round_rocks_are_where_they_lie():
     assert np.median(errors) < 0.1
 
 
+def test_small_rocks_are_found_on_even_ground():
+    scene = plain(2, count=20, height=flat)
+    # Half a metre wide, and a hand's breadth over the ground.
+    scene.ellipsoids[:, 3:5], scene.ellipsoids[:, 5] = 0.25, 0.15
+    scene.ellipsoids[:, :2] = EYE[:2] + 0.5 * (scene.ellipsoids[:, :2] - EYE[:2])
+    rocks, points, hit = seen(scene, RockDetector())
+    which, truth = pairs(rocks.positions, scene.ellipsoids[:, :2], within=0.2)
+    assert len(which) == len(rocks)
+    clear = np.bincount(hit[(hit >= 0) & (points[:, 2] > 0.08)], minlength=20) >= 5
+    assert clear.sum() >= 5
+    assert len(set(np.flatnonzero(clear)) - set(truth)) <= 1
+
+
 def test_a_rock_that_is_hidden_in_part_is_left_out():
     far, near = [10.0, 0.2, 0.0, 0.6, 0.6, 0.8, 0.0], [6.0, 0.5, 0.0, 0.3, 0.3, 1.0, 0.0]
     scene = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.array([far, near]))
@@ -75,7 +90,7 @@ def test_a_rock_that_is_hidden_in_part_is_left_out():
 def test_ground_alone_has_no_rocks():
     ground, _ = Scene(np.zeros((0, 2)), np.zeros(0), height=waves).scan(EYE, noise=0.02)
     for points in (ground, np.zeros((0, 3))):
-        assert len(detect_rocks(points, RockDetector(), p_HoLo_H=EYE)) == 0
+        assert len(detect_rocks(points, HIGH, p_HoLo_H=EYE)) == 0
 
 
 def test_bad_input_is_rejected():

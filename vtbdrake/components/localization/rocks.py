@@ -32,7 +32,8 @@ class RockDetector:
         elevation_step: Angle between neighbouring rows in rad.
         range_noise: Standard deviation of a range in m.
         reach: Distance in m from the scanner up to which rocks are looked for.
-        least_height: How far a point must be over the ground to belong to a rock, in m.
+        least_height: How far a point must be over the ground to belong to a rock, in m; more than waves of the ground
+            that are too short for `fit_ground` to follow.
         least_roundness: How much of the roundness of a circle its outline must have on the visible side.
         least_width: The least width of a rock in m.
         largest_width: The largest width of a rock in m.
@@ -49,11 +50,11 @@ class RockDetector:
     elevation_step: float = pi / 6.0 / 16
     range_noise: float = 0.02
     reach: float = 25.0
-    least_height: float = 0.2
+    least_height: float = 0.06
     least_roundness: float = 0.4
     least_width: float = 0.2
     largest_width: float = 3.0
-    least_points: int = 4
+    least_points: int = 3
     ground_height: float = 0.0
     cell: float = 0.2
     elongation: float = 0.25
