@@ -16,6 +16,7 @@ from pydrake.systems.framework import Diagram
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
 from vtbdrake.components.localization.unit import LocalizationUnit
@@ -185,15 +186,18 @@ class CarrierScenario(Scenario):
             commands=[Signal("route", size=1, lower=0.0, upper=last, default=float(self.route))],
         )
 
+    @abstractmethod
     def sight(self) -> Callable[[Scan, Array, float], Landmarks]:
         """Return how the DPS finds landmarks in scans, see `Localizer`."""
+
+    def scanner_accuracy(self) -> dict[str, float]:
+        """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
         rows, columns = raster_size(self.scanner)
-        detector = TrunkDetector(
-            azimuth_step=self.scanner.azimuth / columns,
-            elevation_step=self.scanner.elevation / rows,
-            range_noise=max(self.scanner_errors.noise, _LEAST_RANGE_NOISE),
-        )
-        return ScanLandmarks(detect_trunks, detector, self.X_BL)
+        return {
+            "azimuth_step": self.scanner.azimuth / columns,
+            "elevation_step": self.scanner.elevation / rows,
+            "range_noise": max(self.scanner_errors.noise, _LEAST_RANGE_NOISE),
+        }
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         """Return how the DPS localizes itself on a map, which has errors as ``map`` says."""
@@ -317,6 +321,9 @@ class ForestScenario(CarrierScenario):
     def surveyed_map(self) -> WorldModel:
         return self.stand().map(MAPS[self.map], seed=self.map_seed)
 
+    def sight(self) -> ScanLandmarks:
+        return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
+
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world import add_forest
 
@@ -364,6 +371,9 @@ class PlainScenario(CarrierScenario):
 
     def surveyed_map(self) -> WorldModel:
         return self.rock_field().map(MAPS[self.map], seed=self.map_seed)
+
+    def sight(self) -> ScanLandmarks:
+        return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy()), self.X_BL)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world import add_plain
