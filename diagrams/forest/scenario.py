@@ -59,10 +59,16 @@ def scanner_config() -> LaserScannerConfig:
 
 
 def plain_scanner_config() -> LaserScannerConfig:
-    """Return a scanner for low landmarks: 32 beams over 40 deg, otherwise as that of the forest."""
-    config = scanner_config()
-    config.rows, config.elevation = 32, np.radians(40.0)
-    return config
+    """Return a scanner for low landmarks: 64 beams over 33 deg, 65,536 rays per turn, five turns per second."""
+    return LaserScannerConfig(
+        frequency=5.0,
+        rays_per_second=5.0 * 65_536.0,
+        azimuth=2.0 * np.pi,
+        elevation=np.radians(33.0),
+        rows=64,
+        min_range=0.5,
+        max_range=100.0,
+    )
 
 
 @dataclass
@@ -373,7 +379,7 @@ class PlainScenario(CarrierScenario):
         return self.rock_field().map(MAPS[self.map], seed=self.map_seed)
 
     def sight(self) -> ScanLandmarks:
-        return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy()), self.X_BL)
+        return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world import add_plain

@@ -29,7 +29,7 @@ from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.carrier import Carrier
 from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
-from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 
 POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
 CYCLES = 200
@@ -70,8 +70,12 @@ def test_pose_is_found_without_a_guess_and_followed() -> None:
     assert testbed.read(context, f"{LOCALIZER}.matched") > 20.0
 
 
-def test_carrier_localizes_itself_in_a_forest() -> None:
-    testbed = ForestScenario(seed=1, length=50.0, width=50.0, start=12.0).build()
+SMALL = {"seed": 1, "length": 50.0, "width": 50.0, "start": 12.0}
+
+
+@pytest.mark.parametrize("scenario", [ForestScenario(**SMALL), PlainScenario(**SMALL, abundance=0.1)])
+def test_carrier_localizes_itself_among_landmarks(scenario: CarrierScenario) -> None:
+    testbed = scenario.build()
     context = testbed.default_context()
     testbed.simulator(context).AdvanceTo(1.7)
     assert testbed.read(context, f"{POSE}.status") == TRACKING
