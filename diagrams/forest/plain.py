@@ -20,7 +20,7 @@ from vtbdrake.components.meshes import Surface, copies, unit_sphere
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.routes import Route, strip_roads
+from vtbdrake_diagrams.forest.routes import Route, distances, strip_roads
 from vtbdrake_diagrams.forest.stand import MapErrors, surveyed
 
 Array = NDArray[np.float64]
@@ -97,9 +97,7 @@ class RockField:
         stretch = np.sqrt(rng.uniform(*_ELONGATION, count))
         heights = diameters[:count] * rng.uniform(*_FLATNESS, count)
         yaws = rng.uniform(0.0, pi, count)
-        free = np.full(count, np.inf)
-        for route in self.routes():
-            free = np.minimum(free, route.distances(places))
+        free = distances(self.routes(), places)
         objects = []
         for k in np.flatnonzero(free > 0.5 * (self.track_width + diameters[:count] * stretch)).tolist():
             sizes = {"length": diameters[k] * stretch[k], "width": diameters[k] / stretch[k], "height": heights[k]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, cos, pi, sin
@@ -64,10 +65,7 @@ class Route:
 
     def distances(self, places: ArrayLike) -> Array:
         """Return the distances of places (n, 2) in W from the route, (n,), in m."""
-        from scipy.spatial import cKDTree
-
-        found: Array = cKDTree(self.points).query(np.asarray(places, dtype=float).reshape(-1, 2))[0]
-        return found
+        return distances([self], places)
 
     def _segment(self, along: float) -> tuple[int, float]:
         """Return the index of the point before a place on the route, and which share of the way to the next it is."""
@@ -80,6 +78,17 @@ class Route:
         """How far along the route each point is, and last the length, (n + 1,)."""
         gaps = np.linalg.norm(np.diff(self.points, axis=0, append=self.points[:1]), axis=1)
         return np.concatenate([[0.0], np.cumsum(gaps)])
+
+
+def distances(routes: Sequence[Route], places: ArrayLike) -> Array:
+    """Return the distances in m of places (n, 2) in W from the nearest route, (n,); infinite without routes."""
+    from scipy.spatial import cKDTree
+
+    p = np.asarray(places, dtype=float).reshape(-1, 2)
+    if not routes:
+        return np.full(len(p), np.inf)
+    found: Array = cKDTree(np.concatenate([route.points for route in routes])).query(p)[0]
+    return found
 
 
 def strip_roads(length: float, width: float, *, spacing: float = 28.0, seed: int = 0) -> tuple[Route, ...]:

@@ -287,9 +287,10 @@ class ForestScenario(CarrierScenario):
     # Width of the strip roads and distance between them, in m.
     road_width: float = 4.0
     road_spacing: float = 28.0
-    # Bushes per hectare, and dead branches per tree.
+    # Bushes per hectare, dead branches per tree, and the standard deviation of the inclination of trunks in rad.
     undergrowth: float = 300.0
     branches: float = 6.0
+    lean: float = 0.01
 
     def validate(self) -> None:
         self.require(
@@ -316,7 +317,7 @@ class ForestScenario(CarrierScenario):
 
     def vegetation(self) -> Vegetation:
         """Return the clutter."""
-        return Vegetation(self.seed, undergrowth=self.undergrowth, branches=self.branches)
+        return Vegetation(self.seed, undergrowth=self.undergrowth, branches=self.branches, lean=self.lean)
 
     def routes(self) -> tuple[Route, ...]:
         return self.stand().routes()

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
-from vtbdrake_diagrams.forest.routes import Route, strip_roads
+from vtbdrake_diagrams.forest.routes import Route, distances, strip_roads
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ _CLUSTERS, _CLUSTER_RADIUS = 60.0, 6.0
 # Of a plantation: the distance of the rows in m, and how far trees are off their places, per axis, in m.
 _ROWS, _JITTER = 2.5, 0.15
 # Attempts to place one tree.
-_ATTEMPTS = 10_000
+_ATTEMPTS = 2_000
 
 # Waves that add up to a field of correlated errors.
 _WAVES = 400
@@ -172,9 +172,7 @@ class Stand:
         rng = np.random.default_rng([self.seed, _TREES])
         places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
         diameters = self.diameters(rng.random(self.count))
-        free = np.full(len(places), np.inf)
-        for route in self.routes():
-            free = np.minimum(free, route.distances(places))
+        free = distances(self.routes(), places)
         objects = (
             _tree(f"tree-{k}", places[k], diameters[k], source=f"stand {self.seed}")
             for k in np.flatnonzero(free > 0.5 * (self.road_width + diameters))
@@ -211,19 +209,37 @@ class Stand:
         size = np.array([self.length, self.width])
         clusters = round(_CLUSTERS * self.length * self.width / HECTARE) if self.kind == "clustered" else 0
         parents = rng.random((clusters, 2)) * size
-        places = np.empty((self.count, 2))
-        filled = attempts = 0
-        while filled < self.count:
-            place = self._beside(parents, rng) if clusters else rng.random(2) * size
-            if not filled or np.min(np.sum((places[:filled] - place) ** 2, axis=1)) >= self.spacing**2:
-                places[filled] = place
-                filled, attempts = filled + 1, 0
+        # By cells that are as wide as the spacing: trees that are too close lie in one of nine cells.
+        cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        places: list[tuple[float, float]] = []
+        attempts = 0
+        while len(places) < self.count:
+            x, y = (self._beside(parents, rng) if clusters else rng.random(2) * size).tolist()
+            if self._is_free(x, y, cells):
+                places.append((x, y))
+                cells.setdefault(self._cell(x, y), []).append((x, y))
+                attempts = 0
             attempts += 1
             if attempts > _ATTEMPTS:
                 raise ValueError(
                     f"{self.density:g} trees/ha find no place in clusters {self.spacing:g} m apart: reduce one of them"
                 )
-        return places
+        return np.array(places)
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        return (int(x / self.spacing), int(y / self.spacing)) if self.spacing > 0.0 else (0, 0)
+
+    def _is_free(self, x: float, y: float, cells: dict[tuple[int, int], list[tuple[float, float]]]) -> bool:
+        """Return whether no tree is closer to a place than the spacing."""
+        if self.spacing == 0.0:
+            return True
+        row, column = self._cell(x, y)
+        return all(
+            (x - other_x) ** 2 + (y - other_y) ** 2 >= self.spacing**2
+            for i in (row - 1, row, row + 1)
+            for j in (column - 1, column, column + 1)
+            for other_x, other_y in cells.get((i, j), ())
+        )
 
     def _beside(self, parents: Array, rng: np.random.Generator) -> Array:
         """Return a place (2,) of a cluster that lies in the stand."""

@@ -29,8 +29,8 @@ _BRANCH_HEIGHT, _BRANCH_LENGTH, _BRANCH_RADIUS, _BRANCH_ELEVATION = (0.4, 5.0), 
 # Of undergrowth: blades of a bush, its radius and height, the width of a blade, in m.
 _BLADES, _BUSH_RADIUS, _BUSH_HEIGHT, _BLADE_WIDTH = 30, (0.2, 0.6), (0.3, 1.3), (0.01, 0.06)
 
-# Streams of random numbers, beside those of `stand`, `ground` and `routes`.
-_BRANCHES, _UNDERGROWTH = 4, 5
+# Streams of random numbers, beside those of `stand`, `ground`, `routes` and `plain`.
+_BRANCHES, _UNDERGROWTH, _LEAN = 4, 5, 8
 
 # A flat, pointed leaf in the plane of x and z.
 _BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]), np.array([(0, 1, 2)]))
@@ -38,15 +38,17 @@ _BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]
 
 @dataclass(frozen=True)
 class Vegetation:
-    """How much clutter grows in a forest.
+    """How trees grow, and how much clutter there is.
 
     Attributes:
-        seed: Determines where.
+        seed: Determines directions and places.
+        lean: Standard deviation of the inclination of trunks in rad, per axis.
         undergrowth: Bushes per hectare.
         branches: Dead branches of a tree below its crown, on average.
     """
 
     seed: int = 0
+    lean: float = 0.01
     undergrowth: float = 300.0
     branches: float = 6.0
 
@@ -56,6 +58,12 @@ class Vegetation:
                 "undergrowth is within [0, 5000] bushes per hectare and branches within [0, 50] per tree, not "
                 f"{self.undergrowth:g} and {self.branches:g}"
             )
+        if not 0.0 <= self.lean <= 0.2:
+            raise ValueError(f"trunks lean by a standard deviation within [0, 0.2] rad, not {self.lean:g} rad")
+
+    def leans(self, trees: WorldModel) -> Array:
+        """Return how far each trunk leans in x and y per m of height, (n, 2)."""
+        return np.random.default_rng([self.seed, _LEAN]).normal(0.0, self.lean, (len(trees), 2))
 
 
 def feet(trees: WorldModel, ground: Ground) -> Array:
@@ -64,22 +72,28 @@ def feet(trees: WorldModel, ground: Ground) -> Array:
     return np.column_stack([p[:, :2], ground.height(p[:, 0], p[:, 1])])
 
 
-def trunks(trees: WorldModel, ground: Ground) -> Surface:
-    """Return the trunks: upright cones from below the ground to the top of the tree.
+def trunks(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surface:
+    """Return the trunks: cones from below the ground to the top of the tree, which lean a little.
 
-    A cone has the diameter of its tree at `BREAST_HEIGHT` over the ground.
+    A cone has the diameter of its tree at `BREAST_HEIGHT` over the ground, and its axis is at the place of the tree
+    where it leaves the ground. Real trunks are also crooked, and wider at their feet; these are not.
     """
     diameters, heights = _sizes(trees)
     length = heights + _ROOTED
     radius = 0.5 * diameters * length / (heights - BREAST_HEIGHT)
-    return copies(unit_cone(_FACETS), _scaled(radius, radius, length), feet(trees, ground) - [0.0, 0.0, _ROOTED])
+    leans = vegetation.leans(trees)
+    shapes = _scaled(radius, radius, length)
+    shapes[:, :2, 2] = leans * length[:, np.newaxis]
+    below = _ROOTED * np.column_stack([leans, np.ones(len(trees))])
+    return copies(unit_cone(_FACETS), shapes, feet(trees, ground) - below)
 
 
-def crowns(trees: WorldModel, ground: Ground) -> Surface:
-    """Return the crowns, each a coarse ellipsoid."""
+def crowns(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surface:
+    """Return the crowns, each a coarse ellipsoid around the upper part of its trunk."""
     _, heights = _sizes(trees)
     radius, half = 0.5 * _CROWN_DIAMETER * heights, 0.5 * (1.0 - _CROWN_BASE) * heights
-    centres = feet(trees, ground) + np.multiply.outer(heights - half, [0.0, 0.0, 1.0])
+    axes = np.column_stack([vegetation.leans(trees), np.ones(len(trees))])
+    centres = feet(trees, ground) + (heights - half)[:, np.newaxis] * axes
     return copies(unit_sphere(1), _scaled(radius, radius, half), centres)
 
 
@@ -89,8 +103,9 @@ def branches(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surfa
     of = np.repeat(np.arange(len(trees)), rng.poisson(vegetation.branches, len(trees)))
     _, heights = _sizes(trees)
     low, high = _BRANCH_HEIGHT
-    start = feet(trees, ground)[of]
-    start[:, 2] += rng.uniform(low, np.minimum(high, _CROWN_BASE * heights[of]))
+    axes = np.column_stack([vegetation.leans(trees), np.ones(len(trees))])
+    above = rng.uniform(low, np.minimum(high, _CROWN_BASE * heights[of]))
+    start = feet(trees, ground)[of] + above[:, np.newaxis] * axes[of]
     directions = _directions(
         rng.uniform(0.0, 2.0 * np.pi, len(of)), _BRANCH_ELEVATION * rng.uniform(-1.0, 1.0, len(of))
     )

@@ -77,13 +77,13 @@ def add_forest(plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: 
         plant: A plant that is registered with a SceneGraph, and not finalized.
         stand: The trees as they are.
         ground: What they stand on.
-        vegetation: Branches and undergrowth.
+        vegetation: How trees lean, branches and undergrowth.
     """
     add_ground(plant, ground, length=stand.length, width=stand.width)
     trees, routes = stand.trees(), stand.routes()
     if len(trees):
-        add_surface(plant, "trunks", trunks(trees, ground), _BARK)
-        add_surface(plant, "crowns", crowns(trees, ground), _NEEDLES)
+        add_surface(plant, "trunks", trunks(trees, ground, vegetation), _BARK)
+        add_surface(plant, "crowns", crowns(trees, ground, vegetation), _NEEDLES)
         add_surface(plant, "branches", branches(trees, ground, vegetation), _DEAD)
     roads = np.concatenate([np.zeros((0, 2)), *(route.points for route in routes)])
     area = {"lower": np.zeros(2), "upper": np.array([stand.length, stand.width])}

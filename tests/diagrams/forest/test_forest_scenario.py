@@ -42,7 +42,7 @@ def cast(directions: np.ndarray, p_WLo: np.ndarray, trees: WorldModel) -> Hits:
     """Cast rays at trunks on the ground."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)
     add_ground(plant, GROUND, length=40.0, width=40.0)
-    add_surface(plant, "trunks", trunks(trees, GROUND), np.ones(4))
+    add_surface(plant, "trunks", trunks(trees, GROUND, Vegetation(lean=0.0)), np.ones(4))
     plant.Finalize()
     caster = RayCaster(plant, scene_graph)
     return caster.cast(
@@ -79,6 +79,20 @@ def test_rays_beside_the_trunk_hit_the_ground() -> None:
     np.testing.assert_allclose(points[:, 2], GROUND.height(points[:, 0], points[:, 1]), atol=0.02)
 
 
+def test_trunks_lean_about_their_feet() -> None:
+    trees, vegetation = Stand(seed=1).trees(), Vegetation(seed=1, lean=0.02)
+    feet = trees.positions()
+    feet[:, 2] = GROUND.height(feet[:, 0], feet[:, 1])
+    vertices = trunks(trees, GROUND, vegetation)[0].reshape(len(trees), -1, 3)
+    base, top = vertices[:, :-1].mean(axis=1), vertices[:, -1]
+    slopes = (top - base)[:, :2] / (top - base)[:, 2:]
+    # The lines from base to top pass through the feet, as inclined as it was asked for.
+    on_ground = base[:, :2] + slopes * (feet[:, 2] - base[:, 2])[:, np.newaxis]
+    np.testing.assert_allclose(on_ground, feet[:, :2], atol=1e-9)
+    assert slopes.std() == pytest.approx(0.02, rel=0.05) and abs(slopes.mean()) < 0.002
+    np.testing.assert_allclose(top[:, 2] - feet[:, 2], [one.number("height", unit="m") for one in trees])
+
+
 def test_vegetation_is_where_it_grows() -> None:
     stand, vegetation = Stand(seed=1, length=40.0, width=40.0, road_width=4.0), Vegetation(seed=1)
     trees = stand.trees()
@@ -95,7 +109,7 @@ def test_vegetation_is_where_it_grows() -> None:
     assert over.min() > -0.3 and 0.5 < over.max() < 1.6
     assert np.linalg.norm(vertices[::50, np.newaxis, :2] - roads, axis=2).min() > 1.0
 
-    vertices, _ = crowns(trees, GROUND)
+    vertices, _ = crowns(trees, GROUND, vegetation)
     assert (vertices[:, 2] - GROUND.height(vertices[:, 0], vertices[:, 1])).min() > 2.0
 
 
@@ -243,6 +257,7 @@ def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
         ({"length": 20.0}, "a stand with roads is at least 40 m long"),
         ({"bumps": 1.0}, "so that a carrier can drive there"),
         ({"undergrowth": -1.0}, "bushes per hectare"),
+        ({"lean": 0.5}, "lean by a standard deviation within"),
         ({"laps": 0}, "laps must be at least 1"),
     ],
 )

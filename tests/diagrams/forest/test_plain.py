@@ -19,7 +19,7 @@ def diameters(rocks: WorldModel) -> np.ndarray:
     return np.array([(one.number("length", unit="m") * one.number("width", unit="m")) ** 0.5 for one in rocks])
 
 
-@pytest.mark.parametrize("abundance", [0.03, 0.1])
+@pytest.mark.parametrize("abundance", [0.03, 0.06])
 def test_covered_area_follows_the_law(abundance: float) -> None:
     """F(D) = k exp(-q D); rocks above 1.5 m are too few to test."""
     found = np.concatenate([diameters(RockField(seed, length=200.0, abundance=abundance).rocks()) for seed in range(3)])
