@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Mesh
+from pydrake.geometry import (
+    GeometryInstance,
+    IllustrationProperties,
+    Mesh,
+    PerceptionProperties,
+    RenderLabel,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from vtbdrake.components.meshes import Surface, surface_mesh
+from vtbdrake.components.textures import grain, tiled_mesh
 from vtbdrake_diagrams.forest.ground import Ground
 from vtbdrake_diagrams.forest.plain import RockField, rock_surface
 from vtbdrake_diagrams.forest.stand import Stand
@@ -18,6 +25,9 @@ Array = NDArray[np.float64]
 
 # How far the ground goes on around a stand, in m.
 _MARGIN = 15.0
+
+# The extents of images with grain in m: of bark, which is drawn out upwards, and of everything else.
+_BARK_TILE, _TILE = (2.0, 40.0), (5.0, 5.0)
 
 _SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
     np.array(color)
@@ -33,7 +43,9 @@ _SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
 )
 
 
-def add_surface(plant: MultibodyPlant, name: str, surface: Surface, color: Array) -> None:
+def add_surface(
+    plant: MultibodyPlant, name: str, surface: Surface, color: Array, *, tile: tuple[float, float] | None = None
+) -> None:
     """Register a surface in W on the world body, for scanners, cameras and Meshcat; nothing collides with it.
 
     Args:
@@ -41,16 +53,35 @@ def add_surface(plant: MultibodyPlant, name: str, surface: Surface, color: Array
         name: Of the geometry.
         surface: Vertices and triangles; one without triangles is left out.
         color: Red, green, blue and opacity, from 0 to 1, shape (4,).
+        tile: The extent in m, across and upwards, of an image with grain that covers the surface, see `tiled_mesh`;
+            None for a plain surface.
     """
-    if len(surface[1]):
+    if not len(surface[1]):
+        return
+    if tile is None:
         mesh = Mesh(surface_mesh(surface, name=name), 1.0)
         plant.RegisterVisualGeometry(plant.world_body(), RigidTransform(), mesh, name, color)
+        return
+    geometry = GeometryInstance(RigidTransform(), tiled_mesh(surface, image=grain(color[:3]), tile=tile), name)
+    geometry.set_illustration_properties(IllustrationProperties())
+    properties = PerceptionProperties()
+    properties.AddProperty("label", "id", RenderLabel(int(plant.world_body().index())))  # As a plant labels its own.
+    geometry.set_perception_properties(properties)
+    plant.RegisterVisualGeometry(plant.world_body(), geometry)
 
 
-def add_ground(plant: MultibodyPlant, ground: Ground, *, length: float, width: float, color: Array = _SOIL) -> None:
+def add_ground(
+    plant: MultibodyPlant,
+    ground: Ground,
+    *,
+    length: float,
+    width: float,
+    color: Array = _SOIL,
+    tile: tuple[float, float] | None = None,
+) -> None:
     """Register the ground of an area from (0, 0) to (length, width) in m, and some around it, like `add_surface`."""
     lower, upper = np.full(2, -_MARGIN), np.array([length, width]) + _MARGIN
-    add_surface(plant, "ground", ground.mesh(lower, upper), color)
+    add_surface(plant, "ground", ground.mesh(lower, upper), color, tile=tile)
 
 
 def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> None:
@@ -67,7 +98,9 @@ def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> N
         add_surface(plant, "rocks", rock_surface(rocks, ground), _STONE)
 
 
-def add_forest(plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: Vegetation) -> None:
+def add_forest(
+    plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: Vegetation, *, textured: bool = False
+) -> None:
     """Register a stand on its ground, with branches and undergrowth, on the world body of a plant.
 
     Scanners, cameras and Meshcat see it. Nothing collides with it: a driver keeps away from trees, and the wheels of a
@@ -78,14 +111,16 @@ def add_forest(plant: MultibodyPlant, stand: Stand, ground: Ground, vegetation: 
         stand: The trees as they are.
         ground: What they stand on.
         vegetation: How trees lean, branches and undergrowth.
+        textured: Whether all surfaces are grained, as stereo cameras need it; images then take longer to render.
     """
-    add_ground(plant, ground, length=stand.length, width=stand.width)
+    even, upright = (_TILE, _BARK_TILE) if textured else (None, None)
+    add_ground(plant, ground, length=stand.length, width=stand.width, tile=even)
     trees, routes = stand.trees(), stand.routes()
     if len(trees):
-        add_surface(plant, "trunks", trunks(trees, ground, vegetation), _BARK)
-        add_surface(plant, "crowns", crowns(trees, ground, vegetation), _NEEDLES)
-        add_surface(plant, "branches", branches(trees, ground, vegetation), _DEAD)
+        add_surface(plant, "trunks", trunks(trees, ground, vegetation), _BARK, tile=upright)
+        add_surface(plant, "crowns", crowns(trees, ground, vegetation), _NEEDLES, tile=even)
+        add_surface(plant, "branches", branches(trees, ground, vegetation), _DEAD, tile=even)
     roads = np.concatenate([np.zeros((0, 2)), *(route.points for route in routes)])
     area = {"lower": np.zeros(2), "upper": np.array([stand.length, stand.width])}
     bushes = undergrowth(ground, vegetation, **area, roads=(roads, 0.5 * stand.road_width))
-    add_surface(plant, "undergrowth", bushes, _LEAVES)
+    add_surface(plant, "undergrowth", bushes, _LEAVES, tile=even)

@@ -44,13 +44,13 @@ def photograph(mesh: Mesh, X_WC: RigidTransform) -> np.ndarray:
 QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[255, 255, 255], [0, 0, 255]]], dtype=np.uint8).repeat(16, 0)
 QUARTERS = QUARTERS.repeat(16, 1)
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-TWO = [[0, 1, 2], [0, 2, 3]]
+TWO = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def test_tiles_lie_at_their_places_on_level_ground() -> None:
     ground = np.column_stack([SQUARE, np.zeros(4)])
     above = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 1.0])  # The image's x is that of the world.
-    image = photograph(tiled_mesh(ground, TWO, image=QUARTERS, tile=(2.0, 2.0)), above)
+    image = photograph(tiled_mesh((ground, TWO), image=QUARTERS, tile=(2.0, 2.0)), above)
     for (x, y), color in {
         (0.4, 0.4): (255, 255, 255),
         (0.4, -0.4): (255, 0, 0),
@@ -64,7 +64,7 @@ def test_tiles_stand_upright_on_walls() -> None:
     # The wall x = 0 from the side of negative x: y points to the left.
     wall = np.column_stack([np.zeros(4), -SQUARE[:, 0], SQUARE[:, 1]])
     before = RigidTransform(RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2), [-1.0, 0.0, 0.0])
-    image = photograph(tiled_mesh(wall, TWO, image=QUARTERS, tile=(2.0, 4.0)), before)
+    image = photograph(tiled_mesh((wall, TWO), image=QUARTERS, tile=(2.0, 4.0)), before)
     # One metre above the origin is the middle of a tile that is 4 m high.
     for (y, z), color in {(0.4, 0.5): (255, 255, 255), (0.4, -0.5): (255, 0, 0), (-0.4, 0.5): (0, 0, 255)}.items():
         assert np.abs(image[int(100 - 100 * z), int(100 - 100 * y)] - np.array(color, dtype=float)).max() < 10, (y, z)
@@ -72,7 +72,7 @@ def test_tiles_stand_upright_on_walls() -> None:
 
 def test_triangles_larger_than_the_image_are_refused() -> None:
     with pytest.raises(ValueError, match=r"extends over 2 x 2 m, more than the image of 0.5 x 3 m: give a larger"):
-        tiled_mesh(np.column_stack([SQUARE, np.zeros(4)]), TWO, image=QUARTERS, tile=(0.5, 3.0))
+        tiled_mesh((np.column_stack([SQUARE, np.zeros(4)]), TWO), image=QUARTERS, tile=(0.5, 3.0))
 
 
 def test_png_holds_the_colours() -> None:

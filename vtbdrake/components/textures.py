@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.components.meshes import Surface, vertex_normals
+
 if TYPE_CHECKING:
     from pydrake.geometry import Mesh
 
@@ -62,28 +64,23 @@ def _mesh(
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(obj.encode(), ".obj", "texture.obj"), supporting_files=files))
 
 
-def tiled_mesh(
-    vertices: ArrayLike, triangles: ArrayLike, *, image: NDArray[np.uint8], tile: tuple[float, float]
-) -> Mesh:
-    """Return a surface in memory that is tiled with an image, along the two axes that each triangle faces least.
+def tiled_mesh(surface: Surface, *, image: NDArray[np.uint8], tile: tuple[float, float]) -> Mesh:
+    """Return a surface as a mesh that is tiled with an image, along the two axes that each triangle faces least.
 
-    So upright surfaces show the image upright, and each place of a surface in space shows another part of it. Edges of
-    triangles are sharp.
+    So upright surfaces show the image upright, and each place of a surface in space shows another part of it.
 
     Args:
-        vertices: The vertices in m, shape (v, 3).
-        triangles: Indices of three vertices each, counterclockwise seen from outside, shape (t, 3).
+        surface: Vertices in m and triangles.
         image: Colours, shape (h, w, 3), that repeat without a seam.
         tile: The extent of the image in m, across and (on upright surfaces) along z. No triangle extends farther.
 
     Raises:
         ValueError: A triangle is larger than the image.
     """
-    indices = np.asarray(triangles, dtype=np.int64)
-    points = np.asarray(vertices, dtype=float)[indices]
-    normals = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(np.abs(normals), axis=1)]
+    vertices, indices = surface
+    points = vertices[indices]
+    facing = np.abs(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]))
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(facing, axis=1)]
     across = np.take_along_axis(points, axes[:, np.newaxis, :], axis=2) / tile
     folded = across - np.floor(across.min(axis=1, keepdims=True))
     if folded.max(initial=0.0) > 2.0:
@@ -92,11 +89,9 @@ def tiled_mesh(
             f"a triangle extends over {extent[0]:.3g} x {extent[1]:.3g} m, more than the image of {tile[0]:g} x "
             f"{tile[1]:g} m: give a larger tile, or divide the triangle"
         )
-    count = np.arange(len(indices))
-    of_triangles = np.repeat(count[:, np.newaxis], 3, axis=1)
-    corners = np.stack([indices, 3 * count[:, np.newaxis] + np.arange(3), of_triangles], axis=-1)
+    corners = np.stack([indices, np.arange(indices.size).reshape(-1, 3), indices], axis=-1)
     # Renderers do not repeat an image: here it is twice as wide and high, so that a triangle may cross its edges.
-    return _mesh(vertices, 0.5 * folded.reshape(-1, 2), normals, corners, np.tile(image, (2, 2, 1)))
+    return _mesh(vertices, 0.5 * folded.reshape(-1, 2), vertex_normals(surface), corners, np.tile(image, (2, 2, 1)))
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

@@ -150,7 +150,7 @@ def cylinders(trees: Array) -> tuple[Array, NDArray[np.int64]]:
 def photographed(trees: Array, info: CameraInfo, baseline: float) -> list[ImageRgba8U]:
     """The left and the right image of trees with bark."""
     scene_graph = SceneGraph()
-    mesh = tiled_mesh(*cylinders(trees), image=grain((0.6, 0.5, 0.4)), tile=(2.0, 16.0))
+    mesh = tiled_mesh(cylinders(trees), image=grain((0.6, 0.5, 0.4)), tile=(2.0, 16.0))
     geometry = GeometryInstance(RigidTransform(), mesh, "trees")
     geometry.set_perception_properties(PerceptionProperties())
     world = scene_graph.world_frame_id()
