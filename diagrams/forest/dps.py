@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from drake import lcmt_scope
 from pydrake.common.value import Value
@@ -19,8 +22,7 @@ from vtbdrake.components.localization.dead_reckoning import DeadReckoning, Drift
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.fallback import Hold
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import scan_map
-from vtbdrake.lcm.maps import vector_map
+from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_localizer
 
@@ -30,35 +32,38 @@ AXLE = -0.8
 """Where the rear axle, which is not steered, is on x_B, in m."""
 
 
-def make_deployment(*, scan_period: float) -> Deployment:
+def make_deployment(eyes: LcmMap, *, period: float) -> Deployment:
     """Return how the localization unit runs on its carrier: after a fault, the advised route stays.
 
-    Signals of numbers travel as ``lcmt_scope``; scans leave before them in the cycle of the carrier.
+    Signals of numbers travel as ``lcmt_scope``; scans or images leave before them in the cycle of the carrier.
 
     Args:
-        scan_period: Time from scan to scan, in s.
+        eyes: How scans or images travel.
+        period: Time from scan to scan, or from image to image, in s.
     """
     return Deployment(
         protocol=Protocol(
             sense=[
-                scan_map("SCAN", "scan"),
+                eyes,
                 vector_map("ODOMETRY", lcmt_scope, {"odometry": "value"}),
                 vector_map("IMU", lcmt_scope, {"imu": "value"}),
             ],
             act=[vector_map("ROUTE_COMMAND", lcmt_scope, {"route": "value"})],
             commands=[vector_map("ROUTE", lcmt_scope, {"route": "value"})],
-            periods={"SCAN": scan_period},
+            periods={eyes.channel: period},
         ),
         period=PERIOD,
         guards={"fallback": {"route": Hold()}},
     )
 
 
-def make_dps(world_map: WorldModel, localizer: Localizer, *, latency: float, drift: DriftModel) -> Diagram:
+def make_dps(
+    world_map: WorldModel, localizer: Localizer, eyes: Mapping[str, Any], *, latency: float, drift: DriftModel
+) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` localizes, ``impl`` advises the driver.
 
-    Input ports: ``scan`` (a `Scan`), ``imu`` (6), ``odometry`` (1), and the command ``route`` (1: the number of the
-    route that is advised). Output port: ``route`` (1).
+    Input ports: one for each of the eyes (``scan``, a `Scan`), ``imu`` (6), ``odometry`` (1), and the command ``route``
+    (1: the number of the route that is advised). Output port: ``route`` (1).
 
     ``env`` has the map as a constant, ``map``: it is part of the DPS, and stays when the simulated world is left out.
     Every part is sampled and shows its own state: no input feeds through.
@@ -66,17 +71,19 @@ def make_dps(world_map: WorldModel, localizer: Localizer, *, latency: float, dri
     Args:
         world_map: What the carrier knows of the world, as the localizer uses it.
         localizer: How scans are evaluated.
+        eyes: A value of each of the signals that the localizer sees with.
         latency: From the sample of a scan to its pose, in s.
         drift: How the dead reckoning drifts.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense())
-    env = builder.AddNamedSystem("env", _make_env(world_map, localizer, latency=latency, drift=drift))
+    env = builder.AddNamedSystem("env", _make_env(world_map, localizer, eyes, latency=latency, drift=drift))
     impl = builder.AddNamedSystem("impl", _make_impl())
     for signal in ("imu", "odometry"):
         builder.ExportInput(sense.GetInputPort(signal), signal)
         builder.Connect(sense.GetOutputPort(signal), env.GetInputPort(signal))
-    builder.ExportInput(env.GetInputPort("scan"), "scan")
+    for eye in eyes:
+        builder.ExportInput(env.GetInputPort(eye), eye)
     builder.ExportInput(impl.GetInputPort("route"), "route")
     builder.ExportOutput(impl.GetOutputPort("route"), "route")
     dps = builder.Build()
@@ -101,12 +108,14 @@ def _make_sense() -> Diagram:
     return builder.Build()
 
 
-def _make_env(world_map: WorldModel, localizer: Localizer, *, latency: float, drift: DriftModel) -> Diagram:
+def _make_env(
+    world_map: WorldModel, localizer: Localizer, eyes: Mapping[str, Any], *, latency: float, drift: DriftModel
+) -> Diagram:
     """Return the perceived environment: the map, and where the carrier is on it."""
     builder = DiagramBuilder()
     builder.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
     reckoning = builder.AddNamedSystem("dead_reckoning", DeadReckoning(period=PERIOD, axle=AXLE))
-    part = add_localizer(builder, reckoning, localizer, period=PERIOD, latency=latency)
+    part = add_localizer(builder, reckoning, localizer, eyes, period=PERIOD, latency=latency)
     pose = builder.AddNamedSystem("pose", PresentPose(period=PERIOD, drift=drift))
     builder.Connect(reckoning.GetOutputPort("motion"), pose.GetInputPort("motion"))
     for port in ("pose", "covariance", "status", "odometry", "time"):

@@ -1,12 +1,13 @@
 """The perception in the DPS of the localization unit: scans become landmarks, and landmarks the pose on the map.
 
 A scan is dated by the clock of the DPS when it arrives (`Arrival`). The slow part ``localizer`` takes it one period
-later: the history of the dead reckoning, which then ends one period before the arrival, reaches the scan's time.
+later: the history of the dead reckoning, which then ends one period before the arrival, reaches the scan's time. Pairs
+of images may take the place of scans (`vtbdrake_diagrams.forest.stereo`), in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -79,24 +80,32 @@ class Localizer:
     """The localization from landmarks to the pose: the function of the slow part ``localizer``.
 
     Attributes:
-        see: Returns the landmarks in a scan, such as `ScanLandmarks`.
+        see: Returns the landmarks in what the eyes show, such as `ScanLandmarks`.
         unit: The localization on the map.
+        eyes: The signals that ``see`` takes, before the history and the time.
     """
 
-    see: Callable[[Scan, Array, float], Landmarks]
+    see: Callable[..., Landmarks]
     unit: LocalizationUnit
+    eyes: tuple[str, ...] = ("scan",)
 
     def prepare(self) -> None:
-        """Look for the libraries of linear algebra."""
+        """Look for the libraries of linear algebra, and load what ``see`` needs."""
         _blas()
+        getattr(self.see, "prepare", lambda: None)()
 
     def __call__(
-        self, *, scan: Scan, scan_time: Array, request: Array, history: Array, memory: UnitState
+        self, *, request: Array, history: Array, memory: UnitState, **seen: Any
     ) -> tuple[dict[str, Any], UnitState]:
-        """Return the outputs of the slow part, and the memory of the unit."""
-        taken = float(scan_time[0])
+        """Return the outputs of the slow part, and the memory of the unit.
+
+        ``seen`` holds the samples of the eyes and their times, such as ``scan`` and ``scan_time``. Samples of different
+        times do not fit together: then nothing is seen.
+        """
+        times = [float(seen[f"{eye}_time"][0]) for eye in self.eyes]
+        taken, is_one = times[0], min(times) == max(times)
         with _blas().limit(limits=1, user_api="blas"):
-            landmarks = self.see(scan, history, taken)
+            landmarks = self.see(*(seen[eye] for eye in self.eyes), history, taken) if is_one else Landmarks.empty()
             found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
         outputs = {
             "pose": found.pose,
@@ -210,14 +219,21 @@ def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, dura
 
 
 def add_localizer(
-    builder: DiagramBuilder, reckoning: DeadReckoning, localizer: Localizer, *, period: float, latency: float
+    builder: DiagramBuilder,
+    reckoning: DeadReckoning,
+    localizer: Localizer,
+    eyes: Mapping[str, Any],
+    *,
+    period: float,
+    latency: float,
 ) -> SlowPart:
-    """Add the slow part ``localizer`` with its ``scan_arrival``, and the input port ``scan`` of their Diagram.
+    """Add the slow part ``localizer``, and for each eye, such as ``scan``, its ``scan_arrival`` and the input port.
 
     Args:
         builder: Of the Diagram ``env`` of the DPS.
         reckoning: Remembers the poses of the carrier.
         localizer: What is computed.
+        eyes: A value of each of its signals.
         period: The period of the DPS, in s.
         latency: From the sample of a scan to its pose, in s.
 
@@ -227,7 +243,7 @@ def add_localizer(
     first = Localization.unknown()
     part = SlowPart(
         localizer,
-        inputs={"scan": Scan.empty(), "scan_time": 1, "history": history_size(period)},
+        inputs={**eyes, **{f"{eye}_time": 1 for eye in eyes}, "history": history_size(period)},
         outputs={
             "pose": 3,
             "covariance": 9,
@@ -254,10 +270,13 @@ def add_localizer(
         offset=period,
         on_request=True,
     )
-    arrival = builder.AddNamedSystem("scan_arrival", Arrival(Scan.empty(), period=period, age=period))
     builder.AddNamedSystem("localizer", part)
-    for output, port in {"sample": "scan", "time": "scan_time", "number": "request"}.items():
-        builder.Connect(arrival.GetOutputPort(output), part.GetInputPort(port))
+    for eye, value in eyes.items():
+        arrival = builder.AddNamedSystem(f"{eye}_arrival", Arrival(value, period=period, age=period))
+        builder.Connect(arrival.GetOutputPort("sample"), part.GetInputPort(eye))
+        builder.Connect(arrival.GetOutputPort("time"), part.GetInputPort(f"{eye}_time"))
+        builder.ExportInput(arrival.GetInputPort("signal"), eye)
+    # The last one, as all of them arrive together or in this order.
+    builder.Connect(arrival.GetOutputPort("number"), part.GetInputPort("request"))
     builder.Connect(reckoning.GetOutputPort("history"), part.GetInputPort("history"))
-    builder.ExportInput(arrival.GetInputPort("signal"), "scan")
     return part

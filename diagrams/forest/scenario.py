@@ -17,6 +17,7 @@ from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
 from vtbdrake.components.localization.unit import LocalizationUnit
@@ -24,6 +25,7 @@ from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
 from vtbdrake.components.world_model import WorldModel, load_geojson
 from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.drake_messages import image_array_map, scan_map
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
@@ -32,9 +34,12 @@ from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
 from vtbdrake_diagrams.forest.plain import RockField
 from vtbdrake_diagrams.forest.routes import Route
 from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
+from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig, StereoLandmarks, add_stereo
 from vtbdrake_diagrams.forest.vegetation import Vegetation
 
 Array = NDArray[np.float64]
+
+PERCEPTIONS = ("scanner", "stereo")
 
 # What a detector assumes of a scanner whose ranges are exact, in m.
 _LEAST_RANGE_NOISE = 0.005
@@ -180,11 +185,15 @@ class CarrierScenario(Scenario):
         """
         return load_geojson(self.map_file) if self.map_file else self.surveyed_map()
 
+    def eyes(self) -> list[Signal]:
+        """Return the signals of what the DPS sees landmarks with."""
+        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency)]
+
     def interface(self) -> Interface:
         last = len(self.routes()) - 1.0
         return Interface(
             sense=[
-                Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency),
+                *self.eyes(),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-50.0, upper=50.0, max_age=5 * PERIOD),
                 Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD),
             ],
@@ -193,8 +202,8 @@ class CarrierScenario(Scenario):
         )
 
     @abstractmethod
-    def sight(self) -> Callable[[Scan, Array, float], Landmarks]:
-        """Return how the DPS finds landmarks in scans, see `Localizer`."""
+    def sight(self) -> Callable[..., Landmarks]:
+        """Return how the DPS finds landmarks in what its eyes show, see `Localizer`."""
 
     def scanner_accuracy(self) -> dict[str, float]:
         """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
@@ -216,21 +225,20 @@ class CarrierScenario(Scenario):
 
     def make_dps(self) -> Diagram:
         world_map = self.global_map()
-        localizer = Localizer(self.sight(), self.unit(world_map))
-        return make_dps(world_map, localizer, latency=self.localizer_latency, drift=DriftModel())
+        eyes = {signal.name: signal.model_value for signal in self.eyes()}
+        localizer = Localizer(self.sight(), self.unit(world_map), tuple(eyes))
+        return make_dps(world_map, localizer, eyes, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
-        return make_deployment(scan_period=1.0 / self.scanner.frequency)
+        return make_deployment(scan_map("SCAN", "scan"), period=1.0 / self.scanner.frequency)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
-        from vtbdrake.components.ray_casting import RayCaster
-        from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
         from vtbdrake_diagrams.forest.belief import declare_belief
         from vtbdrake_diagrams.forest.carrier import Carrier, WheelOdometer, Wheels, add_carrier, standing_pose
         from vtbdrake_diagrams.forest.driver import Driver
 
-        plant, scene_graph = builder.add_plant(self.plant_config)
+        plant, _ = builder.add_plant(self.plant_config)
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
         carrier, ground, routes = Carrier(), self.ground(), self.routes()
         self.add_landscape(plant)
@@ -264,21 +272,36 @@ class CarrierScenario(Scenario):
         builder.add("sense", "odometry", odometer)
         builder.connect(wheels.GetOutputPort("speed"), odometer.GetInputPort("speed"))
         builder.sim_sensor("odometry", odometer.get_output_port())
+        self.add_eyes(builder)
+        # So old are the samples of IMU and odometry.
+        declare_belief(builder, carrier, ground, routes, age=PERIOD)
+
+    def add_eyes(self, builder: VirtualTestbedBuilder) -> None:
+        """Add what the DPS sees landmarks with to the simulated world: the scanner."""
+        from vtbdrake.components.ray_casting import RayCaster
+        from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
+
+        plant = builder.plant
+        caster = RayCaster(plant, builder.scene_graph)
         frame = plant.GetFrameByName("scanner")
-        caster = RayCaster(plant, scene_graph)
         scanner = LaserScanner(plant, frame, caster, config=self.scanner, errors=self.scanner_errors)
         builder.add("sense", "scanner", scanner)
         connect_laser_scanner(builder.diagram_builder, scanner, plant)
         builder.sim_sensor("scan", scanner.GetOutputPort("scan"))
-        # So old are the samples of IMU and odometry.
-        declare_belief(builder, carrier, ground, routes, age=PERIOD)
 
 
 @dataclass
 class ForestScenario(CarrierScenario):
-    """A carrier in a forest stand with strip roads; the landmarks are trees."""
+    """A carrier in a forest stand with strip roads; the landmarks are trees.
+
+    With ``perception="stereo"``, a pair of cameras takes the place of the scanner, and the trees have bark.
+    """
 
     landmark: ClassVar[str] = "tree"
+
+    # What the unit sees with: scanner or stereo; and the pair of cameras.
+    perception: str = "scanner"
+    stereo: StereoConfig = field(default_factory=StereoConfig)
 
     # natural, clustered or plantation, see `Stand`.
     stand_kind: str = "natural"
@@ -294,11 +317,13 @@ class ForestScenario(CarrierScenario):
 
     def validate(self) -> None:
         self.require(
+            perception=(self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
             stand_kind=(self.stand_kind in KINDS, f"one of {', '.join(KINDS)}"),
             road_width=(self.road_width >= 3.0, "at least 3 m: the carrier is 1.5 m wide"),
         )
         super().validate()
         try:
+            self.stereo.check()
             self.vegetation()
         except ValueError as error:
             raise ScenarioError(f"{type(self).__name__}: {error}") from None
@@ -328,13 +353,37 @@ class ForestScenario(CarrierScenario):
     def surveyed_map(self) -> WorldModel:
         return self.stand().map(MAPS[self.map], seed=self.map_seed)
 
-    def sight(self) -> ScanLandmarks:
-        return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
-
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world import add_forest
 
-        add_forest(plant, self.stand(), self.ground(), self.vegetation())
+        textured = self.perception == "stereo"
+        add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
+
+    def eyes(self) -> list[Signal]:
+        if self.perception == "scanner":
+            return super().eyes()
+        from pydrake.systems.sensors import ImageRgba8U
+
+        image = ImageRgba8U(self.stereo.width, self.stereo.height)
+        return [Signal(name, model_value=image, max_age=5.0 / self.stereo.rate) for name in IMAGES]
+
+    def sight(self) -> Callable[..., Landmarks]:
+        if self.perception == "scanner":
+            return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
+        X_BC = self.X_BL @ self.stereo.poses()[IMAGES[0]]
+        return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetector(), X_BC)
+
+    def deployment(self) -> Deployment:
+        if self.perception == "scanner":
+            return super().deployment()
+        images = image_array_map("IMAGES", {name: name for name in IMAGES})
+        return make_deployment(images, period=1.0 / self.stereo.rate)
+
+    def add_eyes(self, builder: VirtualTestbedBuilder) -> None:
+        if self.perception == "scanner":
+            super().add_eyes(builder)
+        else:
+            add_stereo(builder, builder.plant.GetFrameByName("scanner"), self.stereo)
 
 
 @dataclass

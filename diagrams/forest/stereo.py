@@ -1,0 +1,154 @@
+"""The pair of cameras that may take the place of the laser scanner: what it is, and how the DPS sees trunks with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from vtbdrake.components.localization.dead_reckoning import body_rotation, carrier_pose_at
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
+from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
+
+if TYPE_CHECKING:
+    from pydrake.multibody.tree import Frame
+    from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+
+    from vtbdrake.testbed import VirtualTestbedBuilder
+
+Array = NDArray[np.float64]
+
+IMAGES = ("left_image", "right_image")
+"""The signals of the pair."""
+
+# A camera's x is to the right and its y down; the frame L has x ahead and z up.
+_R_LC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+
+
+@dataclass
+class StereoConfig:
+    """Two cameras side by side, which look along x of the frame L, and how their images are compared."""
+
+    # Pairs of images per second.
+    rate: float = 2.0
+    # The size of an image in pixels.
+    width: int = 320
+    height: int = 240
+    # The field of view from top to bottom in rad: from left to right, it is 77 deg.
+    field_of_view: float = 1.08
+    # Distance of the cameras in m.
+    baseline: float = 0.3
+    # Standard deviation of the read noise, in counts of 255.
+    noise: float = 1.5
+    # The largest disparity in pixels, a multiple of 16: what is nearer is not seen.
+    largest_disparity: int = 32
+
+    def check(self) -> None:
+        """Raise a ValueError if there is no such pair.
+
+        Raises:
+            ValueError: A value that no pair of cameras can have.
+        """
+        if not (self.rate > 0.0 and 0.0 < self.field_of_view < np.pi and self.noise >= 0.0):
+            raise ValueError(
+                "a pair of cameras has a positive rate, a field of view between 0 and pi rad and no negative noise, "
+                f"not {self.rate:g}, {self.field_of_view:g} and {self.noise:g}"
+            )
+        self.camera()
+        self.matcher()
+
+    def info(self) -> CameraInfo:
+        """Return size and intrinsics of each camera."""
+        from pydrake.systems.sensors import CameraInfo
+
+        return CameraInfo(self.width, self.height, self.field_of_view)
+
+    def camera(self) -> StereoCamera:
+        """Return the geometry of the pair."""
+        return StereoCamera.of(self.info(), baseline=self.baseline)
+
+    def matcher(self) -> StereoMatcher:
+        """Return how the images are compared."""
+        return StereoMatcher(largest_disparity=self.largest_disparity)
+
+    def poses(self) -> dict[str, RigidTransform]:
+        """Return X_LC of both cameras, by signal: the origin of L lies between them."""
+        half = 0.5 * self.baseline
+        return {name: RigidTransform(_R_LC, [0.0, y, 0.0]) for name, y in zip(IMAGES, (half, -half), strict=True)}
+
+
+@dataclass(frozen=True, eq=False)
+class StereoLandmarks:
+    """Trunks from pairs of images.
+
+    Attributes:
+        camera: The geometry of the pair.
+        matcher: How disparities are found.
+        detector: How trunks are found in them.
+        X_BC: Pose of the left camera, as the DPS knows it.
+    """
+
+    camera: StereoCamera
+    matcher: StereoMatcher
+    detector: StereoTrunkDetector
+    X_BC: RigidTransform
+
+    def prepare(self) -> None:
+        """Load OpenCV."""
+        blank = np.zeros((8, 8), dtype=np.uint8)
+        self.matcher.disparity(blank, blank)
+
+    def __call__(self, left: ImageRgba8U, right: ImageRgba8U, history: Array, time: float) -> Landmarks:
+        """Return the landmarks in the level frame H at the time of the images.
+
+        Args:
+            left: The image of the left camera.
+            right: The image of the right one, of the same time.
+            history: The port ``history`` of the `DeadReckoning`.
+            time: When they were taken, by the clock of the DPS, in s.
+        """
+        _, roll, pitch, *_ = carrier_pose_at(history, time)
+        X_HB = RigidTransform(RotationMatrix(body_rotation(roll, pitch)), np.zeros(3))
+        disparity = self.matcher.disparity(left, right)
+        return detect_stereo_trunks(disparity, self.camera, self.detector, X_HC=X_HB @ self.X_BC)
+
+
+def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfig) -> None:
+    """Add the cameras ``left_camera`` and ``right_camera`` with the ``light`` to a simulated world.
+
+    Args:
+        builder: With a finalized plant.
+        frame: The frame L of the pair.
+        config: What the pair is like.
+    """
+    from vtbdrake.components.environment.light import Light, LightConfig
+    from vtbdrake.components.sensors import ErrorModel
+    from vtbdrake.components.sensors.camera import Camera, connect_camera
+
+    light = LightConfig(
+        direction=[0.6, 0.4, -0.7],
+        intensity=1.6,
+        # The sky from the other side, with the exposure of a camera that sees no white.
+        earth_direction=[-0.7, -0.5, -0.5],
+        earth_shine=0.9,
+        background=[0.6, 0.7, 0.8],
+        shadows=False,
+    )
+    lit = builder.add("env", "light", Light(light))
+    for stream, (signal, X_LC) in enumerate(config.poses().items(), start=6):
+        camera = Camera(
+            builder.plant,
+            frame,
+            period=1.0 / config.rate,
+            info=config.info(),
+            X_FC=X_LC,
+            stream=stream,
+            errors=ErrorModel(noise=config.noise),
+        )
+        builder.add("sense", signal.replace("image", "camera"), camera)
+        connect_camera(builder.diagram_builder, camera, builder.scene_graph, light=lit)
+        builder.sim_sensor(signal, camera.GetOutputPort("color_image"))
