@@ -48,6 +48,7 @@ BENCHMARKS: Registry = {
     "arm_trajectory": "benchmarks.arm_trajectory:arm_trajectory",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
     "scanner_cost": "benchmarks.scanner:scanner_cost",
+    "localization_update_p50": "benchmarks.localization:localization_update_p50",
 }
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
