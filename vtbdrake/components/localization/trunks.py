@@ -42,6 +42,10 @@ _ITERATIONS = (3, 4)
 _GATE = 4.0
 # The distance from the axis, as a share of r, up to which the range of a ray that hits a trunk is predicted as it is.
 _GRAZING = 0.98
+# How much farther it may be beyond, as a share of r.
+_DEPTH = 0.2
+# Of how many standard deviations an edge is taken as it is; what is more counts less and less: it may be a branch.
+_DOUBT = 4.0
 # Information in 1/m^2 that says nothing, but makes matrices regular where no point is left.
 _NEGLIGIBLE = 1e-3
 
@@ -160,11 +164,11 @@ def _upright(scene: Scene, heights: Array, detector: TrunkDetector) -> Clusters:
     layer = (high - low) / _LAYERS
     filled = np.zeros((cells.side**2, _LAYERS), dtype=bool)
     filled[cells.flat, np.minimum((heights - low) / layer, _LAYERS - 1).astype(np.intp)] = True
-    bits = np.packbits(filled, axis=1).reshape(cells.side, cells.side)
+    bits = np.packbits(filled.ravel()).reshape(cells.side, cells.side)
     # With the neighbours of each cell, along x and along y.
     bits[1:-1] = bits[1:-1] | bits[2:] | bits[:-2]
     bits[:, 1:-1] = bits[:, 1:-1] | bits[:, 2:] | bits[:, :-2]
-    seen = np.unpackbits(bits.reshape(-1, 1)[cells.flat], axis=1).sum(axis=1)
+    seen = np.bitwise_count(bits.ravel()[cells.flat])
     # The layers in which rays passed: no more than the field of view has rows there.
     eye_heights = heights - scene.points[chosen, 2]
     top = np.minimum(eye_heights + distances * scene.slopes.max(), high)
@@ -201,15 +205,15 @@ class _Fit:
         cylinders, on = self._start()
         for repeated in _ITERATIONS:
             for _ in range(repeated):
-                cylinders, covariances = self._improved(cylinders, on)
-            errors, weights, _ = self._errors(cylinders)
-            squares = errors**2 * weights
-            on = squares < _GATE**2
+                cylinders = self._improved(cylinders, on)
+            on, squares = self._on(cylinders)
         count = np.maximum(clusters.sums(on.astype(float)), 1.0)
         misfit = clusters.sums(on * squares) / count
-        diameters = 2.0 * cylinders[:, 2]
+        diameters, covariances = 2.0 * cylinders[:, 2], self._covariances(cylinders, on)
         good = (count >= 3) & (count >= 0.6 * clusters.counts) & (misfit < detector.largest_misfit)
         good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
+        # Without enough points on it, a fit says where the trunk is no better than the cluster does.
+        good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (0.5 * detector.largest_diameter) ** 2
         good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
         c, s = np.cos(clusters.bearings), np.sin(clusters.bearings)
         R = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)[good]
@@ -228,6 +232,18 @@ class _Fit:
         _, width, *_ = self._edges(zero, middle, on)
         radius = np.clip(0.5 * middle * width, *self._radii)
         return np.column_stack([middle + 0.8 * radius, zero, radius, zero, zero]), on
+
+    def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Return which points are on the cylinders (n,), and their weighted squared errors (n,).
+
+        A point is not where its range is wrong, or its direction: branches lie beside a trunk at the same distance.
+        """
+        errors, weights, _ = self._errors(cylinders)
+        x, y, r, lx, ly = cylinders[self._clusters.owners].T
+        z = self._heights
+        beside = np.abs((y + ly * z) * self._cosines - (x + lx * z) * self._sines)
+        limits = _GATE**2 * (self._variances + (_DEPTH * r) ** 2)
+        return (errors**2 < limits) & (beside < r + self._detector.azimuth_step * x), errors**2 * weights
 
     def _errors(self, cylinders: Array) -> tuple[Array, Array, Array]:
         """Return the errors of the ranges (n,) in m, their weights (n,) in 1/m^2, and the derivatives (n, 5)."""
@@ -264,26 +280,29 @@ class _Fit:
         rows = np.maximum(count * step / width, 1.0)
         return mean_a, width, mean_z, za / zz, step / np.sqrt(24.0 * rows * zz)
 
-    def _improved(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return the cylinders after one step of Gauss and Newton, and their covariances (k, 5, 5)."""
-        clusters = self._clusters
+    def _improved(self, cylinders: Array, on: NDArray[np.bool_]) -> Array:
+        """Return the cylinders after one step of Gauss and Newton."""
         errors, weights, derivatives = self._errors(cylinders)
-        weights = weights * on
-        weighted = derivatives * weights[:, None]
-        gradient = clusters.sums(weighted * errors[:, None])
-        normal = clusters.sums(weighted[:, :, None] * derivatives[:, None, :])
-        # The covariance of the gradient: less than the normal matrix, because grazing rays have less than their weight.
-        spread = clusters.sums((weighted * (weights * self._variances)[:, None])[:, :, None] * derivatives[:, None, :])
+        weighted = derivatives * (weights * on)[:, None]
         error, J, weight = self._constraints(cylinders, on)
-        gradient += np.einsum("kmi,km->ki", J, weight * error)
-        information = np.einsum("kmi,kmj->kij", J * weight[:, :, None], J)
-        information[:, [0, 1], [0, 1]] += _NEGLIGIBLE
-        inverse = np.linalg.inv(normal + information)
-        improved = cylinders + np.clip(np.einsum("kij,kj->ki", inverse, gradient), -0.3, 0.3)
+        gradient = self._clusters.sums(weighted * errors[:, None]) + np.einsum("kmi,km->ki", J, weight * error)
+        normal = self._clusters.sums(weighted[:, :, None] * derivatives[:, None, :]) + _information(J, weight)
+        step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
+        improved = cylinders + np.clip(step, -0.3, 0.3)
         improved[:, 2] = np.clip(improved[:, 2], *self._radii)
         improved[:, 0] = np.maximum(improved[:, 0], 1.05 * improved[:, 2])
-        covariances: Array = inverse @ (spread + information) @ inverse
-        return improved, covariances
+        return improved
+
+    def _covariances(self, cylinders: Array, on: NDArray[np.bool_]) -> Array:
+        """Return the covariances of the parameters, (k, 5, 5)."""
+        _, weights, derivatives = self._errors(cylinders)
+        weighted = derivatives * (weights * on)[:, None]
+        known = _information(*self._constraints(cylinders, on)[1:])
+        inverse = np.linalg.inv(self._clusters.sums(weighted[:, :, None] * derivatives[:, None, :]) + known)
+        # The covariance of the gradient: grazing rays have less weight than their variance would give them.
+        spread = self._clusters.sums(weighted[:, :, None] * weighted[:, None, :] * self._variances[:, None, None])
+        covariances: Array = inverse @ (spread + known) @ inverse
+        return covariances
 
     def _constraints(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Return errors (k, 7), derivatives (k, 7, 5) and weights (k, 7) of what is known beside the ranges.
@@ -304,7 +323,8 @@ class _Fit:
             J[:, side, 1] = 1.0 / x
             J[:, side, 2] = sign / (x * cosine)
             J[:, side, 4] = z / x
-            weight[:, side] = np.where(self._hidden[:, side], 0.0, edge)
+            doubt = edge * (error[:, side] / _DOUBT) ** 2
+            weight[:, side] = np.where(self._hidden[:, side], 0.0, edge / (1.0 + doubt))
         error[:, 2], J[:, 2, 4] = slope - ly / x, 1.0 / x
         weight[:, 2] = np.where(self._hidden.any(axis=1), 0.0, deviation**-2)
         error[:, 3], J[:, 3, 1] = middle - y / x, 1.0 / x
@@ -315,3 +335,10 @@ class _Fit:
         error[:, 6], J[:, 6, 4] = -ly, 1.0
         weight[:, 5:] = detector.lean**-2
         return error, J, weight
+
+
+def _information(J: Array, weight: Array) -> Array:
+    """Return the information (k, 5, 5) in constraints with derivatives (k, 7, 5) and weights (k, 7)."""
+    information: Array = np.einsum("kmi,kmj->kij", J * weight[:, :, None], J)
+    information[:, [0, 1], [0, 1]] += _NEGLIGIBLE
+    return information
