@@ -1,0 +1,103 @@
+"""The localization unit that sees the forest with a pair of cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.planar import inverse, wrap
+from vtbdrake.components.localization.unit import TRACKING
+from vtbdrake.testbed import ScenarioError, VirtualTestbed
+from vtbdrake_diagrams.forest.perception import SHOWN, Localizer
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig
+
+SCENARIO = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[VirtualTestbed, Context]:
+    """The testbed after a drive of some metres."""
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(8.0)
+    return testbed, context
+
+
+def test_carrier_localizes_itself_by_images(driven: tuple[VirtualTestbed, Context]) -> None:
+    testbed, context = driven
+    assert testbed.read(context, "dps.env.pose.status") == TRACKING
+    x, y, _, *_, yaw = testbed.read(context, "sim.sys.carrier.base.pose")
+    error = testbed.read(context, "dps.env.pose.position") - [x, y]
+    covariance = testbed.read(context, "dps.env.pose.covariance")[:2, :2]
+    assert np.linalg.norm(error) < 0.3
+    assert error @ np.linalg.solve(covariance, error) < 14.0
+    assert abs(wrap(float(testbed.read(context, "dps.env.pose.heading")) - yaw)) < np.radians(1.5)
+
+
+def test_landmarks_stand_where_trees_are(driven: tuple[VirtualTestbed, Context]) -> None:
+    testbed, context = driven
+    rows = testbed.read(context, "dps.env.localizer.landmarks").reshape(SHOWN, 3)
+    shown = rows[np.isfinite(rows[:, 0])]
+    found = Landmarks(shown[:, :2], np.tile(np.eye(2), (len(shown), 1, 1)), shown[:, 2], shown[:, 2])
+    # Where they are in the world, by the odometry since the images were taken.
+    x, y, _, *_, yaw = testbed.read(context, "sim.sys.carrier.base.pose")
+    since = float(context.get_time() - testbed.read(context, "dps.env.localizer.time"))
+    X_WH = np.array([x - SCENARIO.speed * since * np.cos(yaw), y - SCENARIO.speed * since * np.sin(yaw), yaw])
+    trees = map_landmarks(SCENARIO.truth()).seen_from(inverse(X_WH)).positions
+    distances = np.linalg.norm(found.positions[:, None] - trees, axis=2).min(axis=1)
+    assert len(found) >= 3
+    assert np.median(distances) < 0.4
+
+
+def test_left_camera_is_on_the_left() -> None:
+    poses = StereoConfig(baseline=0.4).poses()
+    assert poses["left_image"].translation() == pytest.approx([0.0, 0.2, 0.0])
+    between = poses["left_image"].inverse() @ poses["right_image"]
+    # As `StereoCamera` has it: along x of the left camera.
+    assert between.IsNearlyEqualTo(RigidTransform([0.4, 0.0, 0.0]), 1e-12)
+    # Both look ahead, upright.
+    assert poses["left_image"].rotation().matrix()[:, 2] == pytest.approx([1.0, 0.0, 0.0])
+    assert poses["left_image"].rotation().matrix()[:, 1] == pytest.approx([0.0, 0.0, -1.0])
+
+
+def test_images_of_different_times_are_not_compared() -> None:
+    compared = []
+
+    def see(left: int, right: int, history: np.ndarray, time: float) -> Landmarks:
+        compared.append((left, right, time))
+        return Landmarks.empty()
+
+    unit = SCENARIO.unit(SCENARIO.global_map())
+    localizer = Localizer(see, unit, IMAGES)
+    history = np.zeros((3, 6))
+    history[:, 0] = [2.0, 1.0, 0.0]
+    for left_time, right_time in ((1.0, 1.5), (1.5, 1.5)):
+        outputs, _ = localizer(
+            request=np.ones(1),
+            history=history.ravel(),
+            memory=unit.start(),
+            left_image=1,
+            left_image_time=np.array([left_time]),
+            right_image=2,
+            right_image_time=np.array([right_time]),
+        )
+        assert outputs["time"] == [left_time]
+    assert compared == [(1, 2, 1.5)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"perception": "sonar"}, "perception must be one of scanner, stereo, not 'sonar'"),
+        ({"stereo": StereoConfig(baseline=0.0)}, "baseline .* positive"),
+        ({"stereo": StereoConfig(largest_disparity=20)}, "multiple of 16 pixels, not 20"),
+        ({"stereo": StereoConfig(rate=0.0)}, "positive rate"),
+    ],
+)
+def test_fields_that_cannot_be_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        ForestScenario(**fields).build()
