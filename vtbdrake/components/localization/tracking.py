@@ -20,6 +20,7 @@ are expected of new landmarks, too.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,11 +37,22 @@ Indices = NDArray[np.int64]
 
 _BIAS, _FIXED = 3, 4
 
+# Standard deviations in m and rad of a pose of which nothing is to be known.
+_LOOSE = np.array([5.0, 5.0, 0.2])
+
 # Hypotheses that are tried in the association of a scan.
 _HYPOTHESES = 40
 
+# What competes with a first match: the density of all detections times the odds that a detection is of something that
+# the map does not show. Assumed, on the safe side for a map that lacks a third of the trees. A first match is one from
+# this probability on.
+_OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
+
 # An innovation of a diameter counts no more than that of three deviations: trunks are no cylinders.
 _DIAMETER_CAP = 9.0
+
+# A diameter with a larger deviation, in m, is not known.
+_NO_DIAMETER = 10.0
 
 # Shares of what is expected under which a scan is taken not to show the place where the carrier is believed to be.
 _LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
@@ -122,6 +134,17 @@ class Matches:
     is_fused: bool = False
 
 
+class _Found(NamedTuple):
+    """Pairs of detection and landmark (k, 2), their d² and their probability (k,)."""
+
+    pairs: Indices
+    squares: Array
+    probability: Array
+
+    def select(self, mask: NDArray[np.bool_]) -> _Found:
+        return _Found(self.pairs[mask], self.squares[mask], self.probability[mask])
+
+
 _NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.int64))
 
 
@@ -132,7 +155,9 @@ class Tracker:
     Association: pairs of detection and landmark within a gate on the Mahalanobis distance are hypotheses. The one that
     agrees with most others, after the state has been conditioned on it, decides which pairs are possible; the best
     one-to-one assignment among them is taken, and its worst pairs are dropped until the joint innovation is
-    probable. Differences of diameter count in the assignment.
+    probable. Diameters count in the assignment. A landmark that is seen for the first time may be another one, or none:
+    its match has the probability p of its density among those of its rivals, and of all that the map does not show. It
+    must be 0.8, and the landmark's prior covariance is divided by p².
 
     Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
     not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
@@ -201,10 +226,10 @@ class Tracker:
         state = self._at(pose, np.array(covariance, dtype=float))
         if landmarks is None:
             return state, _NO_MATCHES
-        pairs = self._associate(state, landmarks)[0]
-        loose = self._at(pose, np.diag([5.0**2, 5.0**2, 0.2**2]))
-        extended = self._extended(loose, pairs[:, 1])
-        return self._fused(extended, landmarks, pairs)
+        found = self._associate(state, landmarks)
+        loose = self._at(pose, np.diag(_LOOSE**2))
+        extended = self._widened(self._extended(loose, found.pairs[:, 1]), found)
+        return self._fused(extended, landmarks, found.pairs)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike) -> TrackState:
         """Return the state after a motion.
@@ -234,19 +259,18 @@ class Tracker:
         """
         if not len(landmarks):
             return state, _NO_MATCHES
-        pairs, distances, extended = self._associate(state, landmarks)
-        known = np.isin(pairs[:, 1], state.indices)
-        if self._is_elsewhere(state, landmarks, len(pairs), int(known.sum())):
-            return replace(state, failures=state.failures + 1), Matches(pairs)
-        if len(pairs) < 2:
-            return state, Matches(pairs)
-        room = np.cumsum(~known) + len(state.indices) <= self.most
-        taken = known | room
-        pairs, distances, known = pairs[taken], distances[taken], known[taken]
-        extended = _without(extended, ~np.isin(extended.indices, np.concatenate([state.indices, pairs[:, 1]])))
-        fused, matches = self._fused(extended, landmarks, pairs)
-        # Only where the carrier is well known does a distance tell right from wrong.
-        evidence = min(self.credit, state.evidence + self._evidence(distances[~known]))
+        found = self._associate(state, landmarks)
+        is_known = np.isin(found.pairs[:, 1], state.indices)
+        if self._is_elsewhere(state, landmarks, len(found.pairs), int(is_known.sum())):
+            return replace(state, failures=state.failures + 1), Matches(found.pairs)
+        if len(found.pairs) < 2:
+            return state, Matches(found.pairs)
+        has_room = np.cumsum(~is_known) + len(state.indices) <= self.most
+        found = found.select(is_known | has_room)
+        is_new = ~np.isin(found.pairs[:, 1], state.indices)
+        extended = self._widened(self._extended(state, found.pairs[is_new, 1]), found.select(is_new))
+        fused, matches = self._fused(extended, landmarks, found.pairs)
+        evidence = min(self.credit, state.evidence + self._evidence(found.squares[is_new]))
         return replace(fused, evidence=evidence, failures=0), matches
 
     def is_lost(self, state: TrackState) -> bool:
@@ -285,6 +309,14 @@ class Tracker:
             indices=np.concatenate([state.indices, new]),
             is_recent=np.concatenate([state.is_recent, np.zeros(len(new), dtype=bool)]),
         )
+
+    def _widened(self, state: TrackState, first: _Found) -> TrackState:
+        """Return the state with larger variances of the landmarks of first matches that are not certain."""
+        P = state.covariance.copy()
+        own = _columns(_rows_of(state.indices, first.pairs[:, 1]))
+        factor = first.probability**-2.0 - 1.0
+        P[own[:, :, None], own[:, None, :]] += factor[:, None, None] * self.landmarks.covariances[first.pairs[:, 1]]
+        return replace(state, covariance=P)
 
     def _covariance(self, indices: Indices) -> Array:
         """Return K of the map's errors, shape (m, m) in m^2."""
@@ -346,43 +378,39 @@ class Tracker:
 
     # -- association
 
-    def _associate(self, state: TrackState, landmarks: Landmarks) -> tuple[Indices, Array, TrackState]:
-        """Return pairs (k, 2), their d² (k,), and the state with all landmarks that came into question."""
+    def _associate(self, state: TrackState, landmarks: Landmarks) -> _Found:
         near = self._nearby(state, landmarks)
         extended = self._extended(state, near[~np.isin(near, state.indices)])
         rows = np.flatnonzero(np.isin(extended.indices, near))
         expected, H = self._expected(extended, rows)
-        # Covariances of all expected detections with each other.
-        joint = _times(H, rows, _times_transpose(extended.covariance, H, rows)).reshape(len(rows), 2, len(rows), 2)
-        joint = joint.transpose(0, 2, 1, 3)
+        # Covariances of all expected detections with each other, (m, m, 2, 2).
+        joint = _times(H, rows, _times_transpose(extended.covariance, H, rows))
+        joint = joint.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3)
         innovations = landmarks.positions[:, None] - expected
         spread = joint[np.arange(len(rows)), np.arange(len(rows))] + self._noise(landmarks)[:, None]
-        threshold = chi_square_quantile(self.gate, 2)
         squares = _squared_distance(innovations, spread)
-        seen, column = np.nonzero(squares < threshold)
-        if not len(seen):
-            return np.zeros((0, 2), dtype=np.int64), np.zeros(0), extended
-        nu, S = innovations[seen, column], spread[seen, column]
-        # After conditioning on pair q, what remains of each pair p.
-        chosen = np.unique(np.linspace(0, len(seen) - 1, _HYPOTHESES).astype(int))
-        C = joint[column[:, None], column[chosen]]
-        gain = C @ np.linalg.inv(S[chosen])
-        after = _squared_distance(
-            nu[:, None] - np.einsum("pqij,qj->pqi", gain, nu[chosen]), S[:, None] - gain @ C.transpose(0, 1, 3, 2)
-        )
-        other = (seen[:, None] != seen[chosen]) & (column[:, None] != column[chosen])
-        after = np.where(other, after, np.where(np.arange(len(seen))[:, None] == chosen, 0.0, np.inf))
-        agreement = np.zeros((len(landmarks), len(chosen)))
-        np.maximum.at(agreement, seen, np.maximum(threshold - after, 0.0))
-        best = after[:, np.argmax(agreement.sum(axis=0))]
-        cost = best + np.log(np.linalg.det(S)) + self._diameter_cost(landmarks, seen, extended.indices[rows][column])
-        possible = best < threshold
-        value = np.zeros((len(landmarks), len(rows)))
-        value[seen, column] = np.where(possible, 1.0 + cost[possible].max() - cost, 0.0)
+        threshold = chi_square_quantile(self.gate, 2)
+        i, j = np.nonzero(squares < threshold)
+        if not len(i):
+            return _Found(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+        nu, S = innovations[i, j], spread[i, j]
+        best, determinant = _agreeing(i, j, nu, S, joint, threshold)
+        diameter = self._diameter_cost(landmarks, i, extended.indices[rows][j])
+        cost = best + np.log(np.linalg.det(S)) + diameter
+        value = np.zeros(squares.shape)
+        is_possible = best < threshold
+        value[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
         one, two = linear_sum_assignment(value, maximize=True)
-        taken = value[one, two] > 0.0
-        one, two = one[taken], two[taken]
-        return np.column_stack([one, extended.indices[rows[two]]]), squares[one, two], extended
+        is_pair = value[one, two] > 0.0
+        one, two = one[is_pair], two[is_pair]
+        density = np.zeros(squares.shape)
+        density[i, j] = np.exp(-0.5 * (best + diameter)) / (2.0 * np.pi * np.sqrt(determinant))
+        others = _OTHERS * len(landmarks) / (np.pi * (landmarks.positions**2).sum(axis=1).max())
+        rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
+        probability = (density / (others + rivals))[one, two]
+        indices = extended.indices[rows[two]]
+        found = _Found(np.column_stack([one, indices]), squares[one, two], probability)
+        return found.select(np.isin(indices, state.indices) | (probability >= _LEAST_PROBABILITY))
 
     def _nearby(self, state: TrackState, landmarks: Landmarks) -> Indices:
         """Return the landmarks of the map that can be within the gate of a detection."""
@@ -396,13 +424,15 @@ class Tracker:
         return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in found]))
 
     def _diameter_cost(self, landmarks: Landmarks, seen: Indices, indices: Indices) -> Array:
-        variance = (
-            self.landmarks.diameter_deviations[indices] ** 2
-            + landmarks.diameter_deviations[seen] ** 2
-            + self.least_deviation**2
-        )
-        squares = (landmarks.diameters[seen] - self.landmarks.diameters[indices]) ** 2 / variance
-        return np.minimum(squares, _DIAMETER_CAP)
+        """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map."""
+        all_diameters, measured = self.landmarks.diameters, landmarks.diameters[seen]
+        noise = np.minimum(landmarks.diameter_deviations[seen], _NO_DIAMETER) ** 2 + self.least_deviation**2
+        own = np.minimum(self.landmarks.diameter_deviations[indices], _NO_DIAMETER) ** 2 + noise
+        other = all_diameters.var() + noise
+        ratio = (measured - all_diameters[indices]) ** 2 / own + np.log(own / other)
+        # A diameter that is known no better than those of all says nothing.
+        cost = np.where(own < other, ratio - (measured - all_diameters.mean()) ** 2 / other, 0.0)
+        return np.minimum(cost, _DIAMETER_CAP)
 
     # -- health
 
@@ -419,6 +449,35 @@ class Tracker:
         """Return the log-likelihood ratio of d² (k,) of first matches, right against by chance."""
         ratio = 0.5 * chi_square_quantile(self.gate, 2) * np.exp(-0.5 * squares)
         return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
+
+
+def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> tuple[Array, Array]:
+    """Return the d² (k,) of pairs after conditioning on the one with which most others agree.
+
+    Also returned are the determinants, (k,) in m^4, of the covariances that remain; of that pair, all remains.
+
+    Args:
+        i: The detections of the pairs, (k,).
+        j: The landmarks of the pairs, (k,), as rows of ``joint``.
+        nu: Their innovations, (k, 2).
+        S: The covariances of those, (k, 2, 2).
+        joint: The covariances of all expected detections with each other, (m, m, 2, 2).
+        threshold: Up to which d² pairs agree.
+    """
+    chosen = np.unique(np.linspace(0, len(i) - 1, _HYPOTHESES).astype(int))
+    C = joint[j[:, None], j[chosen]]
+    gain = C @ np.linalg.inv(S[chosen])
+    rest = nu[:, None] - np.einsum("pqij,qj->pqi", gain, nu[chosen])
+    spread = S[:, None] - gain @ C.transpose(0, 1, 3, 2)
+    spread[chosen, np.arange(len(chosen))] = S[chosen]
+    squares = _squared_distance(rest, spread)
+    is_itself = np.arange(len(i))[:, None] == chosen
+    is_rival = (i[:, None] == i[chosen]) | (j[:, None] == j[chosen])
+    squares = np.where(is_itself, 0.0, np.where(is_rival, np.inf, squares))
+    agreement = np.zeros((i.max() + 1, len(chosen)))
+    np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
+    best = np.argmax(agreement.sum(axis=0))
+    return squares[:, best], np.linalg.det(spread[:, best])
 
 
 def _without(state: TrackState, dropped: NDArray[np.bool_]) -> TrackState:

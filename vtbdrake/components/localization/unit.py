@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite, nan
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse
@@ -31,29 +31,6 @@ STATUS_NAMES = ("searching", "tracking", "lost")
 
 # The fewest matched detections with which a track begins.
 _FEWEST = 4
-
-
-class Fix(Protocol):
-    """What is used of the result of matching without a guess."""
-
-    @property
-    def pose(self) -> Array:
-        """X_WH, shape (3,)."""
-
-    @property
-    def covariance(self) -> Array:
-        """Its covariance, shape (3, 3)."""
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether the match is unique."""
-
-
-class Locator(Protocol):
-    """A map that can be matched with local landmarks without a guess: a `ConstellationMap`."""
-
-    def locate(self, local: Landmarks) -> Fix:
-        """Return where the carrier is that sees these landmarks in H."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +112,7 @@ class LocalizationUnit:
         try_every: Metres travelled or seconds, whichever comes first, between matches without a guess.
     """
 
-    locator: Locator
+    locator: ConstellationMap
     tracker: Tracker
     drift: DriftModel = field(default_factory=DriftModel)
     submap_length: float = 40.0
