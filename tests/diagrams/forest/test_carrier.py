@@ -150,6 +150,22 @@ def test_radius_and_slip_of_a_steady_turn(curvature: float) -> None:
     lateral = abs(w * rear[0]) / 9.81 / Carrier().cornering
     assert slip * np.sign(curvature) < 0.0
     assert abs(slip) == pytest.approx(lateral, rel=0.3)
+    # The body leans outwards until the springs, less the weight's own moment, bear the centrifugal force.
+    carrier = Carrier()
+    springs = WEIGHT / carrier.sag * (carrier.track / 2.0) ** 2 - WEIGHT * carrier.centre_height
+    lean = carrier.mass * w * rear[0] * carrier.centre_height / springs
+    assert R_WB[2, 1] == pytest.approx(lean, rel=0.05)
+
+
+def test_tyres_damp_turning_on_the_spot() -> None:
+    """The dampers of the springs have no share in it; without damping, the carrier would turn to and fro."""
+    standing = world(time_step=0.002)
+    simulator = standing.simulator(SpatialVelocity([0.0, 0.0, 0.02], [0.0, 0.0, 0.0]))
+    rates = []
+    for time in np.arange(1.0, 1.5, 0.05):
+        simulator.AdvanceTo(time)
+        rates.append(abs(standing.velocity(simulator).rotational()[2]))
+    assert max(rates) < 0.1 * 0.02
 
 
 def test_wheels_run_faster_uphill_than_the_carrier() -> None:
