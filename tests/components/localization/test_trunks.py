@@ -154,6 +154,18 @@ def test_a_hidden_edge_is_not_taken_for_the_trunks_own():
     assert abs(trunks.diameters[far] - 0.4) < 2.5 * trunks.diameter_deviations[far]
 
 
+def test_branches_beside_a_trunk_do_not_widen_it():
+    # Of one row each, 15 cm to both sides of the trunk, at its distance.
+    place = EYE[:2] + np.array([4.0, 0.0])
+    points, _ = Scene(place[None], np.array([0.2])).scan(EYE, noise=0.01)
+    rows = np.repeat([1.1, 1.9], 12)
+    sides = np.concatenate([np.linspace(0.11, 0.25, 12), -np.linspace(0.11, 0.25, 12)])
+    branches = np.column_stack([np.full(24, place[0]), place[1] + sides, rows])
+    for seen in (points, np.vstack([points, branches])):
+        (diameter,) = detect_trunks(seen, TrunkDetector(range_noise=0.01), p_HoLo_H=EYE).diameters
+        assert abs(diameter - 0.2) < 0.025
+
+
 def test_what_is_no_trunk_is_not_found():
     nothing = Scene(np.zeros((0, 2)), np.zeros(0), height=hills)
     ground, _ = nothing.scan(EYE, noise=0.02)
