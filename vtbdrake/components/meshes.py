@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, pi, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,20 @@ def obj_mesh(
     from pydrake.common import MemoryFile
     from pydrake.geometry import InMemoryMesh
 
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices).tolist()]
-    marks = [str(k + 1) for k in range(len(lines))]
+    corner = "%d" if normals is None else "%d//%d"
+    text = _lines("v %.9g %.9g %.9g", np.asarray(vertices))
     if normals is not None:
-        lines += [f"vn {x:.3g} {y:.3g} {z:.3g}" for x, y, z in normals.tolist()]
-        marks = [f"{mark}//{mark}" for mark in marks]
-    rows = faces.tolist() if isinstance(faces, np.ndarray) else faces
-    lines += ["f " + " ".join([marks[k] for k in face]) for face in rows]
-    return InMemoryMesh(mesh_file=MemoryFile("\n".join(lines) + "\n", ".obj", name))
+        text += _lines("vn %.3g %.3g %.3g", normals)
+    # Faces with equally many vertices at once.
+    for rows in [faces] if isinstance(faces, np.ndarray) else [np.array([face]) for face in faces]:
+        numbers = np.repeat(rows + 1, 1 if normals is None else 2, axis=1)
+        text += _lines(" ".join(["f", *[corner] * rows.shape[1]]), numbers)
+    return InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name))
+
+
+def _lines(form: str, rows: NDArray[Any]) -> str:
+    """Return a line of text for each row of numbers, (n, k); formatting all at once takes half the time."""
+    return (form + "\n") * len(rows) % tuple(rows.ravel().tolist())
 
 
 def surface_mesh(surface: Surface, *, name: str = "mesh") -> InMemoryMesh:
