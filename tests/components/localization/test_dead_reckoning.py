@@ -198,6 +198,9 @@ def test_scans_outside_of_the_history_use_its_ends():
     # One period before, the carrier was a metre further back, and level.
     expected = [[4.0 - np.cos(0.5), np.sin(0.5), 0.0], [0.0, 5.0 * np.cos(0.1), 5.0 * np.sin(0.1)]]
     np.testing.assert_allclose(points, expected, atol=1e-12)
+    # All of it after the newest pose: as from there.
+    late = Scan([[1.0, 0.0, 0.0]], [4.0], [0.0], 0.0)
+    np.testing.assert_allclose(deskewed(late, history, RigidTransform(), time=9.0), [[4.0, 0.0, 0.0]], atol=1e-12)
     assert deskewed(Scan.empty(), history, RigidTransform(), time=1.0).shape == (0, 3)
 
 

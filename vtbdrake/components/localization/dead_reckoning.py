@@ -7,6 +7,7 @@ is up by gravity, x points in the heading of B. O is where H was at the start. L
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from math import atan2, ceil, cos, hypot, inf, isfinite, sin, sqrt
 
 import numpy as np
@@ -316,25 +317,24 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     knots = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
     fired = time + scan.times
     first, last = (fired.min(), fired.max()) if len(fired) else (time, time)
-    # Only the knots around the scan.
-    low = max(int(np.searchsorted(knots[:, 0], first, side="right")) - 1, 0)
-    high = max(int(np.searchsorted(knots[:, 0], last)) + 1, low + 1)
-    knots = knots[low:high]
+    # Only the knots around the scan, at least two.
+    low = min(max(int(np.searchsorted(knots[:, 0], first, side="right")) - 1, 0), len(knots) - 2)
+    knots = knots[low : max(int(np.searchsorted(knots[:, 0], last)) + 1, low + 2)]
     _, _, _, x, y, heading = carrier_pose_at(history, time).tolist()
     R_OH = rotation(heading)
     turns = np.array([body_rotation(roll, pitch, turned - heading) for _, roll, pitch, _, _, turned in knots.tolist()])
     moves = np.zeros((len(knots), 3))
     moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
-    p_BQ = scan.points() @ X_BL.rotation().matrix().T + X_BL.translation()
-    points = np.empty_like(p_BQ)
-    # Between which knots a ray was fired, and where between them; before the first and after the last at these.
+    # Between which knots a ray was fired, and where between them; before the first and after the last, at these.
     place = np.interp(fired, knots[:, 0], np.arange(len(knots)))
     segments = np.minimum(place.astype(int), max(len(knots) - 2, 0))
-    for segment in range(segments.min(initial=0), segments.max(initial=-1) + 1):
-        rows = np.flatnonzero(segments == segment)
-        share = (place[rows] - segment)[:, np.newaxis]
-        following = min(segment + 1, len(knots) - 1)
-        before = p_BQ[rows] @ turns[segment].T + moves[segment]
-        after = p_BQ[rows] @ turns[following].T + moves[following]
-        points[rows] = before + share * (after - before)
+    share = (place - segments)[:, np.newaxis]
+    order = np.argsort(segments, kind="stable")
+    p_BQ = (scan.points() @ X_BL.rotation().matrix().T + X_BL.translation())[order]
+    points = np.empty_like(p_BQ)
+    ends = np.searchsorted(segments[order], np.arange(len(knots)))
+    for segment, (begin, end) in enumerate(pairwise(ends.tolist())):
+        rows, following = slice(begin, end), segment + 1
+        moved = p_BQ[rows] @ (turns[following] - turns[segment]).T + (moves[following] - moves[segment])
+        points[order[rows]] = p_BQ[rows] @ turns[segment].T + moves[segment] + share[order[rows]] * moved
     return points
