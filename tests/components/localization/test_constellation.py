@@ -1,56 +1,180 @@
-"""Tests of global localization, against exhaustive search, and for what it must not claim."""
+"""Tests of global localization: against exhaustive search, and that nothing wrong is claimed."""
+
+from math import pi
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse, transform, wrap
 from vtbdrake_diagrams.forest.stand import ACCURATE, Stand
+from vtbdrake_diagrams.forest.trials import Case, run
 
 
-def landmarks(places, *, deviation=0.05, diameters=None, diameter_deviation=np.inf):
+def landmarks(places, *, deviation=0.05):
+    """Landmarks of which the diameters are not known."""
     places = np.asarray(places, dtype=float)
     n = len(places)
-    thick = np.full(n, 0.2) if diameters is None else diameters
-    return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), thick, np.full(n, diameter_deviation))
+    return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.2), np.full(n, np.inf))
 
 
-def seen(places_W, X_WH, rng, *, reach=20.0, deviation=0.05, false=10):
-    """Nine tenths of the landmarks around a pose, displaced, and false ones among them."""
+def scattered(rng, *, side, count, spacing):
+    places = [rng.uniform(0.0, side, 2)]
+    while len(places) < count:
+        place = rng.uniform(0.0, side, 2)
+        if np.min(np.hypot(*(np.array(places) - place).T)) > spacing:
+            places.append(place)
+    return np.array(places)
+
+
+def seen(places_W, X_WH, rng, *, reach, deviation=0.05, missed=0.1, false=0):
+    """What is seen of the places around a pose, displaced, and false landmarks among them."""
     around = transform(inverse(X_WH), places_W)
-    around = around[np.hypot(*around.T) < reach]
-    around = around[rng.random(len(around)) < 0.9] + 0.0
+    around = around[(np.hypot(*around.T) < reach) & (rng.random(len(around)) >= missed)]
     around = around + deviation * rng.normal(size=around.shape)
-    return landmarks(np.vstack([around, rng.uniform(-14.0, 14.0, (false, 2))]), deviation=deviation)
+    return landmarks(np.vstack([around, rng.uniform(-0.7 * reach, 0.7 * reach, (false, 2))]), deviation=deviation)
 
 
-def errors(fix, X_WH):
+def error(fix, X_WH):
     return np.append(fix.pose[:2] - X_WH[:2], wrap(fix.pose[2] - X_WH[2]))
 
 
-def test_a_place_is_recognized_in_a_stand():
+def log_likelihoods(poses, local, places, variance, *, share):
+    """The formula of the module, with sums over all landmarks of a map without diameters: poses (k, 3) -> (k,)."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    around = (np.hypot(*(places[:, np.newaxis] - places).transpose(2, 0, 1)) <= 8.0).sum(axis=1)
+    density = np.maximum(around / (pi * 8.0**2), len(places) / np.prod(high - low))
+    total = np.zeros(len(poses))
+    for x, y in local:
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        at = poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
+        square = ((at[:, np.newaxis] - places) ** 2).sum(axis=2)
+        normal = np.exp(-0.5 * square / variance) / (2.0 * pi * variance)
+        total += np.log(1.0 - share + share * (normal / density).sum(axis=1))
+    return total
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_exhaustive_search_finds_the_same_pose(seed):
+    rng = np.random.default_rng(seed)
+    places = scattered(rng, side=24.0, count=30, spacing=2.0)
+    X_WH = np.array([*rng.uniform(8.0, 16.0, 2), rng.uniform(-pi, pi)])
+    local = seen(places, X_WH, rng, reach=10.0, deviation=0.1, false=6)
+    mapped = places + 0.1 * rng.normal(size=places.shape)
+    fix = ConstellationMap(landmarks(mapped, deviation=0.1)).locate(local)
+
+    axis = np.arange(2.0, 23.0, 1.2)
+    grid = np.stack(np.meshgrid(axis, axis, np.arange(-pi, pi, 0.12), indexing="ij"), axis=-1).reshape(-1, 3)
+    rough = log_likelihoods(grid, local.positions, mapped, 0.6**2, share=0.4)
+    variance = 2 * 0.1**2 + 0.02**2
+    best = min(
+        (
+            minimize(
+                lambda pose: -log_likelihoods(pose[np.newaxis], local.positions, mapped, variance, share=0.4)[0],
+                grid[row],
+                method="Nelder-Mead",
+                options={"initial_simplex": grid[row] + np.vstack([np.zeros(3), np.diag([0.5, 0.5, 0.05])])},
+            )
+            for row in np.argsort(-rough)[:5]
+        ),
+        key=lambda result: result.fun,
+    )
+    assert fix.log_likelihood == pytest.approx(-best.fun, abs=0.1)
+    assert np.abs(error(fix, best.x)) == pytest.approx([0.0, 0.0, 0.0], abs=5e-3)
+
+
+def test_places_of_a_stand_are_recognized():
+    for seed, name in enumerate(("accurate", "remote", "poor")):
+        trial = run(Case("natural", 600.0, name, "inside"), seed=7000 + seed)
+        assert trial.is_sure and trial.is_right
+
+
+def test_other_stands_are_not_recognized():
+    for seed, (kind, name) in enumerate(
+        [("plantation", "accurate"), ("plantation", "remote"), ("plantation", "poor"), ("natural", "remote")]
+    ):
+        assert not run(Case(kind, 1000.0, name, "outside"), seed=8000 + seed).is_sure
+
+
+def test_covariance_of_matches_without_doubt():
+    """Equal errors of all landmarks: σ²/n at their mean, and σ²/Σr² in the heading."""
+    rng = np.random.default_rng(3)
+    places = scattered(rng, side=60.0, count=100, spacing=3.5)
+    X_WH = np.array([30.0, 30.0, 1.0])
+    local = seen(places, X_WH, rng, reach=15.0, missed=0.0)
+    fix = ConstellationMap(landmarks(places, deviation=0.1)).locate(local)
+    assert fix.is_sure and len(fix.pairs) == len(local)
+    true = transform(X_WH, local.positions)
+    np.testing.assert_array_less(np.hypot(*(places[fix.pairs[:, 1]] - true).T), 0.3)
+
+    variance = 0.1**2 + 0.05**2 + 0.02**2
+    arms = transform([0.0, 0.0, X_WH[2]], local.positions)
+    J = np.array([[[1.0, 0.0, -y], [0.0, 1.0, x]] for x, y in arms]).reshape(-1, 3)
+    np.testing.assert_allclose(fix.covariance, variance * np.linalg.inv(J.T @ J), rtol=0.05, atol=2e-6)
+
+
+def test_covariance_is_consistent_with_errors():
+    nees = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        places = scattered(rng, side=40.0, count=100, spacing=1.5)
+        X_WH = np.array([*rng.uniform(15.0, 25.0, 2), rng.uniform(-pi, pi)])
+        local = seen(places, X_WH, rng, reach=12.0, deviation=0.05, false=15)
+        kept = places[rng.random(100) < 0.8]
+        fix = ConstellationMap(landmarks(kept + 0.2 * rng.normal(size=kept.shape), deviation=0.2)).locate(local)
+        if fix.is_sure:
+            nees.append(error(fix, X_WH) @ np.linalg.solve(fix.covariance, error(fix, X_WH)))
+    assert len(nees) >= 20
+    # Mean of 20 chi-square variables of 3 degrees of freedom: 3 ± 0.55.
+    assert 1.6 < np.mean(nees) < 4.6
+
+
+def test_displacement_that_neighbours_share_stays_unknown():
+    rng = np.random.default_rng(5)
+    places = scattered(rng, side=60.0, count=200, spacing=2.0)
+    X_WH = np.array([30.0, 30.0, -2.0])
+    local = seen(places, X_WH, rng, reach=15.0, false=10)
+    shift = np.array([0.8, -0.5])
+    mapped = landmarks(places + shift, deviation=0.7)
+    fix = ConstellationMap(mapped, correlation=40.0).locate(local)
+    assert fix.is_sure
+    np.testing.assert_allclose(error(fix, X_WH), [*shift, 0.0], atol=0.25)
+    # The errors have the variance s² = 0.49 m². Of a Gaussian field, the Laplacian tells half of it at most: their
+    # covariance is -2 s²/L², the variance of the Laplacian is 8 s²/L⁴.
+    assert (np.diagonal(fix.covariance)[:2] > 0.245).all() and (np.diagonal(fix.covariance)[:2] < 0.5).all()
+    # The map may be turned by half the curl of its errors, of which each slope has the deviation s/L.
+    assert fix.covariance[2, 2] == pytest.approx(0.5 * (0.7 / 40.0) ** 2, rel=0.2)
+
+
+def test_large_coordinates_change_nothing():
     stand = Stand(seed=1, density=600.0)
-    constellation = ConstellationMap(map_landmarks(stand.map(ACCURATE)))
-    rng = np.random.default_rng(1)
-    for X_WH in ([30.0, 40.0, 2.0], [60.0, 70.0, -3.0], [50.0, 25.0, 0.1]):
-        fix = constellation.locate(seen(stand.trees().positions()[:, :2], X_WH, rng))
-        assert fix.is_sure and fix.margin >= 5.0 and fix.fit >= 0.6
-        assert np.hypot(*errors(fix, X_WH)[:2]) < 0.15 and abs(errors(fix, X_WH)[2]) < 0.01
+    there = map_landmarks(stand.map(ACCURATE))
+    local = seen(stand.trees().positions()[:, :2], [30.0, 40.0, 2.0], np.random.default_rng(1), reach=20.0)
+    far = np.array([500_000.0, 5_600_000.0, 0.0])
+    fix, far_fix = (ConstellationMap(one).locate(local) for one in (there, there.seen_from(far)))
+    assert fix.is_sure and far_fix.is_sure
+    np.testing.assert_allclose(far_fix.pose - far, fix.pose, atol=1e-6)
+    np.testing.assert_allclose(far_fix.covariance, fix.covariance, rtol=1e-4, atol=1e-12)
 
 
-def test_another_stand_is_not_recognized():
-    constellation = ConstellationMap(map_landmarks(Stand(seed=1, density=600.0).map(ACCURATE)))
-    other = Stand(seed=2, density=600.0).trees().positions()[:, :2]
-    for seed in range(5):
-        assert not constellation.locate(seen(other, [50.0, 50.0, 1.0], np.random.default_rng(seed))).is_sure
+def test_trees_in_a_square_lattice_are_not_sure():
+    x, y = np.meshgrid(np.arange(0.0, 60.0, 3.0), np.arange(0.0, 60.0, 3.0))
+    places = np.column_stack([x.ravel(), y.ravel()])
+    local = seen(places, [31.0, 29.0, 0.3], np.random.default_rng(2), reach=15.0)
+    assert not ConstellationMap(landmarks(places)).locate(local).is_sure
 
 
 def test_too_few_landmarks_are_never_sure():
-    constellation = ConstellationMap(map_landmarks(Stand(seed=1).map(ACCURATE)))
-    for local in (Landmarks.empty(), landmarks([[1.0, 2.0]]), landmarks([[1.0, 2.0], [5.0, 5.0]])):
-        fix = constellation.locate(local)
+    stand = Stand(seed=1)
+    constellation = ConstellationMap(map_landmarks(stand.map(ACCURATE)))
+    few = seen(stand.trees().positions()[:, :2], [50.0, 50.0, 0.0], np.random.default_rng(0), reach=20.0)
+    for count in (0, 1, 2, 3, 15):
+        fix = constellation.locate(few.select(np.arange(count)))
         assert not fix.is_sure and np.isfinite(fix.pose).all() and np.linalg.eigvalsh(fix.covariance)[0] > 0.0
+    together = landmarks(np.zeros((20, 2)))
+    assert not constellation.locate(together).is_sure
 
 
 def test_maps_and_parameters_are_checked():

@@ -1,71 +1,75 @@
 """Global localization without a guess: the constellation of the landmarks around the carrier, found again on a map.
 
-Two local landmarks at a distance ℓ can be any pair of the map with that distance, and with trunks as thick; each such
-pair gives a pose. The right pose is among the poses of many pairs, a wrong one of few by chance. So pairs vote for
-poses (`PairTable`), the poses with most votes are fitted to the landmarks around them (`_approach`, least squares with
-weights that fall with the distance), and the best of them are judged by their likelihood (`_Matching`).
+Pairs of landmarks vote for poses (`pair_votes`). Those with most votes are fitted to the nearest landmarks of the map
+(least squares with weights that fall with the distance), and the best of them are judged by their likelihood.
 
-**Likelihood.** Of the n local landmarks, the share w is on the map, the rest is not: false trunks, and trees that the
-map lacks. Let λ be the density of the map's landmarks in 1/m², N the normal density of the difference of
-a local landmark from the one of the map with which it is matched, and D the density of its diameter, if it is
-that one, divided by the density of diameters on the map. Compared with a place that the map does not show, the pose has
-the logarithm of the likelihood
+**Likelihood.** Of the n local landmarks, the share w is on the map; the rest is not: false trunks, and trees that the
+map lacks. Let λ_k be the density of the map's landmarks in 1/m² around its landmark k (within 8 m, at least the mean of
+the map), N_ik the normal density of the difference of the local landmark i from it, and D_ik the density of the local
+diameter, if both are the same, divided by its density among all diameters of the map. Compared with a place that the
+map does not show, a pose has the logarithm of the likelihood
 
-    Λ = Σ_matched ln((1 - ε_D) D + ε_D) + ln(w N / λ) + Σ_others ln(1 - w).
+    Λ = Σ_i ln(1 - w + w Σ_k N_ik ((1 - ε) D_ik + ε) / λ_k),
 
-**Test of uniqueness.** A pose is sure if all of this holds, with s² = s_map² + s_local² (per axis):
+where ε is the share of diameters that are measured badly. The pose is found by expectation maximization, its covariance
+is the inverse of the observed information: matches that are in doubt count less (Louis, J. R. Stat. Soc. B 44, 1982).
+
+**Test of uniqueness.** A pose is sure if all of this holds, with s² the variance of the difference of a landmark here
+and on the map, per axis:
 
 * There are at least `fewest` local landmarks.
 * Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 200: the number of poses that can be told apart on a map of area A, and a
   factor of 200 beside it.
-* No other pose has a likelihood above Λ - 5. A pose is another one if it has less than half of its matches in common.
-* Λ is at least 0.6 of what is expected of a right pose with these landmarks: rows of a plantation match nearly after a
-  step from tree to tree, with matches that are many and poor.
+* No other pose has more than Λ - 5, or than half of Λ. It is another one if it has less than half of its matches in
+  common. (In the rows of a plantation many poses nearly match; by chance, the best of them is ahead by more than 5.)
+* Λ is at least 0.6 of what is expected of a right pose with these landmarks.
 
-**Errors of the map that neighbours share.** With a correlation length L, the errors of a map at distance r have the
-correlation exp(-r² / (2 L²)). The field of errors is written as a sum of smooth functions with random factors, the
-terms of the series of exp(x·x'/L²) up to the third order (`_shared_functions`). The factors are estimated together with
-the pose; what they leave of the variance is independent. So close landmarks may be displaced together, but not apart,
-and the covariance of the pose contains the displacement that cannot be known.
+**Errors of the map that neighbours share.** With a correlation length L, the errors of a map at a distance r have the
+correlation exp(-r² / (2 L²)). The field of errors is a sum of smooth functions with random factors that are estimated
+together with the pose (`_shared_functions`); what they leave of the variance is independent. So neighbours may be
+displaced together, but not apart, and the covariance of the pose contains the displacement that cannot be known. The
+less the errors of a map are like that, the less its curvature says about its displacement: the covariance is too small.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, log, pi
+from math import log, pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import rotation, transform, wrap
+from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
+from vtbdrake.components.localization.planar import compose, rotation, transform, wrap
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# What is not in any covariance (bark, lean, roots), and keeps exact landmarks from infinite likelihoods: assumed, in m.
+# What is in no covariance (bark, lean, roots), and keeps exact landmarks from infinite likelihoods: assumed, in m.
 _FLOOR = 0.02
+_DIAMETER_FLOOR = 0.01
 
-# Pairs are this far apart, in m: closer ones say little about the heading, others are too many.
-_NEAREST, _FARTHEST = 3.0, 15.0
-
-# Pairs of the local landmarks vote until there are this many votes; at least so many pairs do.
-_VOTES, _FEWEST_PAIRS = 600_000, 25
-
-# Pairs agree within this many standard deviations of distance and diameters.
-_GATE = 2.5
-
-# How many places are looked at: those with most votes, those fitted, those judged.
-_VOTED, _FITTED, _JUDGED = 160, 48, 12
-
-# The share of diameters that are measured badly, ε_D.
+# The share of diameters that are measured badly, ε: assumed.
 _BAD_DIAMETERS = 0.1
 
 # Landmarks are counted within this radius, in m, for the density around each.
 _SURROUNDINGS = 8.0
 
-_FACTOR, _LEAST_MARGIN, _LEAST_FIT = 200.0, 5.0, 0.6
+# How many poses are looked at: those with most votes, those fitted, those judged.
+_VOTED, _FITTED, _JUDGED = 300, 60, 10
+
+# Steps of expectation maximization.
+_STEPS = 8
+
+# Landmarks of the map that each local one may be.
+_NEIGHBOURS = 3
+
+# Samples from which the likelihood of a right pose is computed.
+_SAMPLES = 300
+
+_FACTOR, _LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 200.0, 5.0, 0.5, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +81,9 @@ class Fix:
         covariance: Its covariance, if it is the right one, shape (3, 3).
         is_sure: Whether it passes the test of uniqueness. If not, pose and covariance are no measurement.
         log_likelihood: Λ, the logarithm of the likelihood compared with a place that the map does not show.
-        margin: By how much Λ exceeds that of the best other pose.
+        margin: By how much Λ exceeds that of the best other pose, or of a place that the map does not show.
         fit: Λ as a share of what is expected of a right pose.
-        pairs: Indices of matched landmarks, local and on the map, shape (m, 2).
+        pairs: Indices of landmarks that are the same, local and on the map, shape (m, 2).
     """
 
     pose: Array
@@ -98,11 +102,72 @@ class Fix:
         return self
 
 
-class ConstellationMap:
-    """A map of landmarks, prepared to be searched for a constellation.
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """Local landmarks in a frame C that has its origin among them, as they are compared with a map.
 
-    What is computed once are the pairs of landmarks, sorted by their distance: about 70 bytes for each of the 30 pairs
-    that a tree of a stand with 800 trees/ha has. Immutable.
+    Attributes:
+        places: Positions in C in m, (n, 2).
+        covariances: Of the positions in m², (n, 2, 2).
+        diameters: In m, (n,).
+        diameter_variances: In m², (n,).
+        common: How frequent diameters like these are on the map, (n,) in 1/m.
+        shared: The functions that make up the displacement of the map at the landmarks, (n, f).
+        independent: The share of the map's variance that they leave, (n,).
+    """
+
+    places: Array
+    covariances: Array
+    diameters: Array
+    diameter_variances: Array
+    common: Array
+    shared: Array
+    independent: Array
+
+    @property
+    def variances(self) -> Array:
+        """Variances of the positions per axis in m², (n,)."""
+        return 0.5 * np.trace(self.covariances, axis1=1, axis2=2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """What each local landmark may be on the map: k landmarks near it, for one pose.
+
+    Attributes:
+        near: Indices on the map, (n, k).
+        deltas: Their positions less that of the local landmark in m, (n, k, 2).
+        weights: Inverse covariances of these, (n, k, 2, 2).
+        ratios: Logarithms of w N D / λ, (n, k).
+    """
+
+    near: Indices
+    deltas: Array
+    weights: Array
+    ratios: Array
+
+    def likelihoods(self, share: float) -> Array:
+        """Return the terms of Λ, (n,), if the share w is on the map."""
+        terms: Array = np.logaddexp(log(1.0 - share), np.logaddexp.reduce(self.ratios, axis=1))
+        return terms
+
+    def probabilities(self, share: float) -> Array:
+        """Return how probable each match is, (n, k)."""
+        return np.exp(self.ratios - self.likelihoods(share)[:, np.newaxis])
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A pose X_MC with its covariance, its likelihood and its matches (m, 2)."""
+
+    pose: Array
+    covariance: Array
+    log_likelihood: float
+    pairs: Indices
+
+
+class ConstellationMap:
+    """A map of landmarks, prepared to be searched for a constellation. Immutable.
 
     Attributes:
         landmarks: The map, in W.
@@ -114,7 +179,7 @@ class ConstellationMap:
         ValueError: The map has fewer than 3 landmarks, or a parameter is outside of its range.
     """
 
-    def __init__(self, landmarks: Landmarks, *, correlation: float = 0.0, share: float = 0.5, fewest: int = 16) -> None:
+    def __init__(self, landmarks: Landmarks, *, correlation: float = 0.0, share: float = 0.4, fewest: int = 16) -> None:
         if len(landmarks) < 3:
             raise ValueError(f"a constellation needs a map of at least 3 landmarks, not {len(landmarks)}")
         if not 0.0 < share < 1.0 or correlation < 0.0 or fewest < 2:
@@ -133,13 +198,16 @@ class ConstellationMap:
         self._low, self._high = self._places.min(axis=0), self._places.max(axis=0)
         self._area = float(np.prod(np.maximum(self._high - self._low, 1.0)))
         counts = self._tree.query_ball_point(self._places, _SURROUNDINGS, return_length=True)
+        # A landmark at the edge has fewer around it, though they are as dense.
         self._densities = np.maximum(counts / (pi * _SURROUNDINGS**2), len(landmarks) / self._area)
         self._roots = np.linalg.cholesky(landmarks.covariances + 1e-12 * np.eye(2))
         self._variance = 0.5 * float(np.mean(np.trace(landmarks.covariances, axis1=1, axis2=2)))
-        self._diameter_variances = landmarks.diameter_deviations**2
-        # Diameters that stand for all.
+        self._diameter_variances = landmarks.diameter_deviations**2 + _DIAMETER_FLOOR**2
+        # Some that stand for the diameters of all.
         self._typical = np.argsort(landmarks.diameters)[np.linspace(0, len(landmarks) - 1, 200).astype(int)]
-        self._pairs = PairTable.of(landmarks, self._places, self._tree)
+        self._pairs = PairTable.of(
+            self._places, self._tree, diameters=landmarks.diameters, diameter_variances=self._diameter_variances
+        )
 
     def locate(self, local: Landmarks) -> Fix:
         """Return where the carrier is that has these landmarks around it, in its level frame H.
@@ -148,45 +216,100 @@ class ConstellationMap:
         """
         if len(local) < 2:
             return self._unknown()
-        # The frame C of the constellation: H with its origin among the landmarks, where pose errors are least.
         p_HoCo_H = local.positions.mean(axis=0)
-        constellation = _Constellation.of(self, local, local.positions - p_HoCo_H)
-        judged = [self._judged(constellation, pose) for pose in self._candidates(constellation)]
+        here = self._seen(local, local.positions - p_HoCo_H)
+        # The variance about the mean is that part of the map's errors that displaces landmarks against each other.
+        relative = self._variance * (1.0 - float(np.mean(_correlation(here.places, self.correlation))))
+        variance = relative + float(np.mean(here.variances)) + _FLOOR**2
+        judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
         found = sorted((one for one in judged if one is not None), key=lambda one: -one.log_likelihood)
         if not found:
             return self._unknown()
         best = found[0]
         others = [one.log_likelihood for one in found[1:] if _is_other(one.pairs, best.pairs)]
         margin = best.log_likelihood - max([0.0, *others])
-        fit = best.log_likelihood / constellation.expected
-        poses = self._area / (2.0 * pi * constellation.variance) * 2.0 * pi * 10.0 / constellation.variance**0.5
+        fit = best.log_likelihood / max(1.0, self._expected(here, relative / max(self._variance, 1e-12)))
+        poses = self._area / (2.0 * pi * variance) * 2.0 * pi * 10.0 / variance**0.5
         is_sure = (
             len(local) >= self.fewest
             and best.log_likelihood > log(max(poses, 1.0)) + log(_FACTOR)
-            and margin >= _LEAST_MARGIN
+            and margin >= max(_LEAST_MARGIN, (1.0 - _LARGEST_SHARE) * best.log_likelihood)
             and fit >= _LEAST_FIT
         )
-        R_WH = rotation(best.pose[2])
-        arm_W = -R_WH @ p_HoCo_H
-        pose = np.array([*(best.pose[:2] + arm_W + self._p_WoMo_W), wrap(best.pose[2])])
-        carried = np.array([[1.0, 0.0, -arm_W[1]], [0.0, 1.0, arm_W[0]], [0.0, 0.0, 1.0]])
+        p_CoHo_M = rotation(best.pose[2]) @ -p_HoCo_H
+        pose = compose([*(best.pose[:2] + self._p_WoMo_W), best.pose[2]], [*-p_HoCo_H, 0.0])
+        carried = np.array([[1.0, 0.0, -p_CoHo_M[1]], [0.0, 1.0, p_CoHo_M[0]], [0.0, 0.0, 1.0]])
         covariance = carried @ best.covariance @ carried.T
         return Fix(pose, covariance, is_sure, best.log_likelihood, margin, fit, best.pairs)
 
     def _unknown(self) -> Fix:
         """Return that the carrier is anywhere on the map."""
         pose = np.array([*(0.5 * (self._low + self._high) + self._p_WoMo_W), 0.0])
-        covariance = np.diag([*((self._high - self._low) ** 2 / 12.0), pi**2 / 3.0])
+        covariance = np.diag([*((self._high - self._low) ** 2 / 12.0 + 1.0), pi**2 / 3.0])
         return Fix(pose, covariance, False, 0.0, 0.0, 0.0, np.zeros((0, 2), dtype=np.intp))
 
-    def _candidates(self, constellation: _Constellation) -> Array:
-        """Return the poses X_MC that are to be judged, shape (k, 3)."""
-        poses = self._voted(constellation)
-        wide = max(3.0 * constellation.variance**0.5, 0.4)
-        poses, support = self._approach(constellation, poses, wide)
+    def _seen(self, local: Landmarks, places: Array) -> _Local:
+        shared = _shared_functions(places, self.correlation)
+        diameter_variances = local.diameter_deviations**2 + _DIAMETER_FLOOR**2
+        common = self._common(local.diameters, diameter_variances)
+        independent = 1.0 - (shared**2).sum(axis=1)
+        return _Local(places, local.covariances, local.diameters, diameter_variances, common, shared, independent)
+
+    def _common(self, diameters: Array, variances: Array) -> Array:
+        """Return the density of diameters among those of the map, (n,), if they are measured with these variances."""
+        delta = diameters[:, np.newaxis] - self.landmarks.diameters[self._typical]
+        return _normal(delta, variances[:, np.newaxis] + self._diameter_variances[self._typical]).mean(axis=1)
+
+    def _expected(self, here: _Local, relative: float) -> float:
+        """Return the Λ that is expected of a right pose, by samples of landmarks that are on the map or not.
+
+        Args:
+            here: The local landmarks.
+            relative: The share of the map's variance that displaces landmarks against each other.
+        """
+        rng = np.random.default_rng(0)
+        one = rng.integers(len(here.places), size=_SAMPLES)
+        own = rng.integers(len(self._places), size=_SAMPLES)
+        S = relative * self.landmarks.covariances[own] + here.covariances[one] + _FLOOR**2 * np.eye(2)
+        errors = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(_SAMPLES, 2)))
+        true = self.landmarks.diameters[own]
+        variances = here.diameter_variances[one]
+        known = np.where(np.isfinite(variances), variances, 0.0) + np.where(
+            np.isfinite(self._diameter_variances[own]), self._diameter_variances[own], 0.0
+        )
+        diameters = true + np.sqrt(known) * rng.normal(size=_SAMPLES)
+        common = self._common(diameters, variances)
+        expected = 0.0
+        for share, places in (
+            (self.share, self._places[own] + errors),
+            (1.0 - self.share, rng.uniform(self._low, self._high, (_SAMPLES, 2))),
+        ):
+            nothing = np.zeros((_SAMPLES, 0))
+            sampled = _Local(
+                places, here.covariances[one], diameters, variances, common, nothing, np.full(_SAMPLES, relative)
+            )
+            matches = self._matches(sampled, np.zeros(3), np.zeros((_SAMPLES, 2)), np.zeros((_SAMPLES, 2, 2)))
+            expected += share * float(matches.likelihoods(self.share).mean())
+        return len(here.places) * expected
+
+    def _candidates(self, here: _Local, deviation: float) -> Array:
+        """Return the poses X_MC that are to be judged, (k, 3); a landmark here and on the map differ by a deviation."""
+        local = LocalPairs.of(
+            here.places,
+            here.variances + _FLOOR**2,
+            diameters=here.diameters,
+            diameter_variances=here.diameter_variances,
+            map_variance=self._variance,
+            correlation=self.correlation,
+        )
+        poses = self._pairs.favourites(local, count=_VOTED)
+        weights = 1.0 / (deviation**2 + here.variances)
+        weights /= weights.mean()
+        wide = max(2.0 * deviation, 0.4)
+        poses, support = self._approach(here.places, weights, poses, wide)
         poses = poses[np.argsort(-support)[:_FITTED]]
-        for width in (0.7 * wide, 0.5 * wide, 0.5 * wide):
-            poses, support = self._approach(constellation, poses, width)
+        for width in (0.8 * wide, 0.6 * wide, 0.6 * wide):
+            poses, support = self._approach(here.places, weights, poses, width)
         chosen: list[Array] = []
         for row in np.argsort(-support):
             if support[row] > 0.0 and not any(_is_near(poses[row], other) for other in chosen):
@@ -195,310 +318,141 @@ class ConstellationMap:
                 break
         return np.array(chosen).reshape(-1, 3)
 
-    def _voted(self, constellation: _Constellation) -> Array:
-        """Return the poses X_MC for which most pairs vote, shape (k, 3)."""
-        spread = constellation.variance**0.5
-        cell = float(np.clip(7.0 * spread, 0.8, 3.0))
-        margin = 20.0
-        votes = self._pairs.votes(constellation, self._variance, self.correlation)
-        inside = ((votes[:, :2] > self._low - margin) & (votes[:, :2] < self._high + margin)).all(axis=1)
-        votes = votes[inside]
-        if not len(votes):
-            return np.zeros((0, 3))
-        columns, rows = (np.ceil((self._high - self._low + 2.0 * margin) / cell) + 1).astype(int)
-        sectors = int(2.0 * pi / np.clip(0.6 * spread, 0.05, 0.3))
-        scaled = (votes[:, :2] - (self._low - margin)) / np.float32(cell)
-        turned = votes[:, 2] * np.float32(sectors / (2.0 * pi))
-        found = []
-        # Two grids, so that no place lies near the border of a cell in both.
-        for shift in (np.float32(0.0), np.float32(0.5)):
-            place = (scaled + shift).astype(np.int64)
-            sector = (turned + shift).astype(np.int64) % sectors
-            keys = (sector * rows + place[:, 1]) * columns + place[:, 0]
-            found.append(_crowded(keys, votes))
-        return np.vstack(found)
-
-    def _approach(self, constellation: _Constellation, poses: Array, width: float) -> tuple[Array, Array]:
-        """Fit poses X_MC (k, 3) to the landmarks of the map nearest to each local one, in one step of least squares.
+    def _approach(self, places: Array, weights: Array, poses: Array, width: float) -> tuple[Array, Array]:
+        """Fit poses to the landmarks of the map nearest to each local one, in one step of least squares.
 
         Args:
-            constellation: The local landmarks.
-            poses: Where they may be.
+            places: The local landmarks in C, (n, 2).
+            weights: Their weights, (n,).
+            poses: Poses X_MC, (k, 3).
             width: The weights fall to exp(-1/2) at this distance in m.
 
         Returns:
             The better poses (k, 3), and the sums of weights (k,).
         """
-        local = constellation.places
         c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        x = c * local[:, 0] - s * local[:, 1] + poses[:, :1]
-        y = s * local[:, 0] + c * local[:, 1] + poses[:, 1:2]
+        x = c * places[:, 0] - s * places[:, 1] + poses[:, :1]
+        y = s * places[:, 0] + c * places[:, 1] + poses[:, 1:2]
         distances, nearest = self._tree.query(np.stack([x, y], axis=-1), distance_upper_bound=2.5 * width)
         known = nearest < len(self._places)
-        weights = np.where(known, np.exp(-0.5 * np.minimum(distances, 1e3) ** 2 / width**2), 0.0)
-        weights *= constellation.weights
+        weight = weights * np.where(known, np.exp(-0.5 * np.minimum(distances / width, 9.0) ** 2), 0.0)
         target = self._places[np.where(known, nearest, 0)]
-        total = weights.sum(axis=1)
-        share = weights / np.maximum(total, 1e-9)[:, np.newaxis]
-        mean_C, mean_M = share @ local, np.einsum("kn,kni->ki", share, target)
-        u, v = local - mean_C[:, np.newaxis], target - mean_M[:, np.newaxis]
-        along = np.einsum("kn,kni,kni->k", share, u, v)
-        across = np.einsum("kn,kn->k", share, u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+        total = weight.sum(axis=1)
+        weight /= np.maximum(total, 1e-9)[:, np.newaxis]
+        mean_C, mean_M = weight @ places, np.einsum("kn,kni->ki", weight, target)
+        u, v = places - mean_C[:, np.newaxis], target - mean_M[:, np.newaxis]
+        along = np.einsum("kn,kni,kni->k", weight, u, v)
+        across = np.einsum("kn,kn->k", weight, u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
         heading = np.arctan2(across, along)
         c, s = np.cos(heading), np.sin(heading)
         turned = np.column_stack([c * mean_C[:, 0] - s * mean_C[:, 1], s * mean_C[:, 0] + c * mean_C[:, 1]])
-        fitted = np.column_stack([mean_M - turned, heading])
-        return np.where(total[:, np.newaxis] > 0.0, fitted, poses), total
+        return np.column_stack([mean_M - turned, heading]), total
 
-    def _judged(self, constellation: _Constellation, pose: Array) -> _Judged | None:
-        """Match the landmarks at a pose X_MC, and estimate it with the shared errors of the map around it."""
-        odds = log(self.share / (1.0 - self.share))
-        n = len(constellation.places)
-        shared = constellation.shared
-        functions = shared.shape[1]
-        # The displacement of the map around each local landmark, as a factor of the root of the covariance.
-        mean, spread = np.zeros((n, 2)), (shared**2).sum(axis=1)[:, np.newaxis, np.newaxis] * np.eye(2)
-        pairs: Indices = np.zeros((0, 2), dtype=np.intp)
-        for _ in range(6):
-            R = rotation(pose[2])
-            seen_M = transform(pose, constellation.places)
-            C_M = R @ constellation.covariances @ R.T + _FLOOR**2 * np.eye(2)
-            _, near = self._tree.query(seen_M + self._variance**0.5 * mean, k=min(3, len(self._places)))
-            L = self._roots[near]
-            P = L @ L.swapaxes(-1, -2)
-            left = constellation.independent[:, np.newaxis, np.newaxis, np.newaxis]
-            S = left * P + L @ spread[:, np.newaxis] @ L.swapaxes(-1, -2) + C_M[:, np.newaxis]
-            delta = self._places[near] - seen_M[:, np.newaxis] - np.einsum("nkij,nj->nki", L, mean)
-            diameter = constellation.diameter_gain(self, near)
-            gain = odds - np.log(self._densities[near]) + diameter + _log_normal(delta, S)
-            before, pairs = pairs, _one_to_one(near, gain)
-            if len(pairs) < 3:
-                return None
-            if np.array_equal(before, pairs):
-                break
-            i, j = pairs.T
-            L = self._roots[j]
-            S = constellation.independent[i, np.newaxis, np.newaxis] * (L @ L.swapaxes(-1, -2)) + C_M[i]
-            arm = seen_M[i] - pose[:2]
+    def _matches(self, here: _Local, pose: Array, mean: Array, spread: Array) -> _Matches:
+        """Compare local landmarks at a pose X_MC with the nearest ones of the map.
+
+        Args:
+            here: The local landmarks.
+            pose: The pose, (3,).
+            mean: The displacement of the map at them as a factor of the root of its covariance, (n, 2).
+            spread: The covariance of this factor, (n, 2, 2).
+        """
+        R_MC = rotation(pose[2])
+        seen = transform(pose, here.places)
+        C = R_MC @ here.covariances @ R_MC.T + _FLOOR**2 * np.eye(2)
+        _, near = self._tree.query(seen + self._variance**0.5 * mean, k=min(_NEIGHBOURS, len(self._places)))
+        L = self._roots[near]
+        S = L @ (spread + here.independent[:, np.newaxis, np.newaxis] * np.eye(2))[:, np.newaxis] @ L.swapaxes(-1, -2)
+        S += C[:, np.newaxis]
+        deltas = self._places[near] - seen[:, np.newaxis] - np.einsum("nkij,nj->nki", L, mean)
+        a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
+        determinant = a * c - b**2
+        weights = np.moveaxis(np.array([[c, -b], [-b, a]]) / determinant, (0, 1), (2, 3))
+        normal = -0.5 * np.einsum("nki,nkij,nkj->nk", deltas, weights, deltas) - 0.5 * np.log(determinant)
+        variances = here.diameter_variances[:, np.newaxis] + self._diameter_variances[near]
+        same = _normal(here.diameters[:, np.newaxis] - self.landmarks.diameters[near], variances)
+        # Nothing is gained from a diameter that is not known: both densities are 0.
+        common = np.broadcast_to(here.common[:, np.newaxis], same.shape)
+        factor = np.divide(same, common, out=np.ones_like(same), where=common > 0.0)
+        diameter = np.log((1.0 - _BAD_DIAMETERS) * factor + _BAD_DIAMETERS)
+        ratios = log(self.share / (2.0 * pi)) - np.log(self._densities[near]) + normal + diameter
+        return _Matches(near, deltas, weights, ratios)
+
+    def _judged(self, here: _Local, pose: Array) -> _Judged | None:
+        """Find the most likely pose near a pose X_MC, with the displacement of the map around it.
+
+        The displacement at landmark i is L_k Σ_f φ_f(i) β_f, with the root L_k of the map's covariance and normal
+        factors β of unit variance; Λ is integrated over them (Laplace's approximation).
+        """
+        functions = here.shared.shape[1]
+        prior = np.diag([0.0] * 3 + [1.0] * (2 * functions))
+        mean = np.zeros((len(here.places), 2))
+        spread = (here.shared**2).sum(axis=1)[:, np.newaxis, np.newaxis] * np.eye(2)
+        for step in range(_STEPS):
+            matches = self._matches(here, pose, mean, spread)
+            probable = matches.probabilities(self.share)
+            i, k = np.nonzero(probable > 1e-3)
+            L = self._roots[matches.near[i, k]]
+            arm = transform([0.0, 0.0, pose[2]], here.places[i])
             A = np.zeros((len(i), 2, 3 + 2 * functions))
             A[:, 0, 0] = A[:, 1, 1] = 1.0
             A[:, 0, 2], A[:, 1, 2] = -arm[:, 1], arm[:, 0]
-            A[:, :, 3:] = np.einsum("mf,mij->mifj", shared[i], L).reshape(len(i), 2, -1)
-            # Divided by the root of the covariance, so that all errors are of unit variance.
-            root = np.linalg.cholesky(S)
-            residual = np.linalg.solve(root, (self._places[j] - seen_M[i])[..., np.newaxis]).ravel()
-            A = np.linalg.solve(root, A).reshape(2 * len(i), -1)
-            information = A.T @ A + np.diag([0.0] * 3 + [1.0] * (2 * functions))
+            A[:, :, 3:] = np.einsum("mf,mij->mifj", here.shared[i], L).reshape(len(i), 2, -1)
+            weights = matches.weights[i, k] * probable[i, k, np.newaxis, np.newaxis]
+            weighted = (weights @ A).reshape(2 * len(i), -1)
+            information = weighted.T @ A.reshape(weighted.shape) + prior
+            if np.linalg.cond(information[:3, :3]) > 1e12:
+                return None
             covariance = np.linalg.inv(information)
-            change = covariance @ (A.T @ residual)
-            pose = np.asarray(pose + change[:3], dtype=np.float64)
-            factors = change[3:].reshape(functions, 2)
-            mean = shared @ factors
-            block = covariance[3:, 3:].reshape(functions, 2, functions, 2)
-            spread = np.einsum("nf,figj,ng->nij", shared, block, shared, optimize=True)
-            residual = residual - A @ change
-            # The density of all residuals, the factors integrated out.
-            square = residual @ residual + change[3:] @ change[3:]
-            logdet = 2.0 * np.log(np.abs(np.diagonal(root, axis1=1, axis2=2))).sum()
-            logdet += np.linalg.slogdet(information[3:, 3:])[1]
-        column = (near[i] == j[:, np.newaxis]).argmax(axis=1)
-        evidence = (odds - np.log(self._densities[j]) + diameter[i, column]).sum()
-        evidence += -0.5 * (square + logdet) - len(i) * log(2.0 * pi) + n * log(1.0 - self.share)
-        return _Judged(pose, np.asarray(covariance[:3, :3], dtype=np.float64), float(evidence), pairs)
+            # The displacement is estimated afresh, so the differences are those without it.
+            deltas = matches.deltas[i, k] + np.einsum("mij,mj->mi", L, mean[i])
+            change = covariance @ (weighted.T @ deltas.ravel())
+            pose = pose + change[:3]
+            mean = here.shared @ change[3:].reshape(functions, 2)
+            if functions and step < 2:
+                # At first the displacement is not known well enough to tell neighbours apart by it.
+                block = covariance[3:, 3:].reshape(functions, 2, functions, 2)
+                spread = np.einsum("nf,figj,ng->nij", here.shared, block, here.shared, optimize=True)
+                continue
+            if not spread.any() and np.abs(change[:3]).max() < 1e-3:
+                break
+            spread = np.zeros_like(spread)
+        matches = self._matches(here, pose, mean, spread)
+        evidence = float(matches.likelihoods(self.share).sum() - 0.5 * change[3:] @ change[3:])
+        evidence -= 0.5 * float(np.linalg.slogdet(information[3:, 3:])[1])
+        # The information that is missing because matches are in doubt: the covariance of the score of each landmark.
+        scores = np.einsum("mji,mjl,ml->mi", A, matches.weights[i, k], deltas - A @ change)
+        p = probable[i, k, np.newaxis]
+        means = np.zeros((len(here.places), A.shape[2]))
+        np.add.at(means, i, p * scores)
+        missing = scores.T @ (p * scores) - means.T @ means
+        covariance = _inverse_of_observed(information, missing)[:3, :3]
+        return _Judged(pose, covariance, evidence, _one_to_one(matches.near, probable))
 
 
-@dataclass(frozen=True, eq=False)
-class _Judged:
-    """A pose X_MC with its covariance, its likelihood and its matches (m, 2)."""
-
-    pose: Array
-    covariance: Array
-    log_likelihood: float
-    pairs: Indices
-
-
-@dataclass(frozen=True, eq=False)
-class _Constellation:
-    """The local landmarks, in C, and what is known of their errors on a map.
-
-    Attributes:
-        places: Positions in m, (n, 2).
-        covariances: Of their detection, (n, 2, 2) in m^2.
-        variances: The same as one variance, (n,).
-        weights: Weights for a fit, 1 for the average landmark, (n,).
-        diameters: In m, (n,).
-        diameter_variances: In m^2, (n,).
-        common: How frequent the diameters are on the map, (n,) in 1/m.
-        shared: The smooth functions of the map's shared errors at the landmarks, (n, f).
-        independent: The share of the map's variance that they leave, (n,).
-        variance: Of a difference between here and the map, per axis in m^2.
-        expected: The likelihood Λ that is expected of a right pose.
-    """
-
-    places: Array
-    covariances: Array
-    variances: Array
-    weights: Array
-    diameters: Array
-    diameter_variances: Array
-    common: Array
-    shared: Array
-    independent: Array
-    variance: float
-    expected: float
-
-    @classmethod
-    def of(cls, whole: ConstellationMap, local: Landmarks, places: Array) -> _Constellation:
-        """Return these landmarks, seen against a map."""
-        shared = _shared_functions(places, whole.correlation)
-        independent = 1.0 - (shared**2).sum(axis=1)
-        # The variance about its mean is that part of the map's errors that displaces landmarks against each other.
-        relative = whole._variance * float(np.mean(1.0 - _correlation(places, whole.correlation)))
-        variances = 0.5 * np.trace(local.covariances, axis1=1, axis2=2) + _FLOOR**2
-        variance = relative + float(np.mean(variances))
-        typical = whole.landmarks.diameters[whole._typical]
-        typical_variances = whole._diameter_variances[whole._typical]
-        diameter_variances = local.diameter_deviations**2
-        common = _normal(
-            local.diameters[:, np.newaxis] - typical, diameter_variances[:, np.newaxis] + typical_variances
-        )
-        common = common.mean(axis=1)
-        # The same for a landmark that has one of the typical diameters, measured as well as most are.
-        usual = float(np.median(diameter_variances))
-        of_typical = _normal(typical[:, np.newaxis] - typical, usual + typical_variances).mean(axis=1)
-        at_one_deviation = _normal(np.zeros(len(typical)), usual + typical_variances) * exp(-0.5)
-        diameter = float(np.mean(_robust_gain(at_one_deviation, of_typical)))
-        density = len(whole.landmarks) / whole._area
-        matched = np.log(whole.share / (density * 2.0 * pi * (relative + variances))) - 1.0 + diameter
-        others = log(1.0 - whole.share)
-        expected = float(np.sum(whole.share * np.maximum(matched, others) + (1.0 - whole.share) * others))
-        return cls(
-            places,
-            local.covariances,
-            variances,
-            variance / (relative + variances),
-            local.diameters,
-            diameter_variances,
-            common,
-            shared,
-            independent,
-            variance,
-            max(expected, 1.0),
-        )
-
-    def diameter_gain(self, whole: ConstellationMap, near: Indices) -> Array:
-        """Return the logarithm of the factor for diameters of landmarks and those of the map near them, (n, k)."""
-        variances = self.diameter_variances[:, np.newaxis] + whole._diameter_variances[near]
-        density = _normal(self.diameters[:, np.newaxis] - whole.landmarks.diameters[near], variances)
-        return _robust_gain(density, self.common[:, np.newaxis])
+def _inverse_of_observed(complete: Array, missing: Array) -> Array:
+    """Return the inverse of the complete information less the missing one, at most nine tenths of it."""
+    root = np.linalg.inv(np.linalg.cholesky(complete))
+    shares, directions = np.linalg.eigh(root @ missing @ root.T)
+    back = directions.T @ root
+    covariance: Array = back.T @ (back / (1.0 - np.minimum(shares, 0.9))[:, np.newaxis])
+    return covariance
 
 
-@dataclass(frozen=True, eq=False)
-class PairTable:
-    """All pairs of landmarks that are neither close nor far, sorted by their distance.
-
-    Attributes:
-        distances: In m, (n,).
-        angles: The directions from the first to the second landmark in rad, (n,).
-        middles: The places half way in m, (2, n).
-        diameters: Of the first and the second landmark in m, (2, n).
-        reaches: By how much diameters may differ in m, (2, n).
-    """
-
-    distances: NDArray[np.float32]
-    angles: NDArray[np.float32]
-    middles: NDArray[np.float32]
-    diameters: NDArray[np.float32]
-    reaches: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, landmarks: Landmarks, places: Array, tree: cKDTree) -> PairTable:
-        """Return the table of the landmarks of a map that are at these places, (n, 2), which the tree has, too."""
-        pairs = _pairs(places, tree)
-        first, second = places[pairs[:, 0]], places[pairs[:, 1]]
-        delta = (second - first).astype(np.float32)
-        distances = np.hypot(*delta.T)
-        order = np.argsort(distances)
-        pairs, delta = pairs[order], delta[order]
-        return cls(
-            distances[order],
-            np.arctan2(delta[:, 1], delta[:, 0]),
-            np.ascontiguousarray((0.5 * (first + second))[order].T, dtype=np.float32),
-            landmarks.diameters[pairs.T].astype(np.float32),
-            (_GATE * landmarks.diameter_deviations[pairs.T]).astype(np.float32) ** 2,
-        )
-
-    def votes(self, constellation: _Constellation, variance: float, correlation: float) -> NDArray[np.float32]:
-        """Return the poses X_MC for which pairs of the local landmarks vote, (n, 3), with headings in [0, 2π)."""
-        places = constellation.places
-        pairs = _pairs(places, cKDTree(places))
-        pairs = pairs[np.random.default_rng(0).permutation(len(pairs))]
-        delta = places[pairs[:, 1]] - places[pairs[:, 0]]
-        distances, angles = np.hypot(*delta.T), np.arctan2(delta[:, 1], delta[:, 0])
-        middles = 0.5 * (places[pairs[:, 0]] + places[pairs[:, 1]])
-        together = np.exp(-0.5 * (distances / correlation) ** 2) if correlation else 0.0
-        reach = _GATE * np.sqrt(constellation.variances[pairs].sum(axis=1) + 2.0 * variance * (1.0 - together))
-        begin, end = np.searchsorted(self.distances, np.array([distances - reach, distances + reach], dtype=np.float32))
-        enough = np.searchsorted(np.cumsum(2 * (end - begin)), _VOTES) + 1
-        found = [np.zeros((0, 3), np.float32)]
-        turn = np.float32(2.0 * pi)
-        for row in range(min(len(pairs), max(int(enough), _FEWEST_PAIRS))):
-            part = slice(begin[row], end[row])
-            diameters = constellation.diameters[pairs[row]].astype(np.float32)
-            reaches = (_GATE**2 * constellation.diameter_variances[pairs[row]]).astype(np.float32)
-            for flip in (False, True):
-                one, other = (1, 0) if flip else (0, 1)
-                alike = (self.diameters[one, part] - diameters[0]) ** 2 <= self.reaches[one, part] + reaches[0]
-                alike &= (self.diameters[other, part] - diameters[1]) ** 2 <= self.reaches[other, part] + reaches[1]
-                heading = self.angles[part][alike] - np.float32(angles[row] - pi * flip)
-                heading -= turn * np.floor(heading / turn)
-                c, s = np.cos(heading), np.sin(heading)
-                x, y = middles[row].astype(np.float32)
-                middle = self.middles[:, part][:, alike]
-                found.append(np.column_stack([middle[0] - (c * x - s * y), middle[1] - (s * x + c * y), heading]))
-        return np.concatenate(found)
-
-
-def _pairs(places: Array, tree: cKDTree) -> Indices:
-    pairs: Indices = tree.query_pairs(_FARTHEST, output_type="ndarray")
-    delta = places[pairs[:, 1]] - places[pairs[:, 0]]
-    return pairs[(delta**2).sum(axis=1) >= _NEAREST**2]
-
-
-def _crowded(keys: NDArray[np.int64], votes: NDArray[np.float32]) -> Array:
-    """Return the mean poses of the cells with most votes, (k, 3), given the cell of each vote (n,)."""
-    bits = len(keys).bit_length()
-    packed = np.sort((keys << bits) | np.arange(len(keys)))
-    cells = packed >> bits
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    counts = np.diff(starts, append=len(cells))
-    most = np.argsort(-counts, kind="stable")[: _VOTED // 2]
-    rows = np.concatenate(
-        [packed[start : start + count] for start, count in zip(starts[most], counts[most], strict=True)]
-    )
-    members = votes[rows & ((1 << bits) - 1)].astype(float)
-    first = np.cumsum(counts[most]) - counts[most]
-    columns = np.column_stack([members[:, :2], np.cos(members[:, 2]), np.sin(members[:, 2])])
-    means = np.add.reduceat(columns, first) / counts[most][:, np.newaxis]
-    return np.column_stack([means[:, :2], np.arctan2(means[:, 3], means[:, 2])])
-
-
-def _one_to_one(near: Indices, gain: Array) -> Indices:
-    """Return the pairs (m, 2) of each landmark with the best one near it, if that gains, one to one."""
-    best = gain.argmax(axis=1)
-    rows = np.arange(len(gain))
-    gains, chosen = gain[rows, best], near[rows, best]
-    rows = rows[gains > 0.0]
-    rows = rows[np.argsort(-gains[rows], kind="stable")]
-    _, first = np.unique(chosen[rows], return_index=True)
-    rows = np.sort(rows[first])
-    return np.column_stack([rows, chosen[rows]])
+def _one_to_one(near: Indices, probable: Array) -> Indices:
+    """Return the pairs (m, 2) of each landmark with one near it that is more probable than all else, one to one."""
+    best = probable.argmax(axis=1)
+    rows = np.flatnonzero(probable.max(axis=1) > 0.5)
+    rows = rows[np.argsort(-probable[rows, best[rows]], kind="stable")]
+    chosen, first = np.unique(near[rows, best[rows]], return_index=True)
+    pairs = np.column_stack([rows[first], chosen])
+    return pairs[np.argsort(pairs[:, 0])]
 
 
 def _is_other(pairs: Indices, best: Indices) -> bool:
     """Return whether less than half of the matches are the same."""
     common = len({*map(tuple, pairs.tolist())} & {*map(tuple, best.tolist())})
-    return common < 0.5 * min(len(pairs), len(best))
+    return common < 0.5 * min(len(pairs), len(best)) or not len(pairs)
 
 
 def _is_near(pose: Array, other: Array) -> bool:
@@ -528,24 +482,7 @@ def _shared_functions(places: Array, length: float) -> Array:
     return np.column_stack([np.ones_like(x), x, y, *second, *third]) * cut[:, np.newaxis]
 
 
-def _normal(delta: Array, variances: ArrayLike) -> Array:
+def _normal(delta: Array, variances: Array) -> Array:
     """Return densities of the normal distribution; 0 for an infinite variance."""
-    variances = np.maximum(variances, 1e-4)
     density: Array = np.exp(-0.5 * delta**2 / variances) / np.sqrt(2.0 * pi * variances)
-    return density
-
-
-def _robust_gain(density: Array, common: Array) -> Array:
-    """Return the logarithm of the factor for a diameter; nothing is gained where nothing is known."""
-    factor = np.divide(density, common, out=np.ones_like(density), where=common > 0.0)
-    return np.log((1.0 - _BAD_DIAMETERS) * factor + _BAD_DIAMETERS)
-
-
-def _log_normal(delta: Array, S: Array) -> Array:
-    """Return ln N(delta; 0, S) for deltas (..., 2)."""
-    a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
-    x, y = delta[..., 0], delta[..., 1]
-    determinant = a * c - b**2
-    square = (c * x**2 - 2.0 * b * x * y + a * y**2) / determinant
-    density: Array = -0.5 * (square + np.log(determinant)) - log(2.0 * pi)
     return density
