@@ -60,9 +60,10 @@ class Ride(LeafSystem):
         - scan
     """
 
-    def __init__(self, trees: WorldModel, *, blind: tuple[float, float], broken: int) -> None:
+    def __init__(self, trees: WorldModel, *, blind: tuple[float, float], broken: int, clock: float) -> None:
         super().__init__()
         self._trees, self._blind, self._broken = map_landmarks(trees).positions, blind, broken
+        self._clock = clock
         imu = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
         odometry = self.DeclareDiscreteState(1)
         scan = self.DeclareAbstractState(Value(Scan.empty()))
@@ -100,7 +101,7 @@ class Ride(LeafSystem):
         points = np.column_stack([seen, np.full(len(seen), 1.3)]) - X_BL.translation()
         points[:, :2] += NOISE * rng.normal(size=(len(points), 2))
         ranges = np.linalg.norm(points, axis=1)
-        return Scan(points / ranges[:, None], ranges, times, time)
+        return Scan(points / ranges[:, None], ranges, times, time + (self._clock if tick >= 100 else 0.0))
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,8 @@ class RidingScenario(ForestScenario):
     """The localization unit on a ride.
 
     Its scans are empty from ``blind_from`` to ``blind_until`` (s). From 2 s on, five samples of the entry ``broken`` of
-    IMU and odometry (0 to 6) are NaN.
+    IMU and odometry (0 to 6) are NaN, and the scanner's clock is ahead by ``clock`` (s). With another ``stand_seed``,
+    the carrier is in another stand than the one on the map.
     """
 
     simulator_config: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(max_step_size=0.1))
@@ -127,6 +129,11 @@ class RidingScenario(ForestScenario):
     blind_from: float = 0.0
     blind_until: float = 0.0
     broken: int = -1
+    clock: float = 0.0
+    stand_seed: int = 3
+
+    def truth(self) -> WorldModel:
+        return replace(self.stand(), seed=self.stand_seed).trees()
 
     @property
     def X_BL(self) -> RigidTransform:
@@ -139,7 +146,7 @@ class RidingScenario(ForestScenario):
         return replace(super().unit(world_map), submap_length=5.0, try_every=(0.5, 0.5))
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        ride = Ride(self.truth(), blind=(self.blind_from, self.blind_until), broken=self.broken)
+        ride = Ride(self.truth(), blind=(self.blind_from, self.blind_until), broken=self.broken, clock=self.clock)
         builder.add("sense", "ride", ride)
         for signal in ("imu", "odometry", "scan"):
             builder.sim_sensor(signal, ride.GetOutputPort(signal))

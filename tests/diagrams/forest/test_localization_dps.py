@@ -17,7 +17,14 @@ from tests.visualization.meshcat_page import messages
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
-from vtbdrake.components.world_model import WorldModel
+from vtbdrake.components.world_model import (
+    LocalFrame,
+    Quantity,
+    WorldModel,
+    WorldObject,
+    position_estimate,
+    save_geojson,
+)
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
@@ -121,6 +128,46 @@ def test_numbers_that_are_not_finite_do_no_harm(broken: int) -> None:
     assert testbed.read(context, "dps.env.dead_reckoning.ignored") == 5.0
     assert testbed.read(context, f"{POSE}.status") == TRACKING
     assert error(testbed, context)[0] < 0.1
+
+
+@pytest.mark.parametrize("fields", [{"stand_seed": 4}, {"blind_until": 9.0}])
+def test_without_a_place_on_the_map_there_is_never_a_pose(fields: dict[str, Any]) -> None:
+    testbed = built(**fields)
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    for k in range(1, 16):
+        simulator.AdvanceTo(0.5 * k)
+        assert testbed.read(context, f"{POSE}.status") == SEARCHING
+        assert np.isnan(testbed.read(context, f"{POSE}.position")).all()
+    assert testbed.read(context, f"{LOCALIZER}.missed") == 0.0
+
+
+@pytest.mark.parametrize("clock", [-100.0, 1.7e9])
+def test_clock_of_the_scanner_may_jump(clock: float) -> None:
+    testbed = built(clock=clock)
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(4.0)
+    assert testbed.read(context, f"{POSE}.status") == TRACKING
+    assert error(testbed, context)[0] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "message"),
+    [("rock", "m", "the map has no tree"), ("tree", "kg", "kg")],
+)
+def test_map_files_that_do_not_fit_are_refused(tmp_path: Path, kind: str, unit: str, message: str) -> None:
+    objects = (
+        WorldObject(
+            f"{kind}-{k}",
+            kind,
+            position_estimate([3.0 * k, float(k**2), 0.0], deviation=0.1),
+            attributes={"trunk_diameter": Quantity(30.0, unit)},
+        )
+        for k in range(5)
+    )
+    save_geojson(WorldModel(objects), tmp_path / "map.geojson", frame=LocalFrame(61.19, 25.11, 130.0))
+    with pytest.raises(ValueError, match=message):
+        ForestScenario(map_file=str(tmp_path / "map.geojson")).build()
 
 
 def test_map_stays_when_the_world_is_left_out() -> None:
