@@ -144,9 +144,9 @@ def test_a_hidden_edge_is_not_taken_for_the_trunks_own():
     places = np.array([[5.0, 0.2], [10.0, 0.2]]) + EYE[:2]
     diameters = np.array([0.2, 0.4])
     points, _ = Scene(places, diameters).scan(EYE, noise=0.02)
-    trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+    trunks = detect_trunks(points, TrunkDetector(position_floor=0.0), p_HoLo_H=EYE)
     alone, _ = Scene(places[1:], diameters[1:]).scan(EYE, noise=0.02)
-    (whole,) = detect_trunks(alone, TrunkDetector(), p_HoLo_H=EYE).covariances
+    (whole,) = detect_trunks(alone, TrunkDetector(position_floor=0.0), p_HoLo_H=EYE).covariances
     (far,) = np.flatnonzero(trunks.positions[:, 0] > 8.0)
     error = trunks.positions[far] - places[1]
     assert error @ np.linalg.solve(trunks.covariances[far], error) < 9.21

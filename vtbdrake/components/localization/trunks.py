@@ -44,6 +44,8 @@ _GATE = 4.0
 _GRAZING = 0.98
 # How much farther it may be beyond, as a share of r.
 _DEPTH = 0.2
+# The share of the most hits of any column of rays that a column must have: branches beside a trunk are hit in few rows.
+_PERSISTENCE = 0.35
 # Of how many standard deviations an edge is taken as it is; what is more counts less and less: it may be a branch.
 _DOUBT = 4.0
 # Information in 1/m^2 that says nothing, but makes matrices regular where no point is left.
@@ -74,7 +76,8 @@ class TrunkDetector:
         lean: Standard deviation of the lean in rad, per axis, before anything is measured.
         cell: Edge length in m of the cells in which points are gathered; two trunks closer than this become one.
         largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
-        position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight.
+        position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight, and the foot
+            of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad below breast height.
         diameter_floor: Standard deviation in m of the diameter that no fit improves: taper, ovality.
 
     Raises:
@@ -98,7 +101,7 @@ class TrunkDetector:
     lean: float = 0.03
     cell: float = 0.15
     largest_misfit: float = 2.0
-    position_floor: float = 0.01
+    position_floor: float = 0.015
     diameter_floor: float = 0.01
 
     def __post_init__(self) -> None:
@@ -197,6 +200,7 @@ class _Fit:
             elevation_step=detector.elevation_step,
             gap=detector.cell + _GATE * np.sqrt(self._variances),
         )
+        self._columns = self._persistent()
         self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
 
     def trunks(self, origin: Array) -> Landmarks:
@@ -210,7 +214,7 @@ class _Fit:
         count = np.maximum(clusters.sums(on.astype(float)), 1.0)
         misfit = clusters.sums(on * squares) / count
         diameters, covariances = 2.0 * cylinders[:, 2], self._covariances(cylinders, on)
-        good = (count >= 3) & (count >= 0.6 * clusters.counts) & (misfit < detector.largest_misfit)
+        good = (count >= 3) & (count >= 0.5 * clusters.counts) & (misfit < detector.largest_misfit)
         good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
         # Without enough points on it, a fit says where the trunk is no better than the cluster does.
         good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (0.5 * detector.largest_diameter) ** 2
@@ -228,10 +232,23 @@ class _Fit:
         ranked = clusters.distances[np.lexsort((clusters.distances, clusters.owners))]
         middle = ranked[clusters.starts + clusters.counts // 2]
         on = np.abs(clusters.distances - middle[clusters.owners]) < self._detector.largest_diameter
+        on &= self._columns
         zero = np.zeros_like(middle)
         _, width, *_ = self._edges(zero, middle, on)
         radius = np.clip(0.5 * middle * width, *self._radii)
         return np.column_stack([middle + 0.8 * radius, zero, radius, zero, zero]), on
+
+    def _persistent(self) -> NDArray[np.bool_]:
+        """Return which points (n,) are in a column of rays, or next to one, that hits the cluster in enough rows."""
+        clusters = self._clusters
+        right = np.minimum.reduceat(clusters.azimuths, clusters.starts)
+        columns = ((clusters.azimuths - right[clusters.owners]) / self._detector.azimuth_step + 1.5).astype(np.intp)
+        width = int(columns.max()) + 2
+        places = clusters.owners * width + columns
+        hits = np.bincount(places, minlength=len(right) * width).reshape(-1, width)
+        enough = hits >= _PERSISTENCE * hits.max(axis=1, keepdims=True)
+        enough[:, 1:-1] = enough[:, 1:-1] | enough[:, 2:] | enough[:, :-2]
+        return enough.ravel()[places]
 
     def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
         """Return which points are on the cylinders (n,), and their weighted squared errors (n,).
@@ -243,7 +260,9 @@ class _Fit:
         z = self._heights
         beside = np.abs((y + ly * z) * self._cosines - (x + lx * z) * self._sines)
         limits = _GATE**2 * (self._variances + (_DEPTH * r) ** 2)
-        return (errors**2 < limits) & (beside < r + self._detector.azimuth_step * x), errors**2 * weights
+        return self._columns & (errors**2 < limits) & (
+            beside < r + self._detector.azimuth_step * x
+        ), errors**2 * weights
 
     def _errors(self, cylinders: Array) -> tuple[Array, Array, Array]:
         """Return the errors of the ranges (n,) in m, their weights (n,) in 1/m^2, and the derivatives (n, 5)."""
