@@ -79,8 +79,10 @@ def test_exact_disparities_give_axes_and_diameters(roll: float, pitch: float) ->
     assert len(found) == len(TREES)
     order = match(found, TREES)
     error = along_and_across(found.positions[order] - TREES[:, :2], TREES, X_HC)
-    pixel = np.linalg.norm(TREES[:, :2] - X_HC.translation()[:2], axis=1) / 400.0
-    assert (np.abs(error[:, 0]) < 0.02 + 0.1 * TREES[:, 2]).all()
+    distance = np.linalg.norm(TREES[:, :2] - X_HC.translation()[:2], axis=1)
+    pixel = distance / 400.0
+    # A tenth of a pixel: half of what is assumed for disparities that are measured.
+    assert (np.abs(error[:, 0]) < 0.01 + CAMERA.depth_deviation(distance, disparity_deviation=0.1)).all()
     assert (np.abs(error[:, 1]) < pixel).all()
     assert (np.abs(found.diameters[order] - TREES[:, 2]) < 2.5 * pixel).all()
 

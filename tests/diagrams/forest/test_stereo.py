@@ -14,6 +14,7 @@ from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.forest.perception import SHOWN, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig
+from vtbdrake_diagrams.forest.stereo_trials import errors
 
 SCENARIO = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
 
@@ -87,6 +88,20 @@ def test_images_of_different_times_are_not_compared() -> None:
         )
         assert outputs["time"] == [left_time]
     assert compared == [(1, 2, 1.5)]
+
+
+def test_trials_count_errors_in_pixels() -> None:
+    camera, eye = StereoConfig().camera(), np.array([1.0, 2.0])
+    f, b = camera.focal_length, camera.baseline
+    trees = Landmarks([[11.0, 2.0], [1.0, 10.0]], np.zeros((2, 2, 2)), [0.3, 0.2], [0.0, 0.0])
+    # At 10 m: half a pixel of disparity too near, two pixels to the left. At 8 m: three pixels too thick.
+    near, left, thick = 0.5 * 10.0**2 / (f * b), 2.0 * 10.0 / f, 3.0 * 8.0 / f
+    found = Landmarks(
+        [[11.0 - near, 2.0 + left], [1.0, 10.0]], np.tile(0.04 * np.eye(2), (2, 1, 1)), [0.3, 0.2 + thick], [0.1, 0.1]
+    )
+    squares = (near**2 + left**2) / 0.04
+    expected = [[10.0, 0.5, 2.0, 0.0, squares], [8.0, 0.0, 0.0, 3.0, 0.0]]
+    assert errors(found, trees, eye, camera) == pytest.approx(np.array(expected), abs=1e-9)
 
 
 @pytest.mark.parametrize(

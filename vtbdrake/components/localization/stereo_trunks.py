@@ -25,9 +25,10 @@ from vtbdrake.components.perception.stereo import StereoCamera
 
 Array = NDArray[np.float64]
 
-# Cells per pixel of disparity. A trunk of one disparity is spread over three.
+# Cells per pixel of disparity. A trunk of one disparity is spread over three: a cell, and one on either side.
 _CELLS = 2
-_SPREAD = 3
+# Empty cells on either side of all disparities.
+_MARGIN = 2
 # How many columns beside a trunk are looked at.
 _BESIDE = 2
 # The face of a cylinder lies before its axis by pi / 4 of its radius, as a mean over the columns that show it.
@@ -147,9 +148,9 @@ class _Grid:
         # Columns beyond the image, because it is rolled and pitched.
         self._first = -int(1.2 * camera.center_x)
         columns = np.floor(f * right / ahead).astype(int) - self._first
-        self._shape = (int(1.2 * camera.width) + 1, int(disparity.max() * _CELLS) + 2)
+        self._shape = (int(1.2 * camera.width) + 1, int(disparity.max() * _CELLS) + 1 + 2 * _MARGIN)
         inside = (columns >= 0) & (columns < self._shape[0])
-        cells = columns[inside] * self._shape[1] + (disparity[inside] * _CELLS).astype(int)
+        cells = columns[inside] * self._shape[1] + (disparity[inside] * _CELLS).astype(int) + _MARGIN
         height = ahead[inside] / f
         self._height = self._sum(cells, height)
         self._moment = self._sum(cells, height * disparity[inside])
@@ -160,20 +161,21 @@ class _Grid:
 
     def trunks(self, extent: float) -> list[_Trunk]:
         """Return the upright objects that are at least ``extent`` (m) high."""
-        upright = convolve1d(self._height, np.ones(_SPREAD), axis=1, mode="constant") > extent
+        upright = convolve1d(self._height, np.ones(3), axis=1, mode="constant") > extent
         labels, _ = label(upright, np.ones((3, 3)))
         return [
             self._trunk(labels[part] == number, part, upright) for number, part in enumerate(find_objects(labels), 1)
         ]
 
     def _trunk(self, own: NDArray[np.bool_], part: tuple[slice, slice], upright: NDArray[np.bool_]) -> _Trunk:
-        columns, cells = part
+        columns, cells = part[0], slice(part[1].start - 1, part[1].stop + 1)
         first, last = max(columns.start - _BESIDE, 0), columns.stop + _BESIDE
         profile = self._height[first:last, cells].sum(axis=1)
         share = np.minimum(profile / np.median(profile[columns.start - first : columns.stop - first]), 1.0)
         width = float(share.sum())
         middle = float(share @ np.arange(first, first + len(share))) / width + 0.5 + self._first
-        disparity = float((self._moment[part] * own).sum() / (self._height[part] * own).sum())
+        spread = convolve1d(np.pad(own, ((0, 0), (1, 1))).astype(int), np.ones(3, int), axis=1, mode="constant") > 0
+        disparity = float(self._moment[columns, cells][spread].sum() / self._height[columns, cells][spread].sum())
         beside = np.r_[first : columns.start, columns.stop : min(last, self._shape[0])]
         return _Trunk(middle, width, disparity, bool(upright[beside, cells.stop :].any()))
 

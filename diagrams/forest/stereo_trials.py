@@ -1,0 +1,139 @@
+"""Trials of the detection of trunks by stereo: by how many pixels it errs, and whether its covariances say so.
+
+``python -m vtbdrake_diagrams.forest.stereo_trials [--forests N] [--views N] [--seed S]`` takes pairs of images along
+the routes of forests, finds trunks in them, compares each with the tree that fits best by its own covariance, and
+prints a table by distance. A detection with a squared error of more than 25 (of 2 degrees of freedom) is called false:
+one of a crown, or of several trees. The constants of `StereoTrunkDetector` were calibrated with forests of other seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from vtbdrake.cli.output import table
+from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.planar import inverse
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
+from vtbdrake.components.perception.stereo import StereoCamera
+from vtbdrake.state.systems import pose_to_array
+from vtbdrake_diagrams.forest.carrier import Carrier, standing_pose
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stereo import IMAGES
+
+Array = NDArray[np.float64]
+
+SEED = 200_000
+FALSE = 25.0
+"""The squared normalized error from which on a detection is false."""
+BANDS = ((0.0, 6.0), (6.0, 9.0), (9.0, 12.0), (12.0, 16.5))
+"""Distances in m."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoTrials:
+    """What was detected, one row per detection.
+
+    Attributes:
+        distance: Of the tree that fits best from the camera, in m, shape (n,).
+        disparity: By how much the disparity is wrong, in pixels, shape (n,).
+        middle: By how much the column of the middle is wrong, in pixels, shape (n,).
+        width: By how much the width is wrong, in pixels, shape (n,).
+        squares: Squared errors of the position, normalized by the covariance, shape (n,).
+        seconds: Processor time per pair of images in s.
+    """
+
+    distance: Array
+    disparity: Array
+    middle: Array
+    width: Array
+    squares: Array
+    seconds: float
+
+
+def errors(found: Landmarks, trees: Landmarks, eye: Array, camera: StereoCamera) -> Array:
+    """Return the rows of `StereoTrials` of one view, (n, 5); all landmarks are in one frame, as is the eye (2,)."""
+    wrong = found.positions[:, np.newaxis] - trees.positions
+    squares = np.einsum("nmi,nij,nmj->nm", wrong, np.linalg.inv(found.covariances), wrong)
+    nearest = squares.argmin(axis=1)
+    wrong = np.take_along_axis(wrong, nearest[:, np.newaxis, np.newaxis], axis=1)[:, 0]
+    sight = trees.positions[nearest] - eye
+    distance = np.linalg.norm(sight, axis=1)
+    along = np.sum(wrong * sight, axis=1) / distance
+    across = (sight[:, 0] * wrong[:, 1] - sight[:, 1] * wrong[:, 0]) / distance
+    pixels = camera.focal_length / distance
+    width = (found.diameters - trees.diameters[nearest]) * pixels
+    return np.column_stack(
+        [distance, -along * pixels * camera.baseline / distance, across * pixels, width, squares.min(axis=1)]
+    )
+
+
+def run(*, forests: int = 4, views: int = 12, seed: int = SEED) -> StereoTrials:
+    """Return what is detected in ``forests`` forests, in ``views`` views of each."""
+    rows, seconds = [], 0.0
+    for number in range(seed, seed + forests):
+        scenario = ForestScenario(seed=number, perception="stereo")
+        testbed, rng = scenario.build(), np.random.default_rng(number)
+        context = testbed.default_context()
+        camera, matcher, detector = scenario.stereo.camera(), scenario.stereo.matcher(), StereoTrunkDetector()
+        trees, routes = map_landmarks(scenario.truth()), scenario.routes()
+        for _ in range(views):
+            route = routes[rng.integers(len(routes))]
+            along, turn = rng.uniform(0.0, route.length), rng.normal(0.0, 0.1)
+            place, heading = route.position(along), route.heading(along) + turn
+            X_WB = standing_pose(Carrier(), scenario.ground(), position=place, heading=heading)
+            testbed.write(context, {"sim.sys.carrier.base.pose": pose_to_array(X_WB)})
+            images = []
+            for name in IMAGES:
+                eye = testbed.diagram.GetSubsystemByName(f"sim.sense.{name.replace('image', 'camera')}")
+                seen = eye.render(eye.GetMyContextFromRoot(context)).data[..., :3]
+                noisy = seen + scenario.stereo.noise * rng.normal(size=seen.shape)
+                images.append(np.clip(np.rint(noisy), 0.0, 255.0).astype(np.uint8))
+            tilt = RollPitchYaw(X_WB.rotation())
+            R_HB = RotationMatrix(RollPitchYaw(tilt.roll_angle(), tilt.pitch_angle(), 0.0))
+            X_HC = RigidTransform(R_HB, np.zeros(3)) @ scenario.X_BL @ scenario.stereo.poses()[IMAGES[0]]
+            begin = time.process_time()
+            found = detect_stereo_trunks(matcher.disparity(*images), camera, detector, X_HC=X_HC)
+            seconds += time.process_time() - begin
+            local = trees.seen_from(inverse([*X_WB.translation()[:2], tilt.yaw_angle()]))
+            rows.append(errors(found, local, X_HC.translation()[:2], camera))
+    return StereoTrials(*np.vstack(rows).T, seconds=seconds / (forests * views))
+
+
+def report(trials: StereoTrials) -> str:
+    """Return the table of trials, and the time."""
+    rows = []
+    for nearest, farthest in BANDS:
+        band = (trials.distance >= nearest) & (trials.distance < farthest)
+        right = band & (trials.squares < FALSE)
+        spread = [f"{values[right].mean():+.2f} +- {values[right].std():.2f}" for values in _pixels(trials)]
+        false = f"{100.0 * (1.0 - right.sum() / max(band.sum(), 1)):.0f} %"
+        rows.append(
+            [f"{nearest:g} to {farthest:g}", f"{band.sum()}", false, *spread, f"{trials.squares[right].mean():.2f}"]
+        )
+    head = ["m", "trunks", "false", "disparity", "middle", "width", "NEES (2)"]
+    return f"{table(head, rows)}\nprocessor time per pair of images: {1e3 * trials.seconds:.1f} ms"
+
+
+def _pixels(trials: StereoTrials) -> tuple[Array, Array, Array]:
+    return trials.disparity, trials.middle, trials.width
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--forests", type=int, default=4)
+    parser.add_argument("--views", type=int, default=12, help="pairs of images of each forest")
+    parser.add_argument("--seed", type=int, default=SEED)
+    chosen = parser.parse_args(arguments)
+    print(report(run(forests=chosen.forests, views=chosen.views, seed=chosen.seed)))
+
+
+if __name__ == "__main__":
+    main()
