@@ -47,9 +47,9 @@ class Ground:
     bumps: float = 0.04
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.relief <= 3.0 and 0.0 <= self.bumps <= 0.2):
+        if not (0.0 <= self.relief <= 2.0 and 0.0 <= self.bumps <= 0.08):
             raise ValueError(
-                f"relief is within [0, 3] m and bumps within [0, 0.2] m, so that a carrier can drive there, not "
+                f"relief is within [0, 2] m and bumps within [0, 0.08] m, so that a carrier can drive there, not "
                 f"{self.relief:g} and {self.bumps:g}"
             )
 
