@@ -144,6 +144,9 @@ class _Found(NamedTuple):
     def select(self, mask: NDArray[np.bool_]) -> _Found:
         return _Found(self.pairs[mask], self.squares[mask], self.probability[mask])
 
+    def first(self, count: int) -> _Found:
+        return self.select(np.arange(len(self.pairs)) < count)
+
 
 _NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.int64))
 
@@ -157,7 +160,7 @@ class Tracker:
     one-to-one assignment among them is taken, and its worst pairs are dropped until the joint innovation is
     probable. Diameters count in the assignment. A landmark that is seen for the first time may be another one, or none:
     its match has the probability p of its density among those of its rivals, and of all that the map does not show. It
-    must be 0.8, and the landmark's prior covariance is divided by p².
+    must be 0.8, and the prior covariance of the landmark (given its neighbours) is divided by p².
 
     Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
     not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
@@ -226,10 +229,9 @@ class Tracker:
         state = self._at(pose, np.array(covariance, dtype=float))
         if landmarks is None:
             return state, _NO_MATCHES
-        found = self._associate(state, landmarks)
+        found = self._associate(state, landmarks).first(self.most)
         loose = self._at(pose, np.diag(_LOOSE**2))
-        extended = self._widened(self._extended(loose, found.pairs[:, 1]), found)
-        return self._fused(extended, landmarks, found.pairs)
+        return self._fused(self._extended(loose, found.pairs[:, 1], found.probability), landmarks, found.pairs)
 
     def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike) -> TrackState:
         """Return the state after a motion.
@@ -265,12 +267,10 @@ class Tracker:
             return replace(state, failures=state.failures + 1), Matches(found.pairs)
         if len(found.pairs) < 2:
             return state, Matches(found.pairs)
-        has_room = np.cumsum(~is_known) + len(state.indices) <= self.most
-        found = found.select(is_known | has_room)
-        is_new = ~np.isin(found.pairs[:, 1], state.indices)
-        extended = self._widened(self._extended(state, found.pairs[is_new, 1]), found.select(is_new))
-        fused, matches = self._fused(extended, landmarks, found.pairs)
-        evidence = min(self.credit, state.evidence + self._evidence(found.squares[is_new]))
+        new = found.select(~is_known).first(self.most - len(state.indices))
+        extended = self._extended(state, new.pairs[:, 1], new.probability)
+        fused, matches = self._fused(extended, landmarks, np.vstack([found.pairs[is_known], new.pairs]))
+        evidence = min(self.credit, state.evidence + self._evidence(new.squares))
         return replace(fused, evidence=evidence, failures=0), matches
 
     def is_lost(self, state: TrackState) -> bool:
@@ -284,39 +284,37 @@ class Tracker:
         P = block_diag(covariance, self.bias_deviation**2)
         return replace(TrackState.none(), mean=np.append(X_WH, 0.0), covariance=P, evidence=self.first_credit)
 
-    def _extended(self, state: TrackState, indices: ArrayLike) -> TrackState:
-        """Return the state with further landmarks (m,) of the map, which it does not have yet."""
-        new = np.asarray(indices, dtype=np.int64)
+    def _extended(self, state: TrackState, indices: Indices, probability: Array | None = None) -> TrackState:
+        """Return the state with further landmarks of the map, (m,), which it does not have yet.
+
+        Args:
+            state: The state.
+            indices: Which landmarks.
+            probability: That they are the ones that are seen, (m,); by default 1.
+        """
         places, variances = self.landmarks.positions, self.landmarks.covariances
-        mean, P, n = state.mean, state.covariance, len(state.indices)
+        mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
+        factor = np.ones(m) if probability is None else probability**-2.0
         if self.correlation == 0.0:
-            prior, J, added = (
-                block_diag(np.zeros((0, 0)), *variances[new]),
-                np.zeros((2 * len(new), 2 * n)),
-                places[new],
-            )
+            prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances[indices]))
+            J, added = np.zeros((2 * m, 2 * n)), places[indices]
         else:
-            K = self._covariance(np.concatenate([state.indices, new]))
+            K = self._covariance(np.concatenate([state.indices, indices]))
             weights = np.linalg.solve(K[:n, :n], K[:n, n:])
-            prior = np.kron(K[n:, n:] - K[n:, :n] @ weights, np.eye(2))
-            J = np.kron(weights.T, np.eye(2))
-            added = places[new] + weights.T @ (mean[_FIXED:].reshape(-1, 2) - places[state.indices])
+            rest = K[n:, n:] - K[n:, :n] @ weights
+            if probability is not None:
+                # The part of its error that the other landmarks do not tell.
+                rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(K))[n:])
+            prior, J = np.kron(rest, np.eye(2)), np.kron(weights.T, np.eye(2))
+            added = places[indices] + weights.T @ (mean[_FIXED:].reshape(-1, 2) - places[state.indices])
         cross = J @ P[_FIXED:]
         return replace(
             state,
             mean=np.concatenate([mean, added.ravel()]),
             covariance=np.block([[P, cross.T], [cross, cross[:, _FIXED:] @ J.T + prior]]),
-            indices=np.concatenate([state.indices, new]),
-            is_recent=np.concatenate([state.is_recent, np.zeros(len(new), dtype=bool)]),
+            indices=np.concatenate([state.indices, indices]),
+            is_recent=np.concatenate([state.is_recent, np.zeros(m, dtype=bool)]),
         )
-
-    def _widened(self, state: TrackState, first: _Found) -> TrackState:
-        """Return the state with larger variances of the landmarks of first matches that are not certain."""
-        P = state.covariance.copy()
-        own = _columns(_rows_of(state.indices, first.pairs[:, 1]))
-        factor = first.probability**-2.0 - 1.0
-        P[own[:, :, None], own[:, None, :]] += factor[:, None, None] * self.landmarks.covariances[first.pairs[:, 1]]
-        return replace(state, covariance=P)
 
     def _covariance(self, indices: Indices) -> Array:
         """Return K of the map's errors, shape (m, m) in m^2."""

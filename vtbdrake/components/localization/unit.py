@@ -155,9 +155,9 @@ class LocalizationUnit:
             if not self.tracker.is_lost(track):
                 answer = _answer(track, matches, len(landmarks), pose, time)
                 return answer, replace(state, answer=answer, track=track)
-            none = Localization.unknown(LOST)
-            submap = Submap.empty(pose)
-            state = replace(UnitState(none, submap=submap), ignored=state.ignored, losses=state.losses + 1)
+            lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
+            submap = Submap.empty(pose).with_scan(landmarks)
+            return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
         return self._searched(state, landmarks, pose, C, time)
 
     def _searched(

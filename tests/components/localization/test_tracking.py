@@ -1,0 +1,192 @@
+import copy
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
+from vtbdrake.components.localization.tracking import Tracker, TrackState
+from vtbdrake.state.codecs import codec_of
+from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE
+
+START = np.diag([0.1, 0.1, 0.01]) ** 2
+
+
+def tracked(one: Drive, **settings):
+    """Track a drive from a first pose with errors of START; return the tracker and the states."""
+    tracker = Tracker(one.map, **settings)
+    first = one.poses[0] + np.random.default_rng(len(one.map)).multivariate_normal(np.zeros(3), START)
+    states = [tracker.start(first, START, one.scans[0])[0]]
+    for k in range(1, len(one.scans)):
+        states.append(tracker.update(tracker.predict(states[-1], *one.motion(k)), one.scans[k])[0])
+    return tracker, states
+
+
+def scores(errors, *, drives, first=0, bias=0.0, **settings):
+    """Return the errors of the last states (n, 3), and their normalized squares (n,)."""
+    found = []
+    for seed in range(first, first + drives):
+        one = drive(seed, errors, bias=bias)
+        state = tracked(one, correlation=errors.correlation, **settings)[1][-1]
+        found.append((error(state.pose, one.poses[-1]), nees(state.pose, state.pose_covariance, one.poses[-1])))
+    return tuple(np.array(column) for column in zip(*found, strict=True))
+
+
+# The 95 % interval of the mean of 3 degrees of freedom over 16 independent drives.
+BOUNDS = (1.92, 4.32)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.02])
+def test_errors_with_the_accurate_map_are_as_estimated(bias):
+    errors, squares = scores(ACCURATE, drives=16, bias=bias)
+    assert BOUNDS[0] < squares.mean() < BOUNDS[1]
+    assert np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean()) < 0.05
+    assert np.sqrt((errors[:, 2] ** 2).mean()) < np.radians(0.2)
+
+
+def test_errors_with_the_remote_map_are_as_estimated():
+    errors, squares = scores(REMOTE, drives=16)
+    assert BOUNDS[0] < squares.mean() < BOUNDS[1]
+    assert np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean()) < 0.15
+
+
+def test_a_bias_without_a_state_is_inconsistent():
+    _, squares = scores(ACCURATE, drives=8, bias=0.05, bias_deviation=1e-6)
+    assert squares.mean() > BOUNDS[1]
+
+
+def test_fusing_the_map_in_each_scan_is_inconsistent():
+    once, afresh = [], []
+    for seed in range(8):
+        one = drive(seed, ACCURATE, step=0.02)
+        tracker, states = tracked(one)
+        state = states[0]
+        for k in range(1, len(one.scans)):
+            # All landmarks are forgotten: they enter anew, with the error of the map.
+            forgetful = TrackState(
+                state.mean[:4], state.covariance[:4, :4], state.indices[:0], state.is_recent[:0], state.evidence
+            )
+            state, _ = tracker.update(tracker.predict(forgetful, *one.motion(k)), one.scans[k])
+        for squares, last in ((once, states[-1]), (afresh, state)):
+            squares.append(nees(last.pose, last.pose_covariance, one.poses[-1]))
+    assert np.mean(once) < BOUNDS[1] < 2.0 * BOUNDS[1] < np.mean(afresh)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 10.0])
+def test_the_filter_equals_batch_least_squares(correlation):
+    rng = np.random.default_rng(4)
+    places = np.array([[x, y] for x in (-6.0, 0.0, 6.0) for y in (-7.0, 5.0)])
+    n, scans, share = len(places), 4, 0.9
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    K = 0.05**2 * (share * np.exp(-0.5 * (apart / correlation) ** 2) if correlation else 0.0) * np.ones((n, n))
+    np.fill_diagonal(K, 0.05**2)
+    in_view = [np.arange(4 if k < 2 else n) for k in range(scans)]
+    known = Landmarks(
+        places + rng.multivariate_normal(np.zeros(n), K, 2).T,
+        np.tile(0.05**2 * np.eye(2), (n, 1, 1)),
+        np.full(n, 0.3),
+        np.full(n, np.inf),
+    )
+    poses = [np.array([0.5, -0.5, 0.2])]
+    move = np.array([0.6, 0.1, 0.15])
+    noise = np.array([[4e-4, 1e-4, 0.0], [1e-4, 4e-4, 5e-5], [0.0, 5e-5, 1e-4]])
+    for _ in range(scans - 1):
+        poses.append(compose(poses[-1], move + rng.multivariate_normal(np.zeros(3), noise)))
+    sensor, bias, deviation = np.array([0.8, 0.0]), 0.05, 0.02
+
+    def expected(pose, offset, landmarks):
+        d = transform(inverse(pose), landmarks)
+        ray = d - sensor
+        return d + offset * ray / np.linalg.norm(ray, axis=1, keepdims=True)
+
+    seen = [
+        expected(pose, bias, places[rows]) + deviation * rng.normal(size=(len(rows), 2))
+        for pose, rows in zip(poses, in_view, strict=True)
+    ]
+    tracker = Tracker(
+        known, sensor=tuple(sensor), least_deviation=0.0, gate=0.99999, correlation=correlation, correlated_share=share
+    )
+    state, _ = tracker.start(poses[0], START)
+    for k, z in enumerate(seen):
+        state = tracker.predict(state, move, noise) if k else state
+        m = len(z)
+        scan = Landmarks(z, np.tile(deviation**2 * np.eye(2), (m, 1, 1)), np.full(m, 0.3), np.full(m, np.inf))
+        state, matches = tracker.update(state, scan)
+        np.testing.assert_array_equal(matches.pairs, np.column_stack([in_view[k], in_view[k]]))
+
+    def whitened(covariance, residual):
+        return np.linalg.solve(np.linalg.cholesky(covariance), residual)
+
+    def residuals(x):
+        pose, offset, landmarks = x[: 3 * scans].reshape(-1, 3), x[3 * scans], x[3 * scans + 1 :].reshape(-1, 2)
+        parts = [whitened(START, pose[0] - poses[0]), [offset / tracker.bias_deviation]]
+        parts += [whitened(noise, compose(inverse(a), b) - move) for a, b in pairwise(pose)]
+        parts += [whitened(K, landmarks - known.positions).ravel()]
+        parts += [
+            (z - expected(p, offset, landmarks[rows])).ravel() / deviation
+            for z, p, rows in zip(seen, pose, in_view, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    batch = least_squares(residuals, np.concatenate([np.ravel(poses), [0.0], known.positions.ravel()]))
+    order = np.arange(3 * (scans - 1), batch.x.size)
+    covariance = np.linalg.inv(batch.jac.T @ batch.jac)[np.ix_(order, order)]
+    np.testing.assert_allclose(state.covariance, covariance, atol=0.02 * covariance.diagonal().max(), rtol=0.05)
+    assert (np.abs(state.mean - batch.x[order]) < 0.15 * np.sqrt(covariance.diagonal())).all()
+    assert abs(state.range_bias - bias) < 3.0 * np.sqrt(covariance[3, 3])
+
+
+def test_correlated_errors_of_the_map_are_expected():
+    _, squares = scores(POOR, drives=16, first=16)
+    assert BOUNDS[0] < squares.mean() < BOUNDS[1]
+
+
+def test_without_detections_covariance_grows_by_the_odometry():
+    one = drive(0, ACCURATE)
+    tracker, states = tracked(one)
+    state = states[-1]
+    before = state.pose_covariance
+    for _ in range(50):
+        motion = np.array([0.2, 0.0, 0.0])
+        state, matches = tracker.update(
+            tracker.predict(state, motion, DRIFT.covariance(motion, PERIOD)), Landmarks.empty()
+        )
+        assert not matches.is_fused
+    R_HW = rotation(-states[-1].pose[2])
+    along, along_before = ((R_HW @ P[:2, :2] @ R_HW.T)[0, 0] for P in (state.pose_covariance, before))
+    assert along - along_before == pytest.approx(DRIFT.along**2 * 10.0, rel=0.02)
+    grown = before[2, 2] + DRIFT.heading**2 * 50 * PERIOD
+    assert state.pose_covariance[2, 2] == pytest.approx(grown)
+    # It is no loss not to see anything.
+    assert not tracker.is_lost(state)
+
+
+def test_the_state_stays_small_and_is_a_value():
+    one = drive(1, ACCURATE, scans=60, step=0.8)
+    tracker, states = tracked(one, horizon=15.0, most=30)
+    last = states[-1]
+    assert max(len(state.indices) for state in states) <= 30
+    distances = np.linalg.norm(last.mean[4:].reshape(-1, 2) - last.pose[:2], axis=1)
+    assert distances.max() < 15.0 and len(last.indices) < len(np.unique(np.concatenate([s.indices for s in states])))
+    assert copy.deepcopy(last) is last
+    codec = codec_of(TrackState.none())
+    again = codec.decode(codec.encode(last))
+    motion = one.motion(3)
+    for name, array in codec.encode(tracker.predict(again, *motion)).items():
+        np.testing.assert_array_equal(array, codec.encode(tracker.predict(last, *motion))[name])
+    with pytest.raises(ValueError):
+        last.mean[0] = 1.0
+
+
+@pytest.mark.parametrize("settings", [{"gate": 1.0}, {"correlation": -1.0}, {"most": 0}, {"correlated_share": 1.0}])
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ValueError, match="tracker|gate"):
+        Tracker(drive(0, ACCURATE).map, **settings)
+
+
+def test_an_empty_map_is_refused():
+    with pytest.raises(ValueError, match="empty"):
+        Tracker(Landmarks.empty())

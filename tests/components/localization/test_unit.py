@@ -1,0 +1,140 @@
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from tests.components.localization.drives import PERIOD, drive, error, nees
+from vtbdrake.components.localization.constellation import ConstellationMap
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose
+from vtbdrake.components.localization.tracking import Tracker
+from vtbdrake.components.localization.unit import (
+    LOST,
+    SEARCHING,
+    TRACKING,
+    UNIT_STATE_CODEC,
+    LocalizationUnit,
+)
+from vtbdrake_diagrams.forest.stand import ACCURATE, REMOTE
+
+
+def unit_for(landmarks, locator=None):
+    return LocalizationUnit(locator or ConstellationMap(landmarks), Tracker(landmarks))
+
+
+def run(unit, scans, reckoned, state=None, first=0):
+    """Return the answers to scans, and the state at the end."""
+    state, answers = state or unit.start(), []
+    for k, (scan, X_OH) in enumerate(zip(scans, reckoned, strict=True)):
+        answer, state = unit.step(state, scan, X_OH=X_OH, time=PERIOD * (first + k))
+        answers.append(answer)
+    return answers, state
+
+
+def test_a_carrier_without_a_guess_is_found_and_tracked():
+    one = drive(3, ACCURATE, reach=18.0)
+    answers, state = run(unit_for(one.map), one.scans, one.reckoned)
+    is_tracking = [answer.status == TRACKING for answer in answers]
+    first = is_tracking.index(True)
+    assert first < 10 and all(is_tracking[first:]) and state.losses == 0
+    for answer, X_WH in list(zip(answers, one.poses, strict=True))[first:]:
+        assert np.linalg.norm(error(answer.pose, X_WH)[:2]) < 0.15
+        assert nees(answer.pose, answer.covariance, X_WH) < 25.0
+    assert all(np.isnan(answer.pose).all() and np.isinf(answer.covariance[0, 0]) for answer in answers[:first])
+    np.testing.assert_array_equal(answers[-1].X_OH, one.reckoned[-1])
+
+
+@pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
+def test_a_kidnapped_carrier_is_lost_and_found_again(errors):
+    one, other = drive(3, errors, reach=18.0), drive(3, errors, reach=18.0, step=0.5, scans=60, start=(20.0, 40.0))
+    unit = unit_for(one.map)
+    answers, state = run(unit, one.scans, one.reckoned)
+    assert answers[-1].status == TRACKING
+    # The odometry goes on as if nothing had happened.
+    moved = [compose(one.reckoned[-1], X_OH) for X_OH in other.reckoned]
+    after, state = run(unit, other.scans, moved, state, first=len(answers))
+    statuses = [answer.status for answer in after]
+    lost = statuses.index(LOST)
+    assert lost <= 5 and state.losses == 1
+    assert not any(answer.matched for answer in after[:lost])
+    found = statuses.index(TRACKING, lost)
+    assert set(statuses[found:]) == {TRACKING}
+    assert nees(after[-1].pose, after[-1].covariance, other.poses[-1]) < 25.0
+
+
+@pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
+def test_with_the_map_of_another_place_it_never_tracks(errors):
+    for seed in range(2):
+        one = drive(seed, errors, reach=18.0, elsewhere=seed + 50)
+        answers, _ = run(unit_for(one.map), one.scans, one.reckoned)
+        assert {answer.status for answer in answers} == {SEARCHING}
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """Matches anything with a place that it is not."""
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    is_sure: bool = True
+
+    def locate(self, local):
+        return self
+
+
+@pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
+def test_a_wrong_first_pose_ends_soon(errors):
+    for seed in range(4):
+        one = drive(seed, errors)
+        wrong = Wrong(compose(one.poses[0], [9.0, -7.0, 1.0]), np.diag([0.2, 0.2, 0.02]) ** 2)
+        unit = unit_for(one.map, wrong)
+        answers, _ = run(unit, one.scans, one.reckoned)
+        tracking = [answer.status == TRACKING for answer in answers]
+        # It may be claimed again, by this locator.
+        longest = max(len(part) for part in "".join("x" if t else " " for t in tracking).split(" "))
+        assert longest <= 12
+
+
+def test_bad_times_and_poses_are_ignored_and_counted():
+    one = drive(3, ACCURATE, reach=18.0)
+    unit = unit_for(one.map)
+    answers, state = run(unit, one.scans[:15], one.reckoned[:15])
+    bad = [
+        ([np.nan, 0.0, 0.0], 9.0),
+        (one.reckoned[15], 15 * PERIOD - 2.0),
+        (one.reckoned[15], answers[-1].time),
+        (one.reckoned[15], np.nan),
+    ]
+    for count, (X_OH, time) in enumerate(bad, start=1):
+        answer, state = unit.step(state, one.scans[15], X_OH=X_OH, time=time)
+        assert answer is answers[-1] and state.ignored == count
+    rest, state = run(unit, one.scans[15:], one.reckoned[15:], state, first=15)
+    assert rest[-1].status == TRACKING and state.ignored == len(bad)
+    with pytest.raises(ValueError, match="planar pose"):
+        unit.step(state, one.scans[0], X_OH=np.zeros(6), time=100.0)
+
+
+def test_no_trees_in_sight_is_no_error():
+    one = drive(3, ACCURATE, reach=18.0)
+    unit = unit_for(one.map)
+    answers, _ = run(unit, [Landmarks.empty()] * 5, one.reckoned[:5])
+    assert {answer.status for answer in answers} == {SEARCHING}
+    scans = [*one.scans[:12], *[Landmarks.empty()] * 8, *one.scans[20:]]
+    answers, _ = run(unit, scans, one.reckoned)
+    deviations = [answer.covariance[0, 0] for answer in answers[11:20]]
+    assert (np.diff(deviations) > 0.0).all() and answers[20].covariance[0, 0] < deviations[-1]
+    assert answers[-1].status == TRACKING
+
+
+def test_the_memory_survives_as_arrays():
+    one = drive(3, ACCURATE, reach=18.0)
+    unit = unit_for(one.map)
+    straight, _ = run(unit, one.scans, one.reckoned)
+    state, names = unit.start(), set(UNIT_STATE_CODEC.encode(unit.start()))
+    for k, scan in enumerate(one.scans):
+        arrays = UNIT_STATE_CODEC.encode(state)
+        # A slow part wants the same arrays each time.
+        assert set(arrays) == names
+        answer, state = unit.step(UNIT_STATE_CODEC.decode(arrays), scan, X_OH=one.reckoned[k], time=PERIOD * k)
+        np.testing.assert_array_equal(answer.pose, straight[k].pose)
+        np.testing.assert_array_equal(answer.covariance, straight[k].covariance)
