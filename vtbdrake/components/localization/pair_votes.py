@@ -20,8 +20,10 @@ Singles = NDArray[np.float32]
 # Pairs are this far apart, in m: close ones say little about the heading, and there are too many far ones.
 _NEAREST, _FARTHEST = 3.0, 15.0
 
-# Pairs of the local landmarks vote until there are this many votes; at least so many pairs do.
-_VOTES, _FEWEST_PAIRS = 800_000, 25
+# Pairs of the local landmarks vote until there are enough votes, and the right cell stands out by so many standard
+# deviations of the votes in a cell, if the right pose has this share of the pairs (assumed). Memory sets the limit.
+_ENOUGH, _LIMIT, _CONTRAST, _RIGHT = 800_000, 20_000_000, 10.0, 0.08
+_FEWEST_PAIRS = 25
 
 # Pairs agree within this many standard deviations of their distance and of each diameter.
 _GATE = 1.5
@@ -139,19 +141,21 @@ class PairTable:
         reach = _GATE * local.deviations
         ends = np.array([local.distances - reach, local.distances + reach], dtype=np.float32)
         begin, end = np.asarray(np.searchsorted(self.distances, ends))
-        enough = int(np.searchsorted(np.cumsum(2 * (end - begin)), _VOTES)) + 1
-        rows = range(min(len(begin), max(enough, _FEWEST_PAIRS)))
-        if not rows:
+        if not len(begin):
             return np.zeros((0, 3))
-        votes = np.concatenate([self._votes(local, row, slice(begin[row], end[row])) for row in rows])
-        part = slice(len(rows))
-        turn = float(np.median(local.deviations[part] / local.distances[part]))
-        arm2 = (local.middles[part] ** 2).sum(axis=1) / local.distances[part] ** 2
-        shift = float(np.median(local.deviations[part] * np.sqrt(0.25 + arm2)))
+        turn = float(np.median(local.deviations / local.distances))
+        arms = np.hypot(*local.middles.T) / local.distances
+        shift = float(np.median(local.deviations * np.sqrt(0.25 + arms**2)))
         cell, sectors = float(np.clip(_CELL * shift, 0.6, 3.0)), int(2.0 * pi / np.clip(_CELL * turn, 0.04, 0.4))
         low, high = self.low - _MARGIN, self.high + _MARGIN
-        votes = votes[((votes[:, :2] > low) & (votes[:, :2] < high)).all(axis=1)]
         columns, lines = ((high - low) / cell).astype(int) + 2
+        # Of p pairs with v votes each, c cells have p v / c by chance; the right one has p _RIGHT more.
+        sums = 2 * np.cumsum(end - begin)
+        density = float(sums[-1]) / len(sums) / (columns * lines * sectors)
+        needed = max(_FEWEST_PAIRS, _CONTRAST**2 * density / _RIGHT**2, np.searchsorted(sums, _ENOUGH) + 1)
+        rows = range(min(len(sums), int(needed), int(np.searchsorted(sums, _LIMIT)) + 1))
+        votes = np.concatenate([self._votes(local, row, slice(begin[row], end[row])) for row in rows])
+        votes = votes[((votes[:, :2] > low) & (votes[:, :2] < high)).all(axis=1)]
         scaled = (votes[:, :2] - low.astype(np.float32)) / np.float32(cell)
         turned = votes[:, 2] * np.float32(sectors / (2.0 * pi))
         found = []
