@@ -47,6 +47,7 @@ _HYPOTHESES = 40
 # the map does not show. Assumed, on the safe side for a map that lacks a third of the trees. A first match is one from
 # this probability on.
 _OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
+_FIRST_GATE = 0.95
 
 # An innovation of a diameter counts no more than that of three deviations: trunks are no cylinders.
 _DIAMETER_CAP = 9.0
@@ -160,13 +161,14 @@ class Tracker:
     one-to-one assignment among them is taken, and its worst pairs are dropped until the joint innovation is
     probable. Diameters count in the assignment. A landmark that is seen for the first time may be another one, or none:
     its match has the probability p of its density among those of its rivals, and of all that the map does not show. It
-    must be 0.8, and the prior covariance of the landmark (given its neighbours) is divided by p².
+    must be at least 0.8, and the prior covariance of the landmark (given its neighbours) is divided by p².
 
     Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
     not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
     than ``largest_deviation``, or when first matches of landmarks speak against the pose: the d² of a right match is
-    chi-square distributed, that of a match by chance is uniform within the gate. The logarithm of this ratio is summed
-    up to at most ``credit``; below 0, the track is lost (the cumulative sum of Page, Biometrika 41, 1954).
+    chi-square distributed, that of a match by chance is uniform within the gate (of 0.95 for first matches). The
+    logarithm of this ratio is summed up to at most ``credit``; below 0, the track is lost (the cumulative sum of Page,
+    Biometrika 41, 1954).
 
     Landmarks that were marginalized enter anew if the carrier comes back. Their map error is then used twice.
 
@@ -408,7 +410,8 @@ class Tracker:
         probability = (density / (others + rivals))[one, two]
         indices = extended.indices[rows[two]]
         found = _Found(np.column_stack([one, indices]), squares[one, two], probability)
-        return found.select(np.isin(indices, state.indices) | (probability >= _LEAST_PROBABILITY))
+        is_first = (probability >= _LEAST_PROBABILITY) & (found.squares < chi_square_quantile(_FIRST_GATE, 2))
+        return found.select(np.isin(indices, state.indices) | is_first)
 
     def _nearby(self, state: TrackState, landmarks: Landmarks) -> Indices:
         """Return the landmarks of the map that can be within the gate of a detection."""
@@ -445,7 +448,7 @@ class Tracker:
 
     def _evidence(self, squares: Array) -> float:
         """Return the log-likelihood ratio of d² (k,) of first matches, right against by chance."""
-        ratio = 0.5 * chi_square_quantile(self.gate, 2) * np.exp(-0.5 * squares)
+        ratio = 0.5 * chi_square_quantile(_FIRST_GATE, 2) * np.exp(-0.5 * squares)
         return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
 
 
