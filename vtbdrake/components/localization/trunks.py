@@ -74,7 +74,8 @@ class TrunkDetector:
         typical_diameter: Mean in m of the diameters to be expected before anything is measured.
         diameter_spread: Their standard deviation in m.
         lean: Standard deviation of the lean in rad, per axis, before anything is measured.
-        cell: Edge length in m of the cells in which points are gathered; two trunks closer than this become one.
+        cell: Edge length in m of the cells in which points are gathered; trunks whose bark is less than two cells apart
+            are one object, which is mostly refused.
         largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
         position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight, and the foot
             of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad below breast height.
