@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse, transform, wrap
-from vtbdrake_diagrams.forest.stand import ACCURATE, Stand
+from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, Stand
 from vtbdrake_diagrams.forest.trials import Case, run
 
 
@@ -199,3 +199,15 @@ def test_maps_and_parameters_are_checked():
         ConstellationMap(landmarks([[0.0, 0.0], [1.0, 1.0]]))
     with pytest.raises(ValueError, match="share lies between 0 and 1"):
         ConstellationMap(landmarks(np.eye(3, 2)), share=1.0)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 40.0])
+def test_landmarks_that_fit_nowhere_are_not_sure(correlation):
+    stand = Stand(seed=3, length=60.0, width=60.0)
+    table = ConstellationMap(map_landmarks(stand.map(POOR)), correlation=correlation)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(2, 30))
+        places, diameters = rng.uniform(-15.0, 15.0, (n, 2)), rng.uniform(0.06, 0.4, n)
+        local = Landmarks(places, np.tile(1e-4 * np.eye(2), (n, 1, 1)), diameters, np.full(n, 0.01))
+        assert not table.locate(local).is_sure

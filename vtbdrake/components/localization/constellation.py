@@ -397,9 +397,9 @@ class ConstellationMap:
             A = np.zeros((len(i), 2, 3 + 2 * functions))
             A[:, 0, 0] = A[:, 1, 1] = 1.0
             A[:, 0, 2], A[:, 1, 2] = -arm[:, 1], arm[:, 0]
-            A[:, :, 3:] = np.einsum("mf,mij->mifj", here.shared[i], L).reshape(len(i), 2, -1)
+            A[:, :, 3:] = np.einsum("mf,mij->mifj", here.shared[i], L).reshape(len(i), 2, 2 * functions)
             weights = matches.weights[i, k] * probable[i, k, np.newaxis, np.newaxis]
-            weighted = (weights @ A).reshape(2 * len(i), -1)
+            weighted = (weights @ A).reshape(2 * len(i), 3 + 2 * functions)
             information = weighted.T @ A.reshape(weighted.shape) + prior
             if np.linalg.cond(information[:3, :3]) > 1e12:
                 return None
