@@ -1,30 +1,35 @@
 """Application O3: which parameters of the robot are best under different lighting?
 
-The docking camera alone leads the capture. What is decided are the robot's controller (how fast it closes in, and its
-gains), its filter (how much the target's motion may change) and its detector of markers (the threshold). The lights are
-the sun in front of the target, where the servicer throws its shadow on it; the sun beside it, and grazing its face; and
-the sun behind it, where only a lamp on the camera helps. The cost is the time until the fingers hold the bar.
+The docking camera alone leads the capture. What is decided are the robot's controller (how fast the gripper comes and
+closes in, and the gains), its filter (how much the target's motion may change), its detector of markers (the threshold)
+and the exposure of its camera. The lights are the sun in front of the target, where the servicer throws its shadow on
+it; the sun beside it, and grazing its face; and the sun behind it, where only a lamp on the camera helps. The cost is
+the time until the fingers hold the bar; the error of the bar that is perceived then is shown beside it.
 
-What could bend the answer was fixed before the candidates were judged. (The grid was laid anew after a first look at
-the starts 0 and 100, which therefore do not count.)
+What could bend the answer was fixed before the candidates were judged:
 
 * the lights, `LIGHTS`;
-* the candidates: the grid `GRID`, in which the defaults of the robot are; the short version takes those of `SHORT`;
-* the starts: candidates are chosen on `CHOSEN_ON`, and the choice is compared with the default on the others,
-  `CHECKED_ON`;
+* the candidates, `CANDIDATES`, the first of which are the defaults of the robot;
+* the starts: candidates are chosen on `CHOSEN_ON`, and the choice is compared with the default on others, `CHECKED_ON`.
+  No capture from either had been looked at before;
 * a capture that has not succeeded by `HORIZON`, or is aborted, costs `FAILURE`.
 
-The default run chooses among the candidates of `SHORT` on one start: a first look, which never counts as an answer that
-holds. ``--starts 8`` does so on eight, and ``--full`` among all candidates on eight, which takes hours.
+All this was laid anew after an earlier layout, of which the starts 0 to 8 and 100 to 108 had been looked at: they do
+not count. There, the servicer had no wheels, and most failures were not the light's: the arm's reaction turned the base
+until the target left the image. So the servicer of `LightingScenario` holds its attitude by wheels, in all captures.
+The exposure is a new candidate.
+
+Choosing takes minutes. So the default run takes `CHOICE`, what was chosen, and compares it afresh with the default of
+the robot, from the first `FEW` starts of `CHECKED_ON`; ``--starts 8`` does so from all of them, and ``--full`` chooses
+anew first.
 
 ``python -m vtbdrake_diagrams.satellite.lighting [--starts N] [--full]`` prints the answer and draws it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import click
@@ -35,10 +40,12 @@ from pydrake.systems.framework import Diagram
 
 import vtbdrake as vtb
 from vtbdrake.rollout import Executor, ProcessExecutor
-from vtbdrake.state.systems import pose_to_array
+from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.visualization.plots import Picture, finish
 from vtbdrake.visualization.study_plots import BEST
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.satellite.bodies import Target
+from vtbdrake_diagrams.satellite.relative_motion import Relative
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
 from vtbdrake_diagrams.satellite.supervisor import HOLD, RETREAT
@@ -51,6 +58,8 @@ FAILURE = 60.0
 """What a capture without success costs, in s."""
 SAMPLE_PERIOD = 0.2
 """Of the cost, in s."""
+RECORDED = ("sim.sys.servicer.base.pose", "sim.sys.target.body.pose", "dps.impl.relative.relative")
+"""What the error of the bar is found from: the true poses, and a `Relative`."""
 
 _DIRECTION, _LAMP = "sim.env.light.direction", "sim.sense.docking_camera.lamp"
 
@@ -68,8 +77,10 @@ LIGHTS: dict[str, dict[str, Any]] = {
 }
 """The conditions by name."""
 
-CHOSEN_ON, CHECKED_ON = tuple(range(1, 9)), tuple(range(101, 109))
-"""Start poses (seeds) for the choice, and for the comparison; the short version takes the first of each."""
+CHOSEN_ON, CHECKED_ON = tuple(range(11, 19)), tuple(range(111, 119))
+"""Start poses (seeds) for the choice, and for the comparison."""
+FEW = 6
+"""From how many starts the short version compares."""
 
 
 @dataclass(frozen=True)
@@ -77,45 +88,55 @@ class Settings:
     """What is decided: a candidate.
 
     Attributes:
+        speed: The largest speed at which the gripper corrects its position, in m/s; so it comes to the fixture.
         closing_speed: The speed along the fixture's axis, in m/s.
         gain: The gains of position and orientation of the resolved-rate control, in 1/s.
         agility: Factor of the tracker's process noise, of rates and velocities.
+        exposure: That of the camera; at 1 a white surface in the sun is just not too bright.
         threshold: That of the marker detector, in 8-bit counts.
     """
 
+    speed: float = 0.12
     closing_speed: float = 0.06
     gain: float = 1.0
     agility: float = 1.0
+    exposure: float = 1.0
     threshold: float = 7.0
 
     def entries(self) -> tuple[float, ...]:
         """Return the values of `PARAMETERS`."""
         noise = 1e-3 * self.agility
-        return self.closing_speed, self.gain, self.gain, noise, noise, self.threshold
+        return self.speed, self.closing_speed, self.gain, self.gain, noise, noise, self.exposure, self.threshold
 
     def __str__(self) -> str:
         return (
-            f"{self.closing_speed:g} m/s, gains {self.gain:g}/s, process noise x{self.agility:g}, "
-            f"threshold {self.threshold:g}"
+            f"{self.speed:g} and {self.closing_speed:g} m/s, gains {self.gain:g}/s, process noise x{self.agility:g}, "
+            f"exposure {self.exposure:g}, threshold {self.threshold:g}"
         )
 
 
 PARAMETERS = (
+    vtb.Parameter("dps.impl.controller.speed", 0.05, 0.5),
     vtb.Parameter("dps.impl.supervisor.closing_speed", 0.02, 0.15),
     vtb.Parameter("dps.impl.controller.position_gain", 0.2, 4.0),
     vtb.Parameter("dps.impl.controller.orientation_gain", 0.2, 4.0),
     vtb.Parameter("dps.env.target.rate_noise", 1e-4, 1e-2),
     vtb.Parameter("dps.env.target.velocity_noise", 1e-4, 1e-2),
+    vtb.Parameter("sim.sense.docking_camera.exposure", 0.1, 30.0),
     vtb.Parameter("scenario.threshold", 1.0, 15.0),
 )
 DEFAULT = Settings()
-GRID = tuple(Settings(*values) for values in product((0.06, 0.075, 0.09), (1.0, 1.5), (1.0, 0.3), (7.0, 3.0)))
-SHORT = (
+SWIFT = Settings(speed=0.25, closing_speed=0.09, gain=2.0)
+CANDIDATES = (
     DEFAULT,
-    Settings(closing_speed=0.075),
-    Settings(closing_speed=0.075, agility=0.3),
-    Settings(closing_speed=0.075, gain=1.5, agility=0.3, threshold=3.0),
+    replace(DEFAULT, exposure=3.0),
+    SWIFT,
+    replace(SWIFT, exposure=3.0),
+    replace(SWIFT, exposure=8.0),
+    replace(SWIFT, exposure=8.0, agility=0.3, threshold=3.0),
 )
+CHOICE = replace(SWIFT, exposure=8.0, agility=0.3, threshold=3.0)
+"""What ``--full`` has chosen on `CHOSEN_ON`."""
 
 
 @dataclass
@@ -123,6 +144,10 @@ class LightingScenario(SatelliteScenario):
     """A capture that the camera leads alone; the threshold of its marker detector is a field."""
 
     perception: str = "camera"
+    # Without them the arm's reaction turns the base, until the target leaves the image.
+    wheels: bool = True
+    # Slow, because images are what a capture costs.
+    camera_rate: float = 2.0
     # What the detector's adaptive threshold subtracts from the mean, see `MarkerDetector`.
     threshold: float = 7.0
 
@@ -162,13 +187,64 @@ def lighting_problem(seeds: Sequence[int]) -> vtb.Problem:
     )
 
 
-def times_to_grip(candidates: Sequence[Settings], *, seeds: Sequence[int], executor: Executor) -> Array:
-    """Return the cost of each candidate under each light from each start in s, shape (n, lights, starts)."""
+def bar_error(record: Mapping[str, Any]) -> float:
+    """Return how far the bar is at the end from where the DPS believes it, seen from the base, in m.
+
+    Args:
+        record: What was recorded of a rollout, with the addresses of `RECORDED`.
+    """
+    base, target, relative = (record[address][-1] for address in RECORDED)
+    X_BT = pose_from_array(base).InvertAndCompose(pose_from_array(target))
+    return float(np.linalg.norm(X_BT @ Target().X_TH.translation() - Relative.of(relative).p_BH))
+
+
+@dataclass(frozen=True)
+class Captures:
+    """What came of the captures with some settings.
+
+    Attributes:
+        times: The cost of each of the settings under each light from each start, in s, shape (n, lights, starts).
+        errors: The error of the bar when it was held, in m, likewise; NaN without success.
+    """
+
+    times: Array
+    errors: Array
+
+    @property
+    def by_light(self) -> Array:
+        """Return the mean cost over the starts, shape (n, lights)."""
+        return self.times.mean(axis=2)
+
+    @property
+    def failures(self) -> Array:
+        """Return how many captures did not succeed, shape (n, lights)."""
+        return (self.times >= FAILURE).sum(axis=2)
+
+    @property
+    def error_by_light(self) -> Array:
+        """Return the mean error of the captures that succeeded, in m, shape (n, lights); NaN if none did."""
+        succeeded = np.isfinite(self.errors).sum(axis=2)
+        return np.nansum(self.errors, axis=2) / np.where(succeeded, succeeded, np.nan)
+
+    @property
+    def robust(self) -> int:
+        """Return the number of the settings that are best in their worst light; of equal ones, the best in the mean."""
+        order = np.lexsort((self.by_light.mean(axis=1), self.by_light.max(axis=1)))
+        return int(order[0])
+
+
+def capture_all(candidates: Sequence[Settings], *, seeds: Sequence[int], executor: Executor) -> Captures:
+    """Simulate a capture with each candidate under each light from each start."""
     sweep = lighting_problem(seeds).sweep(
-        values=[candidate.entries() for candidate in candidates], executor=executor, progress=False
+        values=[candidate.entries() for candidate in candidates], executor=executor, record=RECORDED, progress=False
     )
-    costs = [FAILURE if rollout.failed else rollout.value for rollout in sweep.rollouts]
-    return np.reshape(costs, (len(candidates), len(LIGHTS), len(seeds)))
+    times = [FAILURE if rollout.failed else rollout.value for rollout in sweep.rollouts]
+    errors = [
+        bar_error(rollout.record) if time < FAILURE else np.nan
+        for rollout, time in zip(sweep.rollouts, times, strict=True)
+    ]
+    shape = len(candidates), len(LIGHTS), len(seeds)
+    return Captures(np.reshape(times, shape), np.reshape(errors, shape))
 
 
 @dataclass(frozen=True)
@@ -176,36 +252,35 @@ class LightingAnswer:
     """The answer to O3.
 
     Attributes:
-        candidates: What was tried; the first is the default.
-        costs: Of each under each light from each start, in s, shape (n, lights, starts).
-        checked: Of the default and of the robust choice, from other starts, shape (2, lights, starts).
+        choice: The settings that are best in their worst light.
+        checked: The captures with the default and with the choice, from the starts for the comparison.
+        candidates: Among what was chosen; empty if `CHOICE` was taken.
+        tried: The captures with these, from the starts for the choice.
     """
 
-    candidates: tuple[Settings, ...]
-    costs: Array
-    checked: Array
-
-    @property
-    def by_light(self) -> Array:
-        """Return the mean cost over the starts, shape (n, lights)."""
-        return self.costs.mean(axis=2)
-
-    @property
-    def robust(self) -> int:
-        """Return the number of the candidate that is best in its worst light; of equal ones, the best in the mean."""
-        order = np.lexsort((self.by_light.mean(axis=1), self.by_light.max(axis=1)))
-        return int(order[0])
+    choice: Settings
+    checked: Captures
+    candidates: tuple[Settings, ...] = ()
+    tried: Captures | None = None
 
     @property
     def best(self) -> dict[str, Settings]:
-        """Return the best candidate for each light."""
-        return {light: self.candidates[int(np.argmin(self.by_light[:, k]))] for k, light in enumerate(LIGHTS)}
+        """Return the best of the candidates for each light; nothing if none were tried."""
+        if self.tried is None:
+            return {}
+        numbers = self.tried.by_light.argmin(axis=0).tolist()
+        return {light: self.candidates[number] for light, number in zip(LIGHTS, numbers, strict=True)}
 
     @property
     def holds(self) -> bool:
         """Return whether, from the other starts, the choice is no worse in any light and better in the worst."""
-        default, robust = self.checked.mean(axis=2)
+        default, robust = self.checked.by_light
         return bool((robust <= default).all() and robust.max() < default.max())
+
+
+def compare(choice: Settings, *, seeds: Sequence[int], executor: Executor) -> LightingAnswer:
+    """Compare a choice with the default."""
+    return LightingAnswer(choice, capture_all([DEFAULT, choice], seeds=seeds, executor=executor))
 
 
 def find_settings(
@@ -214,95 +289,108 @@ def find_settings(
     """Choose among candidates on some starts, and compare the choice with the default on others.
 
     Args:
-        candidates: What is tried; the first is the default.
+        candidates: What is tried.
         seeds: Start poses for the choice.
         others: Start poses for the comparison.
         executor: Runs the rollouts.
     """
-    costs = times_to_grip(candidates, seeds=seeds, executor=executor)
-    chosen = LightingAnswer(tuple(candidates), costs, np.empty(0)).robust
-    checked = times_to_grip([candidates[0], candidates[chosen]], seeds=others, executor=executor)
-    return LightingAnswer(tuple(candidates), costs, checked)
+    tried = capture_all(candidates, seeds=seeds, executor=executor)
+    found = compare(candidates[tried.robust], seeds=others, executor=executor)
+    return replace(found, candidates=tuple(candidates), tried=tried)
 
 
 def plot_answer(answer: LightingAnswer) -> Figure:
-    """Draw the cost of every candidate over the lights, with the default and the robust choice.
+    """Draw the cost over the lights, of the default and of the choice, from the starts for the comparison.
 
-    Left: the mean over the starts on which was chosen, one line per candidate. Right: the two from the other starts.
+    If candidates were tried, they are on the left: the mean over the starts for the choice, one line per candidate.
     """
-    figure = Picture(11.0, 4.2)
-    chosen_axes, checked_axes = figure.subplots(1, 2, sharey=True)
     lights = range(len(LIGHTS))
-    for costs in answer.by_light:
-        chosen_axes.plot(lights, costs, color="0.8", lw=1.0)
-    named = {"default": (0, "C0"), "robust choice": (answer.robust, BEST)}
-    for name, (number, color) in named.items():
-        label = f"{name}: {answer.candidates[number]}"
-        chosen_axes.plot(lights, answer.by_light[number], "o-", color=color, label=label)
-    for costs, (name, (_, color)) in zip(answer.checked, named.items(), strict=True):
-        checked_axes.plot(lights, costs.mean(axis=1), "o-", color=color, label=name)
-        checked_axes.plot(np.repeat(lights, costs.shape[1]), costs.ravel(), ".", color=color, alpha=0.5)
-    titles = f"start poses for the choice: {answer.costs.shape[2]}", f"other start poses: {answer.checked.shape[2]}"
-    for axes, title in zip((chosen_axes, checked_axes), titles, strict=True):
-        axes.set(ylabel="time to grip [s]", title=title)
+    figure = Picture(11.0 if answer.tried else 6.0, 4.2)
+    *left, right = figure.subplots(1, 2 if answer.tried else 1, sharey=True, squeeze=False)[0]
+    for axes in left:
+        assert answer.tried is not None
+        for settings, costs in zip(answer.candidates, answer.tried.by_light, strict=True):
+            axes.plot(lights, costs, "o-", ms=4.0, lw=1.0, label=str(settings))
+        axes.set(title=f"chosen from {answer.tried.times.shape[2]} start poses")
+    named = {"default": "C0", f"choice: {answer.choice}": BEST}
+    for costs, (name, color) in zip(answer.checked.times, named.items(), strict=True):
+        right.plot(lights, costs.mean(axis=1), "o-", color=color, label=name)
+        right.plot(np.repeat(lights, costs.shape[1]), costs.ravel(), ".", color=color, alpha=0.5)
+    right.set(title=f"compared from {answer.checked.times.shape[2]} other start poses")
+    for axes in (*left, right):
+        axes.set(ylabel="time to grip [s]", ylim=(0.0, 1.35 * FAILURE))
         axes.set_xticks(lights, [light.replace(", ", ",\n") for light in LIGHTS])
         axes.axhline(FAILURE, color="0.5", ls=":", lw=1.0)
-        axes.legend(fontsize="x-small")
+        axes.legend(fontsize="xx-small", loc="upper left")
         finish(axes)
     return figure
 
 
-def answer_lighting(*, full: bool = False, starts: int = 1) -> LightingAnswer:
+def answer_lighting(*, full: bool = False, starts: int = len(CHECKED_ON)) -> LightingAnswer:
     """Answer O3 with two worker processes.
 
     Args:
-        full: Whether to try `GRID` on all starts, instead of `SHORT` on some.
-        starts: On how many, at most 8.
+        full: Whether to choose among `CANDIDATES` from all starts of `CHOSEN_ON` first, instead of taking `CHOICE`.
+        starts: From how many starts of `CHECKED_ON` the choice is compared with the default.
     """
-    candidates = (DEFAULT, *(settings for settings in GRID if settings != DEFAULT)) if full else SHORT
-    count = len(CHOSEN_ON) if full else starts
+    others = CHECKED_ON[:starts]
     with ProcessExecutor(2) as executor:
-        return find_settings(candidates, seeds=CHOSEN_ON[:count], others=CHECKED_ON[:count], executor=executor)
+        if not full:
+            return compare(CHOICE, seeds=others, executor=executor)
+        return find_settings(CANDIDATES, seeds=CHOSEN_ON, others=others, executor=executor)
 
 
-def _table(answer: LightingAnswer) -> str:
-    """Return the costs from the other starts by light, of the default and of the choice."""
-    default, robust = answer.checked.mean(axis=2)
-    cells = zip(LIGHTS, default.tolist(), robust.tolist(), strict=True)
-    return "; ".join(f"{light}: {a:.1f} s by default, {b:.1f} s" for light, a, b in cells)
+def _count(full: bool) -> int:
+    return len(CHECKED_ON) if full else FEW
+
+
+def _table(captures: Captures, number: int) -> str:
+    """Return by light what came of the captures with some of the settings."""
+    columns = zip(
+        LIGHTS, captures.by_light[number], captures.failures[number], captures.error_by_light[number], strict=True
+    )
+    return "; ".join(
+        f"{light} {time:.1f} s, {1e3 * error:.0f} mm{f', {failures} failed' if failures else ''}"
+        for light, time, failures, error in columns
+    )
 
 
 def lighting(full: bool) -> Answer:
     """Answer O3: which parameters of the robot are best under different lighting?"""
-    answer = answer_lighting(full=full)
-    enough = answer.checked.shape[2] >= len(CHECKED_ON)
-    best = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
+    answer = answer_lighting(full=full, starts=_count(full))
+    default, robust = answer.checked.by_light.max(axis=1).tolist()
+    count = answer.checked.times.shape[2]
+    chosen = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
     return Answer(
         id="O3",
         question="Which controller parameters are best under different lighting?",
-        answer=f"{answer.candidates[answer.robust]}: {answer.checked[1].mean(axis=1).max():.1f} s to grip in the worst "
-        f"light, by default {answer.checked[0].mean(axis=1).max():.1f} s",
+        answer=f"{answer.choice}: {robust:.1f} s to grip in the worst light, by default {default:.1f} s",
         unit="",
         interval=None,
         paper="none given",
-        holds=answer.holds and enough,
-        note=f"{'' if enough else 'A first look, too few starts to hold. '}"
-        f"Of {len(answer.candidates)} candidates, chosen on {answer.costs.shape[2]} start(s), compared on "
-        f"{answer.checked.shape[2]} other(s); without success {FAILURE:g} s. {_table(answer)}. Best for each light: "
-        f"{best}",
+        holds=answer.holds,
+        note=f"Compared with the default from {count} start poses, other than those of the choice; without success "
+        f"{FAILURE:g} s. By default: {_table(answer.checked, 0)}. With the choice: {_table(answer.checked, 1)}. "
+        + (f"Best for each light: {chosen}" if chosen else "Chosen beforehand on 8 other starts, FULL=1 chooses anew."),
     )
 
 
 @click.command()
-@click.option("--full", is_flag=True, help="All candidates, from all starts.")
-@click.option("--starts", type=click.IntRange(1, len(CHOSEN_ON)), default=1, help="How many starts, without --full.")
+@click.option("--full", is_flag=True, help="Choose among all candidates first.")
+@click.option(
+    "--starts",
+    type=click.IntRange(1, len(CHECKED_ON)),
+    help=f"From how many starts to compare; by default {FEW}, and all with --full.",
+)
 @click.option("--figure", default="lighting.png", help="File of the picture.", show_default=True)
-def main(full: bool, starts: int, figure: str) -> None:
+def main(full: bool, starts: int | None, figure: str) -> None:
     """Answer O3, and draw the answer."""
-    answer = answer_lighting(full=full, starts=starts)
-    for settings, costs in zip(answer.candidates, answer.by_light, strict=True):
-        click.echo(f"{'  '.join(f'{cost:5.1f}' for cost in costs)}  {settings}")
-    click.echo(f"robust: {answer.candidates[answer.robust]}; {_table(answer)}; holds: {answer.holds}")
+    answer = answer_lighting(full=full, starts=starts or _count(full))
+    if answer.tried is not None:
+        for number, settings in enumerate(answer.candidates):
+            click.echo(f"{settings}: {_table(answer.tried, number)}")
+    click.echo(f"default, compared: {_table(answer.checked, 0)}")
+    click.echo(f"{answer.choice}, compared: {_table(answer.checked, 1)}; holds: {answer.holds}")
     plot_answer(answer).savefig(figure, dpi=110)
 
 
