@@ -190,3 +190,19 @@ def test_impossible_settings_are_refused(settings):
 def test_an_empty_map_is_refused():
     with pytest.raises(ValueError, match="empty"):
         Tracker(Landmarks.empty())
+
+
+@pytest.mark.parametrize("correlation", [0.0, 20.0])
+def test_nothing_to_match_and_exact_maps_are_no_errors(correlation):
+    places = np.array([[0.0, 0.0], [4.0, 1.0], [-3.0, 5.0], [6.0, -4.0]])
+    exact = Landmarks(places, np.zeros((4, 2, 2)), np.full(4, 0.3), np.zeros(4))
+    tracker = Tracker(exact, correlation=correlation)
+    for scan in (Landmarks.empty(), exact.select([0]).seen_from([50.0, 0.0, 0.0])):
+        state, matches = tracker.start(np.zeros(3), START, scan)
+        assert not matches.is_fused and tracker.is_lost(state)
+    state, matches = tracker.start(np.zeros(3), START, exact)
+    state, matches = tracker.update(state, exact)
+    assert matches.is_fused and len(matches.pairs) == 4
+    np.testing.assert_allclose(state.pose, 0.0, atol=1e-9)
+    state, matches = tracker.update(state, exact.select([0]))
+    assert not matches.is_fused

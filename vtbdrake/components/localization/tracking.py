@@ -149,6 +149,7 @@ class _Found(NamedTuple):
         return self.select(np.arange(len(self.pairs)) < count)
 
 
+_NOTHING = _Found(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
 _NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.int64))
 
 
@@ -321,7 +322,8 @@ class Tracker:
     def _covariance(self, indices: Indices) -> Array:
         """Return K of the map's errors, shape (m, m) in m^2."""
         places = self.landmarks.positions[indices]
-        deviations = np.sqrt(0.5 * np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2))
+        variances = np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2) / 2.0
+        deviations = np.sqrt(np.maximum(variances, 1e-6))
         squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         K: Array = (
             self.correlated_share * np.exp(-0.5 * squares / self.correlation**2) * np.outer(deviations, deviations)
@@ -380,6 +382,8 @@ class Tracker:
 
     def _associate(self, state: TrackState, landmarks: Landmarks) -> _Found:
         near = self._nearby(state, landmarks)
+        if not len(near):
+            return _NOTHING
         extended = self._extended(state, near[~np.isin(near, state.indices)])
         rows = np.flatnonzero(np.isin(extended.indices, near))
         expected, H = self._expected(extended, rows)
@@ -392,7 +396,7 @@ class Tracker:
         threshold = chi_square_quantile(self.gate, 2)
         i, j = np.nonzero(squares < threshold)
         if not len(i):
-            return _Found(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+            return _NOTHING
         nu, S = innovations[i, j], spread[i, j]
         best, determinant = _agreeing(i, j, nu, S, joint, threshold)
         diameter = self._diameter_cost(landmarks, i, extended.indices[rows][j])
@@ -405,7 +409,8 @@ class Tracker:
         one, two = one[is_pair], two[is_pair]
         density = np.zeros(squares.shape)
         density[i, j] = np.exp(-0.5 * (best + diameter)) / (2.0 * np.pi * np.sqrt(determinant))
-        others = _OTHERS * len(landmarks) / (np.pi * (landmarks.positions**2).sum(axis=1).max())
+        area = np.pi * max(1.0, float((landmarks.positions**2).sum(axis=1).max()))
+        others = _OTHERS * len(landmarks) / area
         rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
         probability = (density / (others + rivals))[one, two]
         indices = extended.indices[rows[two]]
@@ -422,7 +427,7 @@ class Tracker:
         variances = largest + own + P[0, 0] + P[1, 1] + levers * P[2, 2] + self.bias_deviation**2
         reach = np.sqrt(chi_square_quantile(self.gate, 2) * variances)
         found = self._tree.query_ball_point(places, reach)
-        return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in found]))
+        return np.unique(np.array([index for one in found for index in one], dtype=np.int64))
 
     def _diameter_cost(self, landmarks: Landmarks, seen: Indices, indices: Indices) -> Array:
         """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map."""
