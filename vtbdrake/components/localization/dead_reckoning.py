@@ -39,7 +39,8 @@ _BIAS_DEVIATION = 0.005
 class DriftModel:
     """How dead reckoning drifts: random walks, whose deviations grow with the roots of distance, time and turn.
 
-    The values are assumed.
+    The values are assumed. Errors that last, of the radius of a wheel or of the gyros, are no random walks: the
+    deviations are too large for seconds, and too small for minutes.
 
     Attributes:
         along: Of the distance travelled, in m per root metre.
