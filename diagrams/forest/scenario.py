@@ -44,6 +44,10 @@ PERCEPTIONS = ("scanner", "stereo")
 # What a detector assumes of a scanner whose ranges are exact, in m.
 _LEAST_RANGE_NOISE = 0.005
 
+# How far the vertical is off, in rad, which displaces what a high sensor sees: assumed, and more than the 3 mrad that
+# it is in the simulation, as its errors last.
+_LEVELLING = 0.005
+
 
 def plant_config() -> MultibodyPlantConfig:
     """Return the configuration of the plant: discrete, as the wheels are stepped with it."""
@@ -217,11 +221,9 @@ class CarrierScenario(Scenario):
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         """Return how the DPS localizes itself on a map, which has errors as ``map`` says."""
         landmarks, correlation = map_landmarks(world_map, self.landmark), MAPS[self.map].correlation
-        x, y, _ = self.X_BL.translation().tolist()
-        return LocalizationUnit(
-            ConstellationMap(landmarks, correlation=correlation),
-            Tracker(landmarks, sensor=(x, y), correlation=correlation),
-        )
+        x, y, z = self.X_BL.translation().tolist()
+        tracker = Tracker(landmarks, sensor=(x, y), scan_deviation=_LEVELLING * z, correlation=correlation)
+        return LocalizationUnit(ConstellationMap(landmarks, correlation=correlation), tracker)
 
     def make_dps(self) -> Diagram:
         world_map = self.global_map()

@@ -58,6 +58,16 @@ def test_a_bias_without_a_state_is_inconsistent():
     assert squares.mean() > BOUNDS[1]
 
 
+def test_a_scan_that_may_be_displaced_says_less_of_the_position():
+    one = drive(3, ACCURATE)
+    exact, displaced = (
+        Tracker(one.map, scan_deviation=deviation).start(one.poses[0], START, one.scans[0])[0].pose_covariance
+        for deviation in (0.0, 0.05)
+    )
+    # A displacement of all detections is one of the carrier.
+    np.testing.assert_allclose(displaced - exact, np.diag([0.05**2, 0.05**2, 0.0]), atol=3e-5)
+
+
 def test_fusing_the_map_in_each_scan_is_inconsistent():
     once, afresh = [], []
     for seed in range(8):

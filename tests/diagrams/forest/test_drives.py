@@ -9,6 +9,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.drives import (
     GOALS,
+    STANDING,
     Drive,
     Track,
     forest,
@@ -72,10 +73,12 @@ def test_wrong_claim_is_counted() -> None:
 
 def test_independent_poses_are_apart() -> None:
     one = track(0)
-    places = one.drive.truth[one.is_localized][one.independent, 0]
-    assert places[-1] == 50.0
-    assert np.diff(places).min() >= 20.0 - 0.2
+    drive = replace(one.drive, truth=one.drive.truth * [5.0, 1.0, 1.0])
+    places = drive.truth[one.is_localized][replace(one, drive=drive).independent, 0]
+    assert places[-1] == 250.0
+    assert np.diff(places).min() >= 99.0
     assert len(places) == 3
+    assert one.independent.sum() == 1
 
 
 def test_bounds_hold_for_95_percent_of_means() -> None:
@@ -98,9 +101,14 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     found = localize(drive, scenario.unit(scenario.global_map()))
     testbed = scenario.build()
     simulator = testbed.simulator()
+    context = simulator.get_mutable_context()
+    # The driver begins at the first scan after standing.
+    testbed.write(context, {"sim.act.driver.speed": 0.0})
+    simulator.AdvanceTo(STANDING + 0.2)
+    testbed.write(context, {"sim.act.driver.speed": scenario.speed})
     # The result of the last scan is shown some periods later, and before that of the next.
     simulator.AdvanceTo(drive.times[-1] + scenario.localizer_latency + 0.08)
-    pose = testbed.read(simulator.get_context(), "dps.env.localizer.pose")
+    pose = testbed.read(context, "dps.env.localizer.pose")
     assert found.is_localized[-1] and drive.travelled[-1] == pytest.approx(1.5, abs=0.3)
     np.testing.assert_allclose(pose, found.poses[-1], atol=1e-9)
     np.testing.assert_allclose(pose, drive.truth[-1], atol=0.2)

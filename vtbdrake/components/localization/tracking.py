@@ -178,6 +178,8 @@ class Tracker:
         sensor: s = p_HoLo_H in the plane, in m.
         bias_deviation: Standard deviation of the range bias, in m; assumed.
         least_deviation: Standard deviation in m that is added to those of detections, per axis; assumed.
+        scan_deviation: Standard deviation in m, per axis, by which all detections of a scan are displaced together;
+            assumed.
         correlation: L in m, 0 if the map's errors are independent.
         correlated_share: c, of the variance; assumed.
         gate: The share of right pairs that the gate lets pass.
@@ -193,6 +195,7 @@ class Tracker:
     sensor: tuple[float, float] = (0.0, 0.0)
     bias_deviation: float = 0.03
     least_deviation: float = 0.01
+    scan_deviation: float = 0.0
     correlation: float = 0.0
     correlated_share: float = 0.98
     gate: float = 0.997
@@ -340,6 +343,7 @@ class Tracker:
             innovation = (landmarks.positions[pairs[:, 0]] - expected).ravel()
             PHt = _times_transpose(state.covariance, H, rows)
             S = _times(H, rows, PHt) + block_diag(*self._noise(landmarks)[pairs[:, 0]])
+            S += self.scan_deviation**2 * np.tile(np.eye(2), (len(pairs), len(pairs)))
             factor = cho_factor(S, lower=True)
             weighted = cho_solve(factor, innovation)
             parts = (innovation * weighted).reshape(-1, 2).sum(axis=1)
