@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -374,6 +374,9 @@ class ForestScenario(CarrierScenario):
             return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
         X_BC = self.X_BL @ self.stereo.poses()[IMAGES[0]]
         return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetector(), X_BC)
+
+    def unit(self, world_map: WorldModel) -> LocalizationUnit:
+        return replace(super().unit(world_map), begins_with_submap=self.perception == "stereo")
 
     def deployment(self) -> Deployment:
         if self.perception == "scanner":

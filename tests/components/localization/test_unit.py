@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -93,6 +93,17 @@ def test_a_wrong_first_pose_ends_soon(errors):
         # It may be claimed again, by this locator.
         longest = max(len(part) for part in "".join("x" if t else " " for t in tracking).split(" "))
         assert longest <= 12
+
+
+def test_narrow_views_need_all_that_was_gathered_to_begin():
+    """Each scan shows three landmarks, fewer than a track begins with."""
+    one = drive(3, ACCURATE, reach=18.0)
+    narrow = [scan.select(np.arange(3 * k, 3 * k + 3) % len(scan)) for k, scan in enumerate(one.scans)]
+    unit = unit_for(one.map)
+    assert {answer.status for answer in run(unit, narrow, one.reckoned)[0]} == {SEARCHING}
+    answers, _ = run(replace(unit, begins_with_submap=True), narrow, one.reckoned)
+    assert answers[-1].status == TRACKING
+    assert np.linalg.norm(error(answers[-1].pose, one.poses[-1])[:2]) < 0.3
 
 
 def test_bad_times_and_poses_are_ignored_and_counted():

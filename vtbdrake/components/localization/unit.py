@@ -110,6 +110,8 @@ class LocalizationUnit:
         drift: How the odometry drifts.
         submap_length: Over how many metres landmarks are gathered.
         try_every: Metres travelled or seconds, whichever comes first, between matches without a guess.
+        begins_with_submap: Whether tracking begins with all landmarks that were gathered, not with those of the last
+            scan: for sensors of which one sample shows too few for a pose. Their errors are then taken as independent.
     """
 
     locator: ConstellationMap
@@ -117,6 +119,7 @@ class LocalizationUnit:
     drift: DriftModel = field(default_factory=DriftModel)
     submap_length: float = 40.0
     try_every: tuple[float, float] = (2.0, 2.0)
+    begins_with_submap: bool = False
 
     def start(self) -> UnitState:
         """Return the memory before the first scan."""
@@ -170,10 +173,12 @@ class LocalizationUnit:
         if not (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any():
             return none, state
         state = replace(state, tried_at=np.array([submap.distance, time]))
-        fix = self.locator.locate(submap.landmarks())
+        gathered = submap.landmarks()
+        fix = self.locator.locate(gathered)
         if not fix.is_sure:
             return none, state
-        track, matches = self.tracker.start(fix.pose, fix.covariance, landmarks)
+        seen = gathered if self.begins_with_submap else landmarks
+        track, matches = self.tracker.start(fix.pose, fix.covariance, seen)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track):
             return none, state
         answer = _answer(track, matches, len(landmarks), X_OH, time)
