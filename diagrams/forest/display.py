@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
+from vtbdrake.cli import BadInputError, one_line
 from vtbdrake.cli.options import option, parse_field, scenario_argument, settings, timeout_option, url_option
 from vtbdrake.components.localization.planar import transform
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake.components.world_model import WorldModel
+from vtbdrake.control.bridge import BridgeError
 from vtbdrake.monitoring.live.client import watch
 from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model
@@ -138,12 +140,17 @@ def ellipse(place: Array, covariance: Array) -> Array:
 @timeout_option
 def main(scenario: Scenario, url: str, fields: tuple[tuple[str, Any], ...], every: int, timeout: float) -> None:
     """Show a running localization unit in a browser, until Ctrl-C or its end."""
-    meshcat = make_meshcat()
-    scenario = scenario.with_fields(settings(fields))
-    display = DriverDisplay(meshcat, scenario.global_map())
-    click.echo(f"the display is at {meshcat.web_url()}")
-    for _, values in watch(url, WATCHED, every=every, timeout=timeout):
-        display.show(values)
+    try:
+        scenario = scenario.with_fields(settings(fields))
+        meshcat = make_meshcat()
+        display = DriverDisplay(meshcat, scenario.global_map())
+        click.echo(f"the display is at {meshcat.web_url()}")
+        for _, values in watch(url, WATCHED, every=every, timeout=timeout):
+            display.show(values)
+    except KeyboardInterrupt:
+        return
+    except (ValueError, OSError, BridgeError) as error:
+        raise BadInputError(one_line(error)) from error
 
 
 if __name__ == "__main__":
