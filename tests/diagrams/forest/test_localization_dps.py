@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -25,6 +27,7 @@ from vtbdrake.components.world_model import (
     position_estimate,
     save_geojson,
 )
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
@@ -198,29 +201,36 @@ class Drive:
     seen: dict[str, np.ndarray]
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    scenario, log = RidingScenario(), tmp_path_factory.mktemp("drive") / "drive.lcm"
-    dps = DpsAlone(scenario)
-    context = dps.default_context()
+@contextmanager
+def deployed(target: DpsAlone | VirtualTestbed, context: Context, **options: Any) -> Iterator[tuple[Runtime, str]]:
+    """Drive in lock-step with the machine of `RidingScenario`, and give loop and URL at the end."""
+    scenario = RidingScenario()
+    deployment = Deployment.of(scenario).in_lock_step("imu")
     with (
         Hub(port=0) as hub,
         MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
-        scenario.deploy(
-            hub.url,
-            target=dps,
-            context=context,
-            deployment=Deployment.of(scenario).in_lock_step("imu"),
-            record=log,
-            live=True,
-        ) as runtime,
-        LiveWatch(hub.url, WATCHED, timeout=TIMEOUT) as live,
+        target.scenario.deploy(hub.url, target=target, context=context, deployment=deployment, **options) as runtime,
     ):
-        assert runtime.slow_parts.wait(TIMEOUT)
-        runtime.take_over()
-        # A machine in lock-step leaves no time to compute. The first cycle receives; the second commands.
-        runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
-        assert not runtime.guards.latched
+        yield runtime, hub.url
+
+
+def run_all(runtime: Runtime) -> None:
+    assert runtime.slow_parts.wait(TIMEOUT)
+    runtime.take_over()
+    # A machine in lock-step leaves no time to compute. The first cycle receives; the second commands.
+    runtime.run(cycles=CYCLES - runtime.cycles, until=lambda: not runtime.slow_parts.wait(TIMEOUT))
+    assert not runtime.guards.latched
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    dps, log = DpsAlone(RidingScenario()), tmp_path_factory.mktemp("drive") / "drive.lcm"
+    context = dps.default_context()
+    with (
+        deployed(dps, context, record=log, live=True) as (runtime, url),
+        LiveWatch(url, WATCHED, timeout=TIMEOUT) as live,
+    ):
+        run_all(runtime)
         live.wait(10, timeout=TIMEOUT)
         return Drive(dps, context, log, live.arrays())
 
@@ -234,6 +244,19 @@ def test_unit_beside_a_machine_localizes_as_in_simulation(drive: Drive) -> None:
     for name in ("position", "heading"):
         expected = testbed.read(simulated, f"{POSE}.{name}")
         np.testing.assert_allclose(drive.dps.read(drive.context, f"{POSE}.{name}"), expected, atol=1e-3)
+
+
+def test_throwing_the_switches_changes_nothing_else(drive: Drive) -> None:
+    # Its simulated world is another stand than the one on the map: there it would find nothing.
+    testbed = built(stand_seed=4)
+    context = testbed.default_context()
+    with deployed(testbed, context) as (runtime, _):
+        run_all(runtime)
+    assert testbed.read(context, f"{POSE}.status") == TRACKING
+    # The first cycle still sees the simulated IMU.
+    for name in ("position", "heading"):
+        address = f"{POSE}.{name}"
+        np.testing.assert_allclose(testbed.read(context, address), drive.dps.read(drive.context, address), atol=1e-3)
 
 
 def test_log_of_a_drive_is_replayed_to_the_last_bit(drive: Drive) -> None:
