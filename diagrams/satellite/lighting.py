@@ -20,8 +20,7 @@ until the target left the image. So the servicer of `LightingScenario` holds its
 The exposure is a new candidate.
 
 Choosing takes minutes. So the default run takes `CHOICE`, what was chosen, and compares it afresh with the default of
-the robot, from the first `FEW` starts of `CHECKED_ON`; ``--starts 8`` does so from all of them, and ``--full`` chooses
-anew first.
+the robot, from all starts of `CHECKED_ON`; ``--full`` chooses anew first.
 
 ``python -m vtbdrake_diagrams.satellite.lighting [--starts N] [--full]`` prints the answer and draws it.
 """
@@ -79,8 +78,6 @@ LIGHTS: dict[str, dict[str, Any]] = {
 
 CHOSEN_ON, CHECKED_ON = tuple(range(11, 19)), tuple(range(111, 119))
 """Start poses (seeds) for the choice, and for the comparison."""
-FEW = 6
-"""From how many starts the short version compares."""
 
 
 @dataclass(frozen=True)
@@ -340,10 +337,6 @@ def answer_lighting(*, full: bool = False, starts: int = len(CHECKED_ON)) -> Lig
         return find_settings(CANDIDATES, seeds=CHOSEN_ON, others=others, executor=executor)
 
 
-def _count(full: bool) -> int:
-    return len(CHECKED_ON) if full else FEW
-
-
 def _table(captures: Captures, number: int) -> str:
     """Return by light what came of the captures with some of the settings."""
     columns = zip(
@@ -357,7 +350,7 @@ def _table(captures: Captures, number: int) -> str:
 
 def lighting(full: bool) -> Answer:
     """Answer O3: which parameters of the robot are best under different lighting?"""
-    answer = answer_lighting(full=full, starts=_count(full))
+    answer = answer_lighting(full=full)
     default, robust = answer.checked.by_light.max(axis=1).tolist()
     count = answer.checked.times.shape[2]
     chosen = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
@@ -380,12 +373,14 @@ def lighting(full: bool) -> Answer:
 @click.option(
     "--starts",
     type=click.IntRange(1, len(CHECKED_ON)),
-    help=f"From how many starts to compare; by default {FEW}, and all with --full.",
+    default=len(CHECKED_ON),
+    help="From how many starts to compare.",
+    show_default=True,
 )
 @click.option("--figure", default="lighting.png", help="File of the picture.", show_default=True)
-def main(full: bool, starts: int | None, figure: str) -> None:
+def main(full: bool, starts: int, figure: str) -> None:
     """Answer O3, and draw the answer."""
-    answer = answer_lighting(full=full, starts=starts or _count(full))
+    answer = answer_lighting(full=full, starts=starts)
     if answer.tried is not None:
         for number, settings in enumerate(answer.candidates):
             click.echo(f"{settings}: {_table(answer.tried, number)}")
