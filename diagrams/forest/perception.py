@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from math import inf
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
 from threadpoolctl import ThreadpoolController
 
 from vtbdrake.components.arrival import Arrival
@@ -31,17 +32,21 @@ from vtbdrake.components.localization.dead_reckoning import (
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation
 from vtbdrake.components.localization.unit import (
+    LOST,
     UNIT_STATE_CODEC,
     Localization,
     LocalizationUnit,
     UnitState,
 )
 from vtbdrake.scan import Scan
-from vtbdrake.state import discrete_state
+from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed.slow_part import SlowPart
 
 Array = NDArray[np.float64]
+
+# For how long dead reckoning alone is trusted to know the place, in s; assumed.
+_PATIENCE = 10.0
 
 SHOWN = 64
 """How many landmarks the port ``landmarks`` of the localizer shows at most: the nearest."""
@@ -163,8 +168,8 @@ class PresentPose(LeafSystem):
         X_WH(now) = X_WH X_OH^-1 X_OH(now),
 
     and the covariance grows as the `DriftModel` says. ``pose_estimate`` is [time (s), x, y (m), heading (rad),
-    covariance (9,), status]. Without a pose on the map, the pose is NaN and its variances are
-    infinite, as the localizer says.
+    covariance (9,), status]. Without a pose on the map, the pose is NaN and its variances are infinite, as the
+    localizer says. If it has said nothing for longer than the parameter ``patience`` (s), the status is `LOST`.
     """
 
     __slots__ = NO_DICT
@@ -179,7 +184,9 @@ class PresentPose(LeafSystem):
         estimate = self.DeclareDiscreteState(np.array([0.0, *first.pose, *first.covariance.ravel(), first.status]))
         self.DeclareStateOutputPort("pose_estimate", estimate)
         index = int(estimate)
+        patience = self.DeclareNumericParameter(BasicVector([_PATIENCE]))
         self.variables = (
+            parameter("patience", int(patience), unit="s", bounds=(0.0, inf)),
             discrete_state("time", index, unit="s"),
             discrete_state("position", index, start=1, shape=(2,), unit="m"),
             discrete_state("heading", index, start=3, unit="rad"),
@@ -191,7 +198,10 @@ class PresentPose(LeafSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         motion, pose, covariance, status, X_OH, time = (port.Eval(context) for port in self._ports.values())
         now = context.get_time()
-        if np.isfinite(covariance).all():
+        if np.isfinite(covariance).all() and now - time[0] > context.get_numeric_parameter(0).value()[0]:
+            lost = Localization.unknown(LOST)
+            pose, covariance, status = lost.pose, lost.covariance, [lost.status]
+        elif np.isfinite(covariance).all():
             since, _, _, x, y, heading, speed, turn_rate = motion.tolist()
             turn = turn_rate * (now - since)
             way = speed * (now - since)

@@ -20,7 +20,7 @@ from vtbdrake.components.world_model import WorldModel
 from vtbdrake.scan import Scan
 from vtbdrake.state import discrete_state
 from vtbdrake.testbed import VirtualTestbedBuilder
-from vtbdrake_diagrams.forest.dps import PERIOD
+from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 
 SCAN_PERIOD = 0.2
@@ -33,13 +33,19 @@ _FINE = 20  # Steps of the motion per period.
 
 @cache
 def motion() -> np.ndarray:
-    """The pose [x, y, heading] of the carrier, which moves along x_B, in steps of PERIOD / _FINE, and its speed."""
+    """The pose [x, y, heading] of the carrier in steps of PERIOD / _FINE, its velocity along x_B, y_B, and turn rate.
+
+    The middle of its rear axle moves along x_B.
+    """
     times = np.arange(0.0, 60.0, PERIOD / _FINE)
-    speed = 1.2 * np.clip((times - 0.6) / 1.0, 0.0, 1.0)
-    heading = 0.8 + 0.5 * np.sin(0.4 * np.maximum(times - 0.6, 0.0))
+    moving = np.maximum(times - 0.6, 0.0)
+    speed = 1.2 * np.clip(moving, 0.0, 1.0)
+    heading, rate = 0.8 + 0.5 * (1.0 - np.cos(0.4 * moving)), 0.2 * np.sin(0.4 * moving)
     step = PERIOD / _FINE
     x, y = (np.concatenate([[0.0], np.cumsum(f(heading[:-1]) * speed[:-1] * step)]) for f in (np.cos, np.sin))
-    return np.column_stack([40.0 + x, 35.0 + y, heading, speed])
+    return np.column_stack([
+        40.0 + x - AXLE * np.cos(heading), 35.0 + y - AXLE * np.sin(heading), heading, speed, -AXLE * rate, rate,
+    ])  # fmt: skip
 
 
 def pose(time: float) -> np.ndarray:
@@ -60,10 +66,9 @@ class Ride(LeafSystem):
         - scan
     """
 
-    def __init__(self, trees: WorldModel, *, blind: tuple[float, float], broken: int, clock: float) -> None:
+    def __init__(self, scenario: RidingScenario) -> None:
         super().__init__()
-        self._trees, self._blind, self._broken = map_landmarks(trees).positions, blind, broken
-        self._clock = clock
+        self._scenario, self._trees = scenario, map_landmarks(scenario.truth()).positions
         imu = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
         odometry = self.DeclareDiscreteState(1)
         scan = self.DeclareAbstractState(Value(Scan.empty()))
@@ -76,19 +81,19 @@ class Ride(LeafSystem):
         tick = round(context.get_time() / PERIOD)
         now, before = (motion()[max(k, 0) * _FINE] for k in (tick, tick - 1))
         rate = (now[2] - before[2]) / PERIOD
-        inward = rate * (now[3] + before[3]) / 2.0
+        change, (ahead, aside) = (now[3:5] - before[3:5]) / PERIOD, (now[3:5] + before[3:5]) / 2.0
         numbers = state.get_mutable_discrete_state()
-        sample = [0.0, 0.0, rate, (now[3] - before[3]) / PERIOD, inward, 9.81, now[3]]
-        if self._broken >= 0 and 100 <= tick < 105:
-            sample[self._broken] = np.nan
+        sample = [0.0, 0.0, rate, change[0] - rate * aside, change[1] + rate * ahead, 9.81, now[3]]
+        if self._scenario.broken >= 0 and 100 <= tick < 105:
+            sample[self._scenario.broken] = np.nan
         numbers.set_value(0, sample[:6])
         numbers.set_value(1, sample[6:])
-        if tick and tick % round(SCAN_PERIOD / PERIOD) == 0:
+        if tick and tick % round(SCAN_PERIOD / PERIOD) == 0 and tick * PERIOD < self._scenario.dead_from:
             state.get_mutable_abstract_state(0).set_value(self._scan(tick))
 
     def _scan(self, tick: int) -> Scan:
         time, rng = tick * PERIOD, np.random.default_rng([7, tick])
-        if self._blind[0] <= time < self._blind[1]:
+        if self._scenario.blind_from <= time < self._scenario.blind_until:
             return Scan.empty(stamp=time)
         places = transform(inverse(pose(time)), self._trees)
         places = places[np.linalg.norm(places, axis=1) < RANGE]
@@ -101,7 +106,7 @@ class Ride(LeafSystem):
         points = np.column_stack([seen, np.full(len(seen), 1.3)]) - X_BL.translation()
         points[:, :2] += NOISE * rng.normal(size=(len(points), 2))
         ranges = np.linalg.norm(points, axis=1)
-        return Scan(points / ranges[:, None], ranges, times, time + (self._clock if tick >= 100 else 0.0))
+        return Scan(points / ranges[:, None], ranges, times, time + (self._scenario.clock if tick >= 100 else 0.0))
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,8 @@ class RidingScenario(ForestScenario):
     """The localization unit on a ride.
 
     Its scans are empty from ``blind_from`` to ``blind_until`` (s). From 2 s on, five samples of the entry ``broken`` of
-    IMU and odometry (0 to 6) are NaN, and the scanner's clock is ahead by ``clock`` (s). With another ``stand_seed``,
+    IMU and odometry (0 to 6) are NaN, and the scanner's clock is ahead by ``clock`` (s). From ``dead_from`` (s) on, the
+    scanner sends nothing. With another ``stand_seed``,
     the carrier is in another stand than the one on the map.
     """
 
@@ -130,6 +136,7 @@ class RidingScenario(ForestScenario):
     blind_until: float = 0.0
     broken: int = -1
     clock: float = 0.0
+    dead_from: float = 1e3
     stand_seed: int = 3
 
     def truth(self) -> WorldModel:
@@ -146,7 +153,7 @@ class RidingScenario(ForestScenario):
         return replace(super().unit(world_map), submap_length=5.0, try_every=(0.5, 0.5))
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        ride = Ride(self.truth(), blind=(self.blind_from, self.blind_until), broken=self.broken, clock=self.clock)
+        ride = Ride(self)
         builder.add("sense", "ride", ride)
         for signal in ("imu", "odometry", "scan"):
             builder.sim_sensor(signal, ride.GetOutputPort(signal))

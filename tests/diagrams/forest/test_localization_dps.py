@@ -123,6 +123,19 @@ def test_without_trees_in_sight_the_unit_is_lost_and_recovers() -> None:
     assert error(testbed, context)[0] < 0.1
 
 
+def test_when_the_scanner_is_silent_the_unit_is_lost() -> None:
+    testbed = built(dead_from=2.0)
+    context = testbed.default_context()
+    testbed.write(context, {f"{POSE}.patience": 1.0})
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(2.7)
+    assert testbed.read(context, f"{POSE}.status") == TRACKING
+    assert error(testbed, context)[0] < 0.05
+    simulator.AdvanceTo(3.0)
+    assert testbed.read(context, f"{POSE}.status") == LOST
+    assert np.isnan(testbed.read(context, f"{POSE}.position")).all()
+
+
 @pytest.mark.parametrize("broken", [2, 6])
 def test_numbers_that_are_not_finite_do_no_harm(broken: int) -> None:
     testbed = built(broken=broken)
