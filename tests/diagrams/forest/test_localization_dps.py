@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 
 from tests.diagrams.forest.riding import SCAN_PERIOD, RidingScenario, pose
 from tests.visualization.meshcat_page import messages
+from vtbdrake.components.localization.dead_reckoning import DeadReckoning
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
@@ -34,11 +35,13 @@ from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveWatch
 from vtbdrake.recording import read_log
 from vtbdrake.recording.replay import replay
+from vtbdrake.scan import Scan
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.carrier import Carrier
 from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
+from vtbdrake_diagrams.forest.perception import Localizer
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 
 POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
@@ -165,6 +168,37 @@ def test_clock_of_the_scanner_may_jump(clock: float) -> None:
     testbed.simulator(context).AdvanceTo(4.0)
     assert testbed.read(context, f"{POSE}.status") == TRACKING
     assert error(testbed, context)[0] < 0.05
+
+
+def anything() -> dict[str, np.ndarray]:
+    """Return points that no forest would give, in L."""
+    rng = np.random.default_rng(1)
+    return {
+        "nothing": np.zeros((0, 3)),
+        "one point": np.array([[5.0, 0.0, 0.0]]),
+        "one point often": np.tile([5.0, 1.0, 0.0], (500, 1)),
+        "a trunk": np.column_stack([np.full(500, 6.0), np.full(500, 1.0), np.linspace(-2.0, 3.0, 500)]),
+        "a wall": np.column_stack([np.full(5000, 8.0), rng.uniform([-20.0, -2.0], [20.0, 5.0], (5000, 2))]),
+        "flat ground": np.column_stack([rng.uniform(-20.0, 20.0, (5000, 2)), np.full(5000, -2.0)]),
+        "a cloud": 15.0 * rng.normal(size=(20_000, 3)),
+        "stars": 1e4 * rng.normal(size=(2000, 3)),
+    }
+
+
+@pytest.mark.parametrize("kind", [ForestScenario, PlainScenario])
+def test_scans_of_anything_are_no_place_and_no_error(kind: type[CarrierScenario]) -> None:
+    scenario = kind(**SMALL, map="poor")
+    localizer = Localizer(scenario.sight(), scenario.unit(scenario.global_map()))
+    reckoning = DeadReckoning(period=PERIOD)
+    history = reckoning.GetOutputPort("history").Eval(reckoning.CreateDefaultContext())
+    for name, points in anything().items():
+        ranges = np.linalg.norm(points, axis=1)
+        scan = Scan(points / ranges[:, None], ranges, np.zeros(len(points)), 0.0)
+        memory = localizer.unit.start()
+        for k in range(3):
+            time = np.array([0.2 * k])
+            shown, memory = localizer(scan=scan, scan_time=time, request=time, history=history, memory=memory)
+            assert shown["status"] == [SEARCHING], name
 
 
 @pytest.mark.parametrize(
