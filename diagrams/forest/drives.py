@@ -35,7 +35,7 @@ from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUn
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
-from vtbdrake_diagrams.forest.stand import MAPS, Stand
+from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
 Array = NDArray[np.float64]
 
@@ -285,6 +285,25 @@ def nees_bounds(count: int) -> tuple[float, float]:
         return 0.0, np.inf
     low, high = (chi2(3 * count).ppf([0.025, 0.975]) / count).tolist()
     return low, high
+
+
+def shared_displacement(errors: MapErrors, *, size: float = 100.0) -> float:
+    """Return the RMS displacement in m, in the plane, of a whole map by what the errors of its trees have in common.
+
+    It is sqrt(2) s sqrt(c), where s is the standard deviation of the map per axis and c the mean correlation of the
+    errors of two places, exp(-r^2 / (2 L^2)), over the square that the map shows. Nothing that is seen or travelled
+    within the map tells of it, so that no estimate of the position has a smaller error in the mean.
+
+    Args:
+        errors: The errors of the map.
+        size: The side of the square in m.
+    """
+    if errors.correlation == 0.0:
+        return 0.0
+    middles = (np.arange(400) + 0.5) / 400 * size
+    per_axis = np.exp(-0.5 * ((middles[:, np.newaxis] - middles) / errors.correlation) ** 2).mean()
+    # The correlation is a product of one factor per axis.
+    return float(np.sqrt(2.0) * errors.position * per_axis)
 
 
 def _rms(values: ArrayLike) -> float:

@@ -1,0 +1,114 @@
+"""Row C2 of the table of answers: how well the localization unit knows where it is, in simulation and over LCM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vtbdrake.components.localization.unit import TRACKING
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.testbed import DpsAlone
+from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.forest.dps import PERIOD
+from vtbdrake_diagrams.forest.drives import GOALS, SEED, Drives, Score, scores, shared_displacement
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stand import MAPS
+
+CYCLES = 150
+"""Cycles of the loop in lock-step with the process that sends the sensors' data."""
+PATIENCE = 60.0
+"""The longest time to wait for a result of the slow part, in s."""
+LARGEST_DIFFERENCE = 1e-3
+"""Of the pose over LCM from the simulated one, in m and rad: points travel with 32 bits."""
+JUDGED = ("accurate", "remote")
+"""The maps by which the row holds. Of the third, no estimate can reach the goal, see `shared_displacement`."""
+
+
+@dataclass(frozen=True)
+class OverLcm:
+    """What the unit says beside a machine, and in simulation at the same time.
+
+    Attributes:
+        is_tracking: Whether it tracks beside the machine.
+        difference: The largest difference of the two poses, in m or rad.
+    """
+
+    is_tracking: bool
+    difference: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the poses are the same."""
+        return self.is_tracking and self.difference < LARGEST_DIFFERENCE
+
+
+def over_lcm(scenario: ForestScenario, *, cycles: int = CYCLES) -> OverLcm:
+    """Run the DPS alone, fed over LCM by a process that simulates the sensors, and compare it with the simulation.
+
+    Args:
+        scenario: The carrier in its forest.
+        cycles: The number of cycles, in lock-step: the result does not depend on the load of this computer.
+    """
+    dps = DpsAlone(scenario)
+    context = dps.default_context()
+    with (
+        Hub(port=0) as hub,
+        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        scenario.deploy(
+            hub.url, target=dps, context=context, deployment=Deployment.of(scenario).in_lock_step("imu")
+        ) as loop,
+    ):
+        loop.take_over()
+        loop.run(cycles=cycles - loop.cycles, until=lambda: not loop.slow_parts.wait(PATIENCE))
+    testbed = scenario.build()
+    simulated = testbed.default_context()
+    testbed.simulator(simulated).AdvanceTo((cycles - 1) * PERIOD)
+    poses = [
+        np.append(system.read(of, "dps.env.pose.position"), system.read(of, "dps.env.pose.heading"))
+        for system, of in ((dps, context), (testbed, simulated))
+    ]
+    status = dps.read(context, "dps.env.pose.status")
+    return OverLcm(bool(status == TRACKING), float(np.abs(poses[0] - poses[1]).max()))
+
+
+def localization(full: bool) -> Answer:
+    """Answer C2: how well does the unit know where it is?
+
+    The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20.
+    """
+    drives = Drives(length=500.0 if full else 25.0)
+    found = scores(list(drives.through(range(SEED, SEED + (20 if full else 4)))))
+    machine = over_lcm(ForestScenario(seed=1, length=60.0, width=60.0))
+    accurate = found["accurate"]
+    return Answer(
+        id="C2",
+        question="How well does a localization unit, developed in a virtual forest, know where it is among the trees?",
+        answer=", ".join(f"{name} map {one.position:.3f} m" for name, one in found.items()),
+        unit="(RMS)",
+        interval=None,
+        paper="done on a harvester; no figures",
+        holds=machine.agrees and all(GOALS[name].is_met(found[name]) for name in JUDGED) and _is_careful(found),
+        note=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess. "
+        + "; ".join(_told(name, one) for name, one in found.items())
+        + f". What trees of the poor map share within 40 m shows nowhere: on 1 ha it moves the whole map by "
+        f"{shared_displacement(MAPS['poor']):.2f} m (RMS). Over LCM, fed by another process, "
+        + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
+    )
+
+
+def _is_careful(found: Mapping[str, Score]) -> bool:
+    """Return whether no claim was wrong, with any map."""
+    return not any(one.wrong for one in found.values())
+
+
+def _told(name: str, one: Score) -> str:
+    goal = "reached" if GOALS[name].is_met(one) else "NOT reached"
+    return (
+        f"{name}: {one.position:.3f} m (goal {GOALS[name].position:g} m), {np.degrees(one.heading):.2f} deg, NEES "
+        f"{one.independent_nees:.1f} in [{one.bounds[0]:.1f}, {one.bounds[1]:.1f}], a pose in {one.localized:.0%}, "
+        f"{one.wrong} wrong claims, goal {goal}"
+    )
