@@ -34,6 +34,7 @@ from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.dps import PERIOD
+from vtbdrake_diagrams.forest.perception import SETTLED
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
@@ -209,7 +210,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         simulator.AdvanceTo(due + 2.0 * PERIOD)
         taken, past = float(time(context)), history(context)
         rows.append((taken, truth, carrier_pose_at(past, taken)[3:]))
-        landmarks.append(see(scan(context), past, taken))
+        landmarks.append(see(scan(context), past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:
             travelled += float(np.hypot(*(truth - rows[-2][1])[:2]))
     times, truths, reckoned = (np.array(column) for column in zip(*rows, strict=True))

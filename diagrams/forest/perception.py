@@ -48,6 +48,9 @@ Array = NDArray[np.float64]
 # For how long dead reckoning alone is trusted to know the place, in s; assumed.
 _PATIENCE = 10.0
 
+SETTLED = 0.5
+"""Until when samples of the eyes count as seeing nothing, in s: the vertical that levels them must be known first."""
+
 SHOWN = 64
 """How many landmarks the port ``landmarks`` of the localizer shows at most: the nearest."""
 
@@ -105,12 +108,12 @@ class Localizer:
         """Return the outputs of the slow part, and the memory of the unit.
 
         ``seen`` holds the samples of the eyes and their times, such as ``scan`` and ``scan_time``. Samples of different
-        times do not fit together: then nothing is seen.
+        times do not fit together: then nothing is seen, nor before `SETTLED`.
         """
         times = [float(seen[f"{eye}_time"][0]) for eye in self.eyes]
-        taken, is_one = times[0], min(times) == max(times)
+        taken, sees = times[0], min(times) == max(times) >= SETTLED
         with _blas().limit(limits=1, user_api="blas"):
-            landmarks = self.see(*(seen[eye] for eye in self.eyes), history, taken) if is_one else Landmarks.empty()
+            landmarks = self.see(*(seen[eye] for eye in self.eyes), history, taken) if sees else Landmarks.empty()
             found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
         outputs = {
             "pose": found.pose,

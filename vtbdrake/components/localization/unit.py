@@ -170,10 +170,10 @@ class LocalizationUnit:
         submap = state.submap.moved(X_OH, C, length=self.submap_length).with_scan(landmarks)
         none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
         state = replace(state, answer=none, submap=submap)
-        if not (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any():
+        gathered = submap.landmarks()
+        if not len(gathered) or not (np.array([submap.distance, time]) - state.tried_at >= self.try_every).any():
             return none, state
         state = replace(state, tried_at=np.array([submap.distance, time]))
-        gathered = submap.landmarks()
         fix = self.locator.locate(gathered)
         if not fix.is_sure:
             return none, state
