@@ -154,6 +154,19 @@ def test_a_hidden_edge_is_not_taken_for_the_trunks_own():
     assert abs(trunks.diameters[far] - 0.4) < 2.5 * trunks.diameter_deviations[far]
 
 
+def test_hidden_edges_are_found_behind_the_carrier_too():
+    # Where azimuths jump from pi to -pi, in steps of less than a column of rays.
+    deviations = []
+    for bearing in [0.0, *np.pi + np.arange(-0.02, 0.08, 0.0025)]:
+        R = np.array([[np.cos(bearing), -np.sin(bearing)], [np.sin(bearing), np.cos(bearing)]])
+        places = EYE[:2] + np.array([[5.0, -0.2], [10.0, -0.2]]) @ R.T
+        points, _ = Scene(places, np.array([0.2, 0.4])).scan(EYE, noise=0.02, turn=bearing)
+        trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+        (far,) = np.flatnonzero(np.linalg.norm(trunks.positions - EYE[:2], axis=1) > 8.0)
+        deviations.append(trunks.diameter_deviations[far])
+    np.testing.assert_allclose(deviations, deviations[0], rtol=0.02)
+
+
 def test_branches_beside_a_trunk_do_not_widen_it():
     # Of one row each, 15 cm to both sides of the trunk, at its distance.
     place = EYE[:2] + np.array([4.0, 0.0])

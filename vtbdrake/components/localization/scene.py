@@ -148,11 +148,11 @@ class Clusters:
             elevation_step: Angle between neighbouring rows in rad.
             gap: By how much it is nearer than the points of the cluster, in m, (n,).
         """
-        columns, lowest = int(2.0 * pi / azimuth_step) + 1, self.scene.slopes.min()
+        columns, lowest = max(round(2.0 * pi / azimuth_step), 1), self.scene.slopes.min()
         lines = int((self.scene.slopes.max() - lowest) / elevation_step) + 1
         line = ((self.scene.slopes - lowest) / elevation_step).astype(np.intp)
         nearest = np.full(columns * lines, inf)
-        column = ((self.scene.azimuths + pi) / azimuth_step).astype(np.intp) % columns
+        column = np.floor((self.scene.azimuths + pi) / azimuth_step).astype(np.intp) % columns
         np.minimum.at(nearest, column * lines + line, self.scene.distances)
         limits, line = self.distances - gap, line[self.rows]
         sides = []
@@ -160,7 +160,7 @@ class Clusters:
             edge = extreme.reduceat(self.azimuths, self.starts) + self.bearings
             before = np.zeros(len(self.rows), dtype=bool)
             for beyond in (1.0, 2.0):
-                column = ((edge + sign * beyond * azimuth_step + pi) / azimuth_step).astype(np.intp) % columns
+                column = np.floor((edge + pi) / azimuth_step + sign * beyond).astype(np.intp) % columns
                 before |= nearest[column[self.owners] * lines + line] < limits
             sides.append(self.sums(before.astype(float)) > _HIDDEN * self.counts)
         return np.stack(sides, axis=1)
