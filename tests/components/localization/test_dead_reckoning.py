@@ -204,6 +204,18 @@ def test_scans_outside_of_the_history_use_its_ends():
     assert deskewed(Scan.empty(), history, RigidTransform(), time=1.0).shape == (0, 3)
 
 
+def test_long_periods_leave_enough_poses_to_correct_scans():
+    scan = Scan([[1.0, 0.0, 0.0]], [4.0], [-1.5], 0.0)
+    history = np.zeros(history_size(3.0))
+    history[[0, POSE]] = 3.0, 0.0
+    history[3] = 2.0
+    assert DeadReckoning(period=3.0).GetOutputPort("history").size() == len(history) == 2 * POSE
+    # Half way between both poses, the carrier was a metre further back.
+    np.testing.assert_allclose(deskewed(scan, history, RigidTransform(), time=3.0), [[3.0, 0.0, 0.0]], atol=1e-12)
+    with pytest.raises(ValueError, match="at least 2 poses, not 1"):
+        deskewed(scan, history[:POSE], RigidTransform(), time=3.0)
+
+
 def test_drift_grows_as_a_random_walk_does():
     drift, steps, length, turn, T_step = DriftModel(0.05, 0.03, 0.01, 0.04), 40, 0.25, 0.02, 0.1
     rng = np.random.default_rng(7)

@@ -274,8 +274,8 @@ def _cross(a: list[float], b: list[float]) -> list[float]:
 
 
 def history_size(period: float) -> int:
-    """Return the size of the port ``history`` of a `DeadReckoning` with this period in s."""
-    return POSE * ceil(HISTORY_LENGTH / period - 1e-6)
+    """Return the size of the port ``history`` of a `DeadReckoning` with this period in s: two poses at least."""
+    return POSE * max(ceil(HISTORY_LENGTH / period - 1e-6), 2)
 
 
 def carrier_pose_at(history: ArrayLike, time: float) -> Array:
@@ -314,8 +314,13 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
         history: The port ``history`` of a `DeadReckoning`, newest first.
         X_BL: Pose of the scanner in B.
         time: When the scan was complete, by the clock of the DPS, in s.
+
+    Raises:
+        ValueError: The history has fewer than two poses.
     """
     knots = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
+    if len(knots) < 2:
+        raise ValueError(f"deskewing needs a history of at least 2 poses, not {len(knots)}: see `history_size`")
     fired = time + scan.times
     first, last = (fired.min(), fired.max()) if len(fired) else (time, time)
     # Only the knots around the scan, at least two.
@@ -328,7 +333,7 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
     # Between which knots a ray was fired, and where between them; before the first and after the last, at these.
     place = np.interp(fired, knots[:, 0], np.arange(len(knots)))
-    segments = np.minimum(place.astype(int), max(len(knots) - 2, 0))
+    segments = np.minimum(place.astype(int), len(knots) - 2)
     share = (place - segments)[:, np.newaxis]
     order = np.argsort(segments, kind="stable")
     p_BQ = (scan.points() @ X_BL.rotation().matrix().T + X_BL.translation())[order]

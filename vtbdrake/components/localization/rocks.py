@@ -120,7 +120,7 @@ def _outlines(clusters: Clusters, detector: RockDetector, origin: Array) -> Land
     hidden = clusters.hidden_edges(
         azimuth_step=step,
         elevation_step=detector.elevation_step,
-        gap=np.full(len(clusters.rows), detector.cell + 4.0 * detector.range_noise),
+        gap=detector.cell + 4.0 * detector.range_noise,
     )
     good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1)
     good &= (width >= detector.least_width) & (width <= detector.largest_width)

@@ -140,13 +140,13 @@ class Clusters:
         total: Array = np.add.reduceat(values, self.starts, axis=0)
         return total
 
-    def hidden_edges(self, *, azimuth_step: float, elevation_step: float, gap: Array) -> NDArray[np.bool_]:
+    def hidden_edges(self, *, azimuth_step: float, elevation_step: float, gap: float) -> NDArray[np.bool_]:
         """Return whether something nearer begins where a cluster ends, to the right and to the left, (k, 2).
 
         Args:
             azimuth_step: Angle between neighbouring rays of a row in rad.
             elevation_step: Angle between neighbouring rows in rad.
-            gap: By how much it is nearer than the points of the cluster, in m, (n,).
+            gap: By how much it is nearer than the points of the cluster, in m.
         """
         columns, lowest = max(round(2.0 * pi / azimuth_step), 1), self.scene.slopes.min()
         lines = int((self.scene.slopes.max() - lowest) / elevation_step) + 1

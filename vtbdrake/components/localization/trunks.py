@@ -60,9 +60,6 @@ class TrunkDetector:
         azimuth_step: Angle between neighbouring rays of a row in rad.
         elevation_step: Angle between neighbouring rows in rad.
         range_noise: Standard deviation of a range in m.
-        range_noise_growth: What is added to its variance, as a standard deviation that grows with the square of the
-            distance, in 1/m: 0 for a scanner; for a stereo camera, the deviation of the disparity divided by focal
-            length and baseline.
         roughness: Standard deviation of the surface of a trunk from a cylinder in m: bark, ovality.
         reach: Distance in m from the scanner up to which trunks are looked for.
         heights: The lower and the upper end of the slice over the ground in m.
@@ -88,7 +85,6 @@ class TrunkDetector:
     azimuth_step: float = 2.0 * pi / 1250
     elevation_step: float = pi / 6.0 / 16
     range_noise: float = 0.02
-    range_noise_growth: float = 0.0
     roughness: float = 0.005
     reach: float = 25.0
     heights: tuple[float, float] = (0.7, 2.7)
@@ -111,7 +107,6 @@ class TrunkDetector:
             "azimuth_step": (0.0 < self.azimuth_step < 0.1, "in rad, above 0 and below 0.1"),
             "elevation_step": (0.0 < self.elevation_step < 0.5, "in rad, above 0 and below 0.5"),
             "range_noise": (0.0 < self.range_noise < inf, "in m, positive"),
-            "range_noise_growth": (0.0 <= self.range_noise_growth < inf, "in 1/m, at least 0"),
             "roughness": (0.0 <= self.roughness < inf, "in m, at least 0"),
             "reach": (0.0 < self.reach <= 200.0, "in m, positive and at most 200"),
             "heights": (0.0 < low < high < inf, "in m, two positive heights, the lower one first"),
@@ -193,13 +188,12 @@ class _Fit:
     def __init__(self, clusters: Clusters, heights: Array, detector: TrunkDetector) -> None:
         """Prepare the fit; ``heights`` are those of the n points over the reference height in m."""
         self._clusters, self._heights, self._detector = clusters, heights, detector
-        growth = detector.range_noise_growth * clusters.distances**2
-        self._variances = detector.range_noise**2 + detector.roughness**2 + growth**2
+        self._variance = detector.range_noise**2 + detector.roughness**2
         self._cosines, self._sines = np.cos(clusters.azimuths), np.sin(clusters.azimuths)
         self._hidden = clusters.hidden_edges(
             azimuth_step=detector.azimuth_step,
             elevation_step=detector.elevation_step,
-            gap=detector.cell + _GATE * np.sqrt(self._variances),
+            gap=detector.cell + _GATE * self._variance**0.5,
         )
         self._columns = self._persistent()
         self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
@@ -260,7 +254,7 @@ class _Fit:
         x, y, r, lx, ly = cylinders[self._clusters.owners].T
         z = self._heights
         beside = np.abs((y + ly * z) * self._cosines - (x + lx * z) * self._sines)
-        limits = _GATE**2 * (self._variances + (_DEPTH * r) ** 2)
+        limits = _GATE**2 * (self._variance + (_DEPTH * r) ** 2)
         return self._columns & (errors**2 < limits) & (
             beside < r + self._detector.azimuth_step * x
         ), errors**2 * weights
@@ -275,7 +269,7 @@ class _Fit:
         tangent = sine / cosine
         dx, dy = c - tangent * s, s + tangent * c
         errors = self._clusters.distances - (x * c + y * s - r * cosine)
-        return errors, cosine**2 / self._variances, np.stack([dx, dy, -1.0 / cosine, dx * z, dy * z], axis=1)
+        return errors, cosine**2 / self._variance, np.stack([dx, dy, -1.0 / cosine, dx * z, dy * z], axis=1)
 
     def _edges(self, lean: Array, distance: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array, Array]:
         """Return what the azimuths of the points say of the k trunks.
@@ -320,7 +314,7 @@ class _Fit:
         known = _information(*self._constraints(cylinders, on)[1:])
         inverse = np.linalg.inv(self._clusters.sums(weighted[:, :, None] * derivatives[:, None, :]) + known)
         # The covariance of the gradient: grazing rays have less weight than their variance would give them.
-        spread = self._clusters.sums(weighted[:, :, None] * weighted[:, None, :] * self._variances[:, None, None])
+        spread = self._clusters.sums(weighted[:, :, None] * weighted[:, None, :] * self._variance)
         covariances: Array = inverse @ (spread + known) @ inverse
         return covariances
 
