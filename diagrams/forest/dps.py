@@ -116,7 +116,7 @@ def _make_env(
     builder.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
     reckoning = builder.AddNamedSystem("dead_reckoning", DeadReckoning(period=PERIOD, axle=AXLE))
     part = add_localizer(builder, reckoning, localizer, eyes, period=PERIOD, latency=latency)
-    pose = builder.AddNamedSystem("pose", PresentPose(period=PERIOD, drift=drift))
+    pose = builder.AddNamedSystem("pose", PresentPose(period=PERIOD, drift=drift, axle=AXLE))
     builder.Connect(reckoning.GetOutputPort("motion"), pose.GetInputPort("motion"))
     for port in ("pose", "covariance", "status", "odometry", "time"):
         builder.Connect(part.GetOutputPort(port), pose.GetInputPort(port))

@@ -166,7 +166,7 @@ class PresentPose(LeafSystem):
 
     ``motion`` is that of a `DeadReckoning`; the other inputs are those of the slow part ``localizer``: the pose X_WH
     (3,) with its covariance (9,), the status, and the pose X_OH (3,) and the time (s) for which they hold. With the
-    present pose in O, which continues with the last speed and turn rate until the time of the update,
+    present pose in O, which continues with the last speed and turn rate of the axle until the time of the update,
 
         X_WH(now) = X_WH X_OH^-1 X_OH(now),
 
@@ -177,10 +177,16 @@ class PresentPose(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float, drift: DriftModel) -> None:
-        """Declare the system, with the period of its updates in s, and how the dead reckoning drifts."""
+    def __init__(self, *, period: float, drift: DriftModel, axle: float) -> None:
+        """Declare the system.
+
+        Args:
+            period: That of its updates in s.
+            drift: How the dead reckoning drifts.
+            axle: Where on x_B the point is that does not move sideways, in m, as in `DeadReckoning`.
+        """
         super().__init__()
-        self._drift = drift
+        self._drift, self._axle = drift, axle
         sizes = {"motion": MOTION, "pose": 3, "covariance": 9, "status": 1, "odometry": 3, "time": 1}
         self._ports = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
         first = Localization.unknown()
@@ -208,7 +214,8 @@ class PresentPose(LeafSystem):
             since, _, _, x, y, heading, speed, turn_rate = motion.tolist()
             turn = turn_rate * (now - since)
             way = speed * (now - since)
-            X_OH_now = compose([x, y, heading], [way * np.cos(turn / 2), way * np.sin(turn / 2), turn])
+            X_OA_now = compose([x, y, heading], [self._axle + way * np.cos(turn / 2), way * np.sin(turn / 2), turn])
+            X_OH_now = compose(X_OA_now, [-self._axle, 0.0, 0.0])
             X_HH_now = compose(inverse(X_OH), X_OH_now)
             pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - float(time[0]))
         state.set_value(0, [now, *pose, *covariance.ravel(), status[0]])

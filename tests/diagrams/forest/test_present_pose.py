@@ -32,15 +32,16 @@ def test_covariance_is_carried_along_as_derivatives_say() -> None:
 
 
 def test_pose_goes_on_with_the_last_motion() -> None:
-    """On a circle, with the localizer's answer for where the carrier was half a second before."""
-    speed, rate, then, known, period = 1.5, 0.5, 0.5, 0.96, 0.02
+    """The axle is on a circle, and the localizer's answer is for where the carrier was half a second before."""
+    speed, rate, then, known, period, axle = 1.5, 0.5, 0.5, 0.96, 0.02, -2.0
 
     def on_circle(time: float) -> np.ndarray:
         angle = rate * time
-        return np.array([speed / rate * np.sin(angle), speed / rate * (1.0 - np.cos(angle)), angle])
+        p_OA = speed / rate * np.array([np.sin(angle), 1.0 - np.cos(angle)])
+        return np.append(p_OA - axle * np.array([np.cos(angle), np.sin(angle)]), angle)
 
     builder = DiagramBuilder()
-    system = builder.AddSystem(PresentPose(period=period, drift=DriftModel()))
+    system = builder.AddSystem(PresentPose(period=period, drift=DriftModel(), axle=axle))
     X_OH = on_circle(known)
     inputs = {
         "motion": [known, 0.0, 0.0, *X_OH, speed, rate],
