@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
+from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.carrier import Carrier, standing_pose
 from vtbdrake_diagrams.forest.ground import Ground
@@ -34,57 +35,60 @@ def declare_belief(
     The carrier is where the DPS has localized it, at the height at which it stands there, tilted as it measures it; it
     rolls without slip. The driver is on the advised route, or else on the nearest one.
 
+    All of it is as old as the motion that the DPS has measured. The pose, which the DPS has for the present, is moved
+    back by this motion.
+
     Args:
         builder: Of the testbed.
         carrier: The carrier.
         ground: The elevation map of the DPS: that of the simulated ground.
         routes: The routes by number.
-        age: Of the estimates, in s.
+        age: Of the measured motion, in s.
 
     A carrier that is not localized has no belief: whoever asks for it gets a ValueError.
     """
     rear = carrier.wheel_base / 2.0
 
-    def pose(position: Array, heading: float, roll: float, pitch: float) -> list[float]:
-        _check(position)
-        height = standing_pose(carrier, ground, position=position, heading=float(heading)).translation()[2]
-        return [*position, height, float(roll), float(pitch), float(heading)]
+    def axle(position: Array, heading: float, speed: float, turn_rate: float) -> Array:
+        """Return where the middle of the rear axle was, which moves along x_B, and the heading then, (3,)."""
+        if not np.isfinite(position).all():
+            raise ValueError(
+                "the carrier is not localized, so that there is no belief of where it is: ask when dps.env.pose.status "
+                "says that it tracks"
+            )
+        X_WA = compose([*position, float(heading)], [-rear, 0.0, 0.0])
+        way, turn = age * float(speed), age * float(turn_rate)
+        return compose(X_WA, inverse([way * np.cos(turn / 2.0), way * np.sin(turn / 2.0), turn]))
 
-    def velocity(heading: float, roll: float, pitch: float, speed: float, turn_rate: float) -> Array:
-        R_WB = RollPitchYaw(float(roll), float(pitch), float(heading)).ToRotationMatrix().matrix()
+    def pose(position: Array, heading: float, speed: float, turn_rate: float, roll: float, pitch: float) -> list[float]:
+        x, y, yaw = compose(axle(position, heading, speed, turn_rate), [rear, 0.0, 0.0]).tolist()
+        height = standing_pose(carrier, ground, position=[x, y], heading=yaw).translation()[2]
+        return [x, y, height, float(roll), float(pitch), yaw]
+
+    def velocity(heading: float, speed: float, turn_rate: float, roll: float, pitch: float) -> Array:
+        yaw = float(heading) - age * float(turn_rate)
+        R_WB = RollPitchYaw(float(roll), float(pitch), yaw).ToRotationMatrix().matrix()
         # The estimated speed is that of the middle of the rear axle, which does not move sideways.
         return np.concatenate([[0.0, 0.0, float(turn_rate)], R_WB @ [float(speed), float(turn_rate) * rear, 0.0]])
 
     def curvature(speed: float, turn_rate: float) -> float:
         return float(turn_rate) / float(speed) if abs(float(speed)) > _SLOW else 0.0
 
-    def axle(position: Array, heading: float) -> Array:
-        """Return the middle of the rear axle, which the driver leads along the route."""
-        return np.asarray(position) - rear * np.array([np.cos(heading), np.sin(heading)]).ravel()
-
-    def route(position: Array, heading: float, advised: float) -> float:
-        _check(position)
-        place = axle(position, heading)
+    def route(position: Array, heading: float, speed: float, turn_rate: float, advised: float) -> float:
+        place = axle(position, heading, speed, turn_rate)[:2]
         off = [route.distances(place).item() for route in routes]
         number = min(max(round(float(advised)), 0), len(routes) - 1)
         return float(number if off[number] < _OFF else np.argmin(off))
 
-    def along(position: Array, heading: float, advised: float) -> float:
-        return routes[int(route(position, heading, advised))].nearest(axle(position, heading))
+    def along(position: Array, heading: float, speed: float, turn_rate: float, advised: float) -> float:
+        number = int(route(position, heading, speed, turn_rate, advised))
+        return routes[number].nearest(axle(position, heading, speed, turn_rate)[:2])
 
     tilt = ("dps.env.dead_reckoning.roll", "dps.env.dead_reckoning.pitch")
     base = "sim.sys.carrier.base"
-    builder.believe(f"{base}.pose", of=[*_PLACE, *tilt], by=pose, age=age)
-    builder.believe(f"{base}.velocity", of=[_PLACE[1], *tilt, *_MOTION], by=velocity, age=age)
+    builder.believe(f"{base}.pose", of=[*_PLACE, *_MOTION, *tilt], by=pose, age=age)
+    builder.believe(f"{base}.velocity", of=[_PLACE[1], *_MOTION, *tilt], by=velocity, age=age)
     builder.believe("sim.act.wheels.speed", of=_MOTION[:1], age=age)
     builder.believe("sim.act.wheels.curvature", of=_MOTION, by=curvature, age=age)
-    builder.believe("sim.act.driver.route", of=[*_PLACE, _ADVICE], by=route, age=age)
-    builder.believe("sim.act.driver.along", of=[*_PLACE, _ADVICE], by=along, age=age)
-
-
-def _check(position: Array) -> None:
-    if not np.isfinite(position).all():
-        raise ValueError(
-            "the carrier is not localized, so that there is no belief of where it is: ask when dps.env.pose.status "
-            "says that it tracks"
-        )
+    builder.believe("sim.act.driver.route", of=[*_PLACE, *_MOTION, _ADVICE], by=route, age=age)
+    builder.believe("sim.act.driver.along", of=[*_PLACE, *_MOTION, _ADVICE], by=along, age=age)
