@@ -14,7 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 
 from vtbdrake.components.localization.constellation import ConstellationMap
-from vtbdrake.components.localization.dead_reckoning import DriftModel
+from vtbdrake.components.localization.dead_reckoning import HISTORY_LENGTH, DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector
@@ -147,6 +147,7 @@ class CarrierScenario(Scenario):
             localizer_latency=(self.localizer_latency >= PERIOD, f"at least {PERIOD:g} s, the period of the DPS"),
         )
         try:
+            self.check_eyes()
             self.ground()
             for name in ("scanner_errors", "imu_errors", "odometry_errors"):
                 getattr(self, name).check(f"{type(self).__name__}.{name}")
@@ -188,6 +189,21 @@ class CarrierScenario(Scenario):
             GeoJsonError: The file is no map.
         """
         return load_geojson(self.map_file) if self.map_file else self.surveyed_map()
+
+    def check_eyes(self) -> None:
+        """Raise a ValueError if the DPS cannot see landmarks with its scanner.
+
+        Raises:
+            ValueError: A value that no scanner can have, or a scan that takes too long.
+        """
+        self.scanner.check(PERIOD)
+        # Half of what the DPS remembers, as a scan may wait for the one before it.
+        least = 2.0 / HISTORY_LENGTH
+        if self.scanner.frequency < least:
+            raise ValueError(
+                f"scanner.frequency must be at least {least:g} Hz, not {self.scanner.frequency:g}: the DPS remembers "
+                f"the motion of the last {HISTORY_LENGTH:g} s"
+            )
 
     def eyes(self) -> list[Signal]:
         """Return the signals of what the DPS sees landmarks with."""
@@ -246,7 +262,8 @@ class CarrierScenario(Scenario):
         self.add_landscape(plant)
         base = add_carrier(plant, carrier, self.X_BL)
         route = routes[self.route]
-        X_WB = standing_pose(carrier, ground, position=route.position(self.start), heading=route.heading(self.start))
+        start = self.start % route.length
+        X_WB = standing_pose(carrier, ground, position=route.position(start), heading=route.heading(start))
         plant.SetDefaultFloatingBaseBodyPose(base, X_WB)
         plant.Finalize()
 
@@ -260,7 +277,7 @@ class CarrierScenario(Scenario):
             speed=self.speed,
             laps=self.laps,
             route=self.route,
-            along=self.start,
+            along=start,
         )
         builder.add("act", "driver", driver)
         for system in (wheels, driver):
@@ -325,7 +342,6 @@ class ForestScenario(CarrierScenario):
         )
         super().validate()
         try:
-            self.stereo.check()
             self.vegetation()
         except ValueError as error:
             raise ScenarioError(f"{type(self).__name__}: {error}") from None
@@ -360,6 +376,12 @@ class ForestScenario(CarrierScenario):
 
         textured = self.perception == "stereo"
         add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
+
+    def check_eyes(self) -> None:
+        if self.perception == "scanner":
+            super().check_eyes()
+        else:
+            self.stereo.check()
 
     def eyes(self) -> list[Signal]:
         if self.perception == "scanner":

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp, pi
+from math import exp, inf, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +68,11 @@ class MapErrors:
     def __post_init__(self) -> None:
         if not 0.0 <= self.missing <= 1.0 or not 0.0 <= self.wrong < 1.0:
             raise ValueError(f"missing and wrong are shares from 0 to 1, not {self.missing} and {self.wrong}")
-        if min(self.position, self.diameter, self.correlation) < 0.0:
-            raise ValueError("position, diameter and correlation of a map's errors are at least 0")
+        if not all(0.0 <= value < inf for value in (self.position, self.diameter, self.correlation)):
+            raise ValueError(
+                "position, diameter and correlation of a map's errors are finite and at least 0, not "
+                f"{self.position}, {self.diameter} and {self.correlation}"
+            )
 
 
 # The maps by which localization is judged. The diameters of the accurate map are assumed to be 5 % off.
@@ -123,8 +126,9 @@ class Stand:
             raise ValueError(f"a stand is {', '.join(KINDS)}, not {self.kind!r}")
         if not 0.0 <= self.road_width <= 8.0:
             raise ValueError(f"strip roads are at most 8 m wide (0: no roads), not {self.road_width:g} m")
-        if not min(self.length, self.width, self.density, self.diameter_scale, self.diameter_shape) > 0.0:
-            raise ValueError("length, width, density, and scale and shape of the diameters of a stand are positive")
+        for name in ("length", "width", "density", "diameter_scale", "diameter_shape"):
+            if not 0.0 < getattr(self, name) < inf:
+                raise ValueError(f"{name} of a stand is positive and finite, not {getattr(self, name)!r}")
         if not 0.0 < self.least_diameter < self.largest_diameter:
             raise ValueError(
                 f"diameters lie between {self.least_diameter} and {self.largest_diameter} m: no such range"
@@ -132,7 +136,9 @@ class Stand:
         if self.kind == "plantation":
             return
         coverage = self.density / HECTARE * pi * self.spacing**2 / 4.0
-        if self.spacing < 0.0 or coverage > _LARGEST_COVERAGE:
+        if not self.spacing >= 0.0:
+            raise ValueError(f"trees are at least 0 m apart, not {self.spacing!r} m")
+        if coverage > _LARGEST_COVERAGE:
             largest = 2.0 * (_LARGEST_COVERAGE * HECTARE / self.density / pi) ** 0.5
             raise ValueError(
                 f"{self.density:g} trees/ha find no place at random {self.spacing:g} m apart: "

@@ -58,6 +58,8 @@ class StereoConfig:
                 "a pair of cameras has a positive rate, a field of view between 0 and pi rad and no negative noise, "
                 f"not {self.rate:g}, {self.field_of_view:g} and {self.noise:g}"
             )
+        if min(self.width, self.height) < 1:
+            raise ValueError(f"images have at least one pixel, not {self.width} x {self.height}")
         self.camera()
         self.matcher()
 

@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.ray_casting import Hits, RayCaster
-from vtbdrake.components.sensors.laser_scanner import raster
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster
 from vtbdrake.components.world_model import (
     LocalFrame,
     Quantity,
@@ -237,6 +238,16 @@ def test_drive_continues_exactly_from_a_fork(drive: tuple[VirtualTestbed, list[S
     assert not testbed.snapshot(other).compare(testbed.snapshot(context))
 
 
+def test_start_beyond_a_round_is_no_round_driven() -> None:
+    scenario = ForestScenario(length=40.0, width=40.0)
+    length = scenario.routes()[0].length
+    testbed = replace(scenario, start=length + 5.0, laps=1).build()
+    context = testbed.default_context()
+    assert testbed.read(context, "sim.act.driver.along") == pytest.approx(5.0)
+    testbed.simulator(context).AdvanceTo(0.05)
+    assert testbed.read(context, "sim.act.driver.wanted_speed") == 1.0
+
+
 def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
     scenario = ForestScenario(seed=2, map="exact")
     truth = {tuple(p) for p in scenario.truth().positions()[:, :2].tolist()}
@@ -261,6 +272,8 @@ def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
         ({"undergrowth": -1.0}, "bushes per hectare"),
         ({"lean": 0.5}, "lean by a standard deviation within"),
         ({"laps": 0}, "laps must be at least 1"),
+        ({"scanner": LaserScannerConfig(frequency=0.0)}, "frequency must be in scans per s, above 0"),
+        ({"scanner": LaserScannerConfig(frequency=1.0)}, "scanner.frequency must be at least 2 Hz, not 1"),
     ],
 )
 def test_impossible_fields_are_refused(fields: dict[str, object], message: str) -> None:

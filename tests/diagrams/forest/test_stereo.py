@@ -111,8 +111,9 @@ def test_trials_count_errors_in_pixels() -> None:
         ({"stereo": StereoConfig(baseline=0.0)}, "baseline .* positive"),
         ({"stereo": StereoConfig(largest_disparity=20)}, "multiple of 16 pixels, not 20"),
         ({"stereo": StereoConfig(rate=0.0)}, "positive rate"),
+        ({"stereo": StereoConfig(width=0)}, "at least one pixel, not 0 x 240"),
     ],
 )
 def test_fields_that_cannot_be_are_refused(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
-        ForestScenario(**fields).build()
+        ForestScenario(**{"perception": "stereo", **fields}).build()
