@@ -1,0 +1,14 @@
+"""The notebook `forest` runs, and is stored as it runs. One file each, so that notebooks run side by side."""
+
+import pytest
+
+from tests.notebooks.checks import check_runs, check_stored
+
+
+def test_is_stored_with_text_and_plots() -> None:
+    check_stored("forest")
+
+
+@pytest.mark.slow
+def test_runs_in_a_shorter_version() -> None:
+    check_runs("forest", shorter={"length=30.0": "length=4.0", "cycles=200": "cycles=60"})
