@@ -1,0 +1,204 @@
+"""Where should the carrier drive next to be localized best? It asks its own testbed, and the true forest answers.
+
+A stand of clusters has places where many trees are on the map and places with few. The unit has found itself on a
+remote map, and chooses among the routes: the reasoner simulates each in a mental copy, whose forest is the map of the
+DPS, and takes the one along which the DPS would know its position best. Then every route is driven in the true forest,
+from the same state, and the errors tell whether the choice was good.
+
+``python -m vtbdrake_diagrams.forest.next_route [--forests N]`` prints, for each forest, the expected deviations and the
+errors of all routes. What counts was fixed before the first result was seen: the mean over the last `COUNTED` s.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import vtbdrake as vtb
+from vtbdrake.cli.output import table
+from vtbdrake.components.world_model import WorldModel
+from vtbdrake.reasoning import Decision, Reasoner
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stand import MAPS, Stand
+
+Array = NDArray[np.float64]
+
+SEED = 400_000
+ROUTE = "u.route"
+POSE = "sim.sys.carrier.base.pose"
+POSITION, COVARIANCE = "dps.env.pose.position", "dps.env.pose.covariance"
+FOUND = 3.0
+"""When the carrier is asked, in s: it has found itself by then."""
+HORIZON = 40.0
+"""How far ahead it looks, in s."""
+COUNTED = 25.0
+"""Of the horizon, the last s in which the quality counts: the routes have parted by then."""
+SAMPLE_PERIOD = 0.5
+TIME_LIMIT = 600.0
+"""Of one rollout, in s: it takes about a third of the horizon on an idle core, and far more on a busy one."""
+UNKNOWN = 2.0
+"""The deviation and the error of a carrier without a pose, in m [assumed]."""
+
+
+@dataclass(frozen=True)
+class MappedStand(Stand):
+    """A stand as a map shows it: the trees are where the map has them. Its own map is the same.
+
+    Attributes:
+        errors: The name of the errors of the map, see `MAPS`.
+        map_seed: Determines these errors, together with the seed of the stand.
+    """
+
+    errors: str = "accurate"
+    map_seed: int = 0
+
+    def trees(self) -> WorldModel:
+        own = {item.name: getattr(self, item.name) for item in fields(Stand)}
+        return Stand(**own).map(MAPS[self.errors], seed=self.map_seed)
+
+
+@dataclass
+class RouteScenario(ForestScenario):
+    """A carrier in a clustered stand that may think about where to drive next."""
+
+    stand_kind: str = "clustered"
+    density: float = 300.0
+    map: str = "remote"
+    speed: float = 2.0
+    # Whether the simulated forest is that of the map, without clutter: what the carrier imagines.
+    is_imagined: bool = field(default=False, kw_only=True)
+
+    def mental(self) -> RouteScenario:
+        """Return what the carrier simulates when it reasons."""
+        own = {item.name: getattr(self, item.name) for item in fields(self)}
+        return RouteScenario(**{**own, "is_imagined": True, "undergrowth": 0.0, "branches": 0.0, "lean": 0.0})
+
+    def stand(self) -> Stand:
+        true = super().stand()
+        if not self.is_imagined:
+            return true
+        own = {item.name: getattr(true, item.name) for item in fields(Stand)}
+        return MappedStand(**own, errors=self.map, map_seed=self.map_seed)
+
+    def surveyed_map(self) -> WorldModel:
+        return super().stand().map(MAPS[self.map], seed=self.map_seed)
+
+
+def deviation(time: float, covariance: Array) -> float:
+    """Return the standard deviation of the position in m, in the plane; 0 before the time that counts.
+
+    Args:
+        time: In s.
+        covariance: Of the pose, (3, 3); infinite without a pose.
+    """
+    if time < FOUND + HORIZON - COUNTED:
+        return 0.0
+    variance = float(covariance[0, 0] + covariance[1, 1])
+    return min(variance**0.5, UNKNOWN) if np.isfinite(variance) else UNKNOWN
+
+
+def route_reasoner(scenario: RouteScenario, **options: Any) -> Reasoner:
+    """Return the reasoner of the carrier, which decides on the next route."""
+    count = len(scenario.routes())
+    return Reasoner(
+        scenario=scenario,
+        decision=[vtb.Choice(ROUTE, [float(number) for number in range(count)])],
+        quality=vtb.Quality(deviation, of=["time", COVARIANCE], reading="integral", minimize=True),
+        horizon=HORIZON,
+        sample_period=SAMPLE_PERIOD,
+        method="grid",
+        budget=vtb.Budget(rollouts=count + 1),
+        time_limit=TIME_LIMIT,
+        **options,
+    )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A decision, and what came of every route.
+
+    Attributes:
+        decision: The carrier's.
+        expected: The mean deviation of the position along each route in its mind, in m, shape (n,).
+        errors: The root mean square error of the position along each route in the true forest, in m, shape (n,).
+    """
+
+    decision: Decision
+    expected: Array
+    errors: Array
+
+    @property
+    def chosen(self) -> int:
+        """The number of the route that was chosen; that in use if nothing is set."""
+        return round(float(self.decision.values.get(ROUTE, 0.0)))
+
+    @property
+    def rank(self) -> int:
+        """How many routes have a smaller error than the one that was chosen."""
+        return int((self.errors < self.errors[self.chosen]).sum())
+
+
+def decide_and_drive(seed: int) -> Choice:
+    """Let the carrier decide in the forest of a seed, and drive every route in the true forest.
+
+    Raises:
+        ValueError: The carrier has not found itself: it has no belief.
+    """
+    scenario = RouteScenario(seed=seed)
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(FOUND)
+    with route_reasoner(scenario) as reasoner:
+        decision = reasoner.decide(testbed, context)
+    start = testbed.snapshot(context)
+    problem = vtb.Problem(
+        scenario=scenario,
+        parameters=[vtb.Parameter(ROUTE, 0.0, len(scenario.routes()) - 1.0)],
+        quality=vtb.Quality(squared_error, of=["time", POSITION, POSE], reading="integral", minimize=True),
+        horizon=HORIZON,
+        sample_period=SAMPLE_PERIOD,
+        start=start,
+    )
+    numbers = range(len(scenario.routes()))
+    sweep = problem.sweep(values=[(float(number),) for number in numbers], progress=False)
+    expected = np.full(len(numbers), np.nan)
+    for candidate in decision.candidates[1:]:
+        if candidate.rollouts:
+            expected[round(float(candidate.values[ROUTE]))] = candidate.rollouts[0].value / COUNTED
+    errors = np.sqrt([rollout.value / COUNTED for rollout in sweep.rollouts])
+    return Choice(decision, expected, errors)
+
+
+def squared_error(time: float, position: Array, truth: Array) -> float:
+    """Return the squared error of the position in m^2; 0 before the time that counts."""
+    if time < FOUND + HORIZON - COUNTED:
+        return 0.0
+    error = float(((np.asarray(position) - np.asarray(truth)[:2]) ** 2).sum())
+    return min(error, UNKNOWN**2) if np.isfinite(error) else UNKNOWN**2
+
+
+def main() -> None:
+    """Decide in some forests, and print what was expected and what came."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--forests", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=SEED)
+    chosen = parser.parse_args()
+    for seed in range(chosen.seed, chosen.seed + chosen.forests):
+        found = decide_and_drive(seed)
+        rows = [
+            (f"{number}{' (chosen)' if number == found.chosen else ''}", f"{expected:.3f}", f"{error:.3f}")
+            for number, (expected, error) in enumerate(zip(found.expected, found.errors, strict=True))
+        ]
+        print(table(("route", "expected m", "error m"), rows))
+        print(f"forest {seed}: {found.rank} routes would have been better\n", flush=True)
+
+
+if __name__ == "__main__":
+    # Under its own name, so that worker processes find its functions.
+    from vtbdrake_diagrams.forest.next_route import main as program
+
+    program()

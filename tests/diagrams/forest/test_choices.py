@@ -1,0 +1,68 @@
+"""Tests of the choices of a scanner and of a route: what counts, and that the testbed is asked as it should be."""
+
+import numpy as np
+import pytest
+
+from vtbdrake_diagrams.forest.next_route import (
+    COUNTED,
+    FOUND,
+    HORIZON,
+    UNKNOWN,
+    RouteScenario,
+    deviation,
+    squared_error,
+)
+from vtbdrake_diagrams.forest.scanner_choice import (
+    BEAMS,
+    HEIGHTS,
+    SETTLING,
+    ScannerAnswer,
+    plot_answer,
+    position_error,
+    scanner_problem,
+)
+from vtbdrake_diagrams.forest.scanner_choice import UNKNOWN as FAR
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+
+TRUTH = np.array([3.0, 4.0, 0.5, 0.0, 0.0, 1.0])
+
+
+def test_error_counts_from_when_the_pose_has_settled() -> None:
+    assert position_error(SETTLING - 0.1, np.zeros(2), TRUTH) == 0.0
+    assert position_error(SETTLING, np.array([3.3, 4.4]), TRUTH) == pytest.approx(0.5)
+    assert position_error(SETTLING, np.full(2, np.nan), TRUTH) == FAR
+
+
+def test_the_best_scanner_has_the_least_mean_error() -> None:
+    errors = np.full((len(HEIGHTS), len(BEAMS), 2), 0.03)
+    errors[1, 2] = [0.0, 0.04]
+    # Not the least in one forest, but in the mean.
+    errors[0, 0] = [0.01, 0.05]
+    answer = ScannerAnswer(errors)
+    assert answer.best == (HEIGHTS[1], BEAMS[2])
+    assert len(plot_answer(answer).axes) == 2
+
+
+def test_problem_has_the_number_of_beams() -> None:
+    problem = scanner_problem(BEAMS[0], seeds=[3, 4])
+    assert problem.scenario.scanner.rows == BEAMS[0] != ForestScenario().scanner.rows
+    assert [condition["scenario.seed"] for condition in problem.conditions] == [3, 4]
+
+
+def test_imagined_forest_is_that_of_the_map() -> None:
+    scenario = RouteScenario(seed=2, length=60.0, width=60.0)
+    mental = scenario.mental()
+    imagined, mapped = (model.positions() for model in (mental.truth(), scenario.global_map()))
+    np.testing.assert_array_equal(imagined, mapped)
+    np.testing.assert_array_equal(mental.global_map().positions(), mapped)
+    assert len(scenario.truth()) != len(mapped)
+    assert mental.undergrowth == 0.0 and mental.mental() == mental
+
+
+def test_routes_are_judged_after_they_have_parted() -> None:
+    late = FOUND + HORIZON - COUNTED
+    assert deviation(late - 1.0, np.eye(3)) == 0.0
+    assert deviation(late, np.diag([0.09, 0.16, 1.0])) == pytest.approx(0.5)
+    assert deviation(late, np.diag([np.inf, np.inf, np.inf])) == UNKNOWN
+    assert squared_error(late, np.array([3.3, 4.4]), TRUTH) == pytest.approx(0.25)
+    assert squared_error(late, np.full(2, np.nan), TRUTH) == UNKNOWN**2
