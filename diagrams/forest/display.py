@@ -45,7 +45,9 @@ _LOOKS = {
     LOST: ("lost", Rgba(0.84, 0.37, 0.0, 1.0)),
 }
 _TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.4)
-_TRUNK_HEIGHT, _LETTERS = 1.5, 1.0
+_TRUNK_HEIGHT, _LETTERS, _MARKER = 1.5, 1.0, 0.25
+# Where the carrier is seen from, in m, and how bright all is.
+_VIEW, _AMBIENT = (0.0, -14.0, 26.0), 3.0
 
 
 class DriverDisplay:
@@ -53,7 +55,7 @@ class DriverDisplay:
 
     The carrier stands where the pose says, with the ellipse of its position (`DEVIATIONS`) around it and the landmarks
     of the last scan as cylinders. Without a pose there are neither: the status stands where the last pose was, or in
-    the middle of the map.
+    the middle of the map. All is moved so that this place stays in the middle of the view, north up.
     """
 
     def __init__(self, meshcat: Meshcat, world_map: WorldModel) -> None:
@@ -66,10 +68,13 @@ class DriverDisplay:
         self._meshcat = meshcat
         self._status: int | None = None
         self._landmarks = self._shown = 0
-        show_world_model(meshcat, world_map, prefix="display/map", deviations=0.0, label_height=0.0)
-        middle = world_map.positions().mean(axis=0)
-        self._place = middle
-        meshcat.SetCameraPose(middle + np.array([0.0, -25.0, 45.0]), middle)
+        show_world_model(meshcat, world_map, prefix="display/map", marker=_MARKER, deviations=0.0, label_height=0.0)
+        self._place = world_map.positions().mean(axis=0)
+        meshcat.SetCameraPose(_VIEW, np.zeros(3))
+        for color in ("top_color", "bottom_color"):
+            meshcat.SetProperty("/Background", color, [1.0, 1.0, 1.0])
+        meshcat.SetProperty("/Grid", "visible", False)
+        meshcat.SetProperty("/Lights/AmbientLight/<object>", "intensity", _AMBIENT)
         meshcat.SetObject("display/carrier/body", Box(2.5, 1.5, 1.0), _LOOKS[TRACKING][1])
         meshcat.SetObject("display/carrier/ahead", Box(1.5, 0.15, 0.15), _LOOKS[TRACKING][1])
         meshcat.SetTransform("display/carrier/ahead", RigidTransform([2.0, 0.0, 0.0]))
@@ -90,6 +95,7 @@ class DriverDisplay:
             self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], known[COVARIANCE][:2, :2]))
         self._show_landmarks(known[FOUND_AT], known[LANDMARKS].reshape(-1, 3))
         self._show_status(status)
+        self._meshcat.SetTransform("display", RigidTransform(-self._place))
 
     def _show_landmarks(self, X_WH: Array, landmarks: Array) -> None:
         """Draw landmarks, rows of [x, y (m, in H), diameter (m)], where they were seen from the pose X_WH."""

@@ -318,7 +318,7 @@ def drawn(meshcat: Meshcat, kind: str) -> dict[str, Any]:
         m for m in messages(meshcat.StaticHtml()) if m["type"] == kind and m.get("property", "visible") == "visible"
     ]
     value = {"set_transform": lambda m: np.reshape(m["matrix"], (4, 4)).T, "set_property": lambda m: m["value"]}[kind]
-    return {m["path"].removeprefix("/drake/display/"): value(m) for m in found}
+    return {m["path"].removeprefix("/drake/display").removeprefix("/"): value(m) for m in found}
 
 
 def test_display_follows_the_pose(drive: Drive) -> None:
@@ -336,6 +336,8 @@ def test_display_follows_the_pose(drive: Drive) -> None:
         assert np.linalg.norm(X_WH[:2, 3] - truth[:2]) < 0.1
         assert np.arctan2(X_WH[1, 0], X_WH[0, 0]) == pytest.approx(truth[2], abs=0.02)
         np.testing.assert_allclose(matrices["status"][:2, 3], X_WH[:2, 3])
+        # The carrier stays in the middle of the view.
+        np.testing.assert_allclose(matrices[""][:2, 3], -X_WH[:2, 3])
         # Nine of ten landmarks stand where a tree is; the others may be of the scan before.
         places = np.array([m[:2, 3] for path, m in matrices.items() if path.startswith("landmarks")])
         trees = map_landmarks(RidingScenario().truth()).positions
