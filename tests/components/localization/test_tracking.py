@@ -68,6 +68,23 @@ def test_a_scan_that_may_be_displaced_says_less_of_the_position():
     np.testing.assert_allclose(displaced - exact, np.diag([0.05**2, 0.05**2, 0.0]), atol=3e-5)
 
 
+def test_detections_that_are_displaced_together_are_matched():
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-10.0, 10.0, (12, 2))
+    exact = Landmarks(places, np.tile(1e-6 * np.eye(2), (12, 1, 1)), np.full(12, 0.3), np.full(12, np.inf))
+    scan = exact.seen_from([0.12, -0.09, 0.0])
+    surely = np.diag([0.01, 0.01, 0.001]) ** 2
+    for deviation, count in ((0.1, 12), (0.0, 0)):
+        tracker = Tracker(exact, scan_deviation=deviation)
+        state, matches = tracker.update(tracker.start(np.zeros(3), surely)[0], scan)
+        assert matches.is_fused == bool(count)
+        assert sum(i == j for i, j in matches.pairs) == count
+    # With it, the displacement is no motion of the carrier.
+    tracker = Tracker(exact, scan_deviation=0.1)
+    state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], scan)
+    np.testing.assert_allclose(state.pose, 0.0, atol=0.01)
+
+
 def test_fusing_the_map_in_each_scan_is_inconsistent():
     once, afresh = [], []
     for seed in range(8):
@@ -191,9 +208,19 @@ def test_the_state_stays_small_and_is_a_value():
         last.mean[0] = 1.0
 
 
-@pytest.mark.parametrize("settings", [{"gate": 1.0}, {"correlation": -1.0}, {"most": 0}, {"correlated_share": 1.0}])
-def test_impossible_settings_are_refused(settings):
-    with pytest.raises(ValueError, match="tracker|gate"):
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gate": 1.0}, "gate must be a share between 0 and 1, not 1.0"),
+        ({"correlation": -1.0}, "correlation must be in m, at least 0"),
+        ({"scan_deviation": -0.1}, "scan_deviation must be in m, at least 0"),
+        ({"least_deviation": np.nan}, "least_deviation must be in m, at least 0, not nan"),
+        ({"most": 0}, "most must be at least 1"),
+        ({"correlated_share": 1.0}, "correlated_share must be a share from 0 to below 1"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
         Tracker(drive(0, ACCURATE).map, **settings)
 
 

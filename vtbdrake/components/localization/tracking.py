@@ -20,6 +20,7 @@ are expected of new landmarks, too.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -189,6 +190,9 @@ class Tracker:
         credit: The largest evidence.
         first_credit: The evidence at the start: a wrong start ends sooner.
         largest_deviation: Of the position per axis, in m, until the track is lost.
+
+    Raises:
+        ValueError: The map is empty, or a value that no tracker can have.
     """
 
     landmarks: Landmarks
@@ -206,17 +210,33 @@ class Tracker:
     first_credit: float = 6.0
     largest_deviation: float = 2.0
     _tree: cKDTree = field(init=False, repr=False)
+    _largest_variance: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not len(self.landmarks):
             raise ValueError("the map of a tracker is empty: localization needs landmarks")
-        if not 0.0 < self.gate < 1.0 or not 0.0 <= self.correlated_share < 1.0:
-            raise ValueError(f"gate and correlated share lie in (0, 1), not {self.gate} and {self.correlated_share}")
-        if min(self.bias_deviation, self.least_deviation, self.correlation) < 0.0:
-            raise ValueError("deviations and the length of correlation of a tracker are at least 0")
-        if min(self.horizon, self.most, self.patience, self.credit, self.first_credit, self.largest_deviation) <= 0:
-            raise ValueError("horizon, largest values, patience and credits of a tracker are positive")
+        checks = {
+            "bias_deviation": (0.0 <= self.bias_deviation < inf, "in m, at least 0"),
+            "least_deviation": (0.0 <= self.least_deviation < inf, "in m, at least 0"),
+            "scan_deviation": (0.0 <= self.scan_deviation < inf, "in m, at least 0"),
+            "correlation": (0.0 <= self.correlation < inf, "in m, at least 0"),
+            "correlated_share": (0.0 <= self.correlated_share < 1.0, "a share from 0 to below 1"),
+            "gate": (0.0 < self.gate < 1.0, "a share between 0 and 1"),
+            "horizon": (self.horizon > 0.0, "in m, positive"),
+            "most": (self.most >= 1, "at least 1"),
+            "patience": (self.patience >= 1, "at least 1"),
+            "credit": (self.credit > 0.0, "positive"),
+            "first_credit": (self.first_credit > 0.0, "positive"),
+            "largest_deviation": (self.largest_deviation > 0.0, "in m, positive"),
+        }
+        for name, (good, expected) in checks.items():
+            if not good:
+                raise ValueError(f"Tracker: {name} must be {expected}, not {getattr(self, name)!r}")
         object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions))
+        # Of a detection beside that of the pose: of the map, the bias and the scan.
+        largest = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1].max()
+        deviations = (self.bias_deviation, self.least_deviation, self.scan_deviation)
+        object.__setattr__(self, "_largest_variance", float(largest + np.sum(np.square(deviations))))
 
     def start(
         self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | None = None
@@ -393,7 +413,7 @@ class Tracker:
         expected, H = self._expected(extended, rows)
         # Covariances of all expected detections with each other, (m, m, 2, 2).
         joint = _times(H, rows, _times_transpose(extended.covariance, H, rows))
-        joint = joint.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3)
+        joint = joint.reshape(len(rows), 2, len(rows), 2).transpose(0, 2, 1, 3) + self.scan_deviation**2 * np.eye(2)
         innovations = landmarks.positions[:, None] - expected
         spread = joint[np.arange(len(rows)), np.arange(len(rows))] + self._noise(landmarks)[:, None]
         squares = _squared_distance(innovations, spread)
@@ -404,7 +424,7 @@ class Tracker:
         nu, S = innovations[i, j], spread[i, j]
         best, determinant = _agreeing(i, j, nu, S, joint, threshold)
         diameter = self._diameter_cost(landmarks, i, extended.indices[rows][j])
-        cost = best + np.log(np.linalg.det(S)) + diameter
+        cost = best + np.log(determinant) + diameter
         value = np.zeros(squares.shape)
         is_possible = best < threshold
         value[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
@@ -412,7 +432,7 @@ class Tracker:
         is_pair = value[one, two] > 0.0
         one, two = one[is_pair], two[is_pair]
         density = np.zeros(squares.shape)
-        density[i, j] = np.exp(-0.5 * (best + diameter)) / (2.0 * np.pi * np.sqrt(determinant))
+        density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
         area = np.pi * max(1.0, float((landmarks.positions**2).sum(axis=1).max()))
         others = _OTHERS * len(landmarks) / area
         rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
@@ -426,9 +446,8 @@ class Tracker:
         """Return the landmarks of the map that can be within the gate of a detection."""
         places = transform(state.pose, landmarks.positions)
         P, levers = state.pose_covariance, (landmarks.positions**2).sum(axis=1)
-        largest = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1].max()
         own = np.trace(landmarks.covariances, axis1=1, axis2=2)
-        variances = largest + own + P[0, 0] + P[1, 1] + levers * P[2, 2] + self.bias_deviation**2
+        variances = own + P[0, 0] + P[1, 1] + levers * P[2, 2] + self._largest_variance
         reach = np.sqrt(chi_square_quantile(self.gate, 2) * variances)
         found = self._tree.query_ball_point(places, reach)
         return np.unique(np.array([index for one in found for index in one], dtype=np.int64))
@@ -487,7 +506,7 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     agreement = np.zeros((i.max() + 1, len(chosen)))
     np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
     best = np.argmax(agreement.sum(axis=0))
-    return squares[:, best], np.linalg.det(spread[:, best])
+    return squares[:, best], np.maximum(np.linalg.det(spread[:, best]), 1e-12)
 
 
 def _without(state: TrackState, dropped: NDArray[np.bool_]) -> TrackState:
