@@ -194,6 +194,22 @@ def test_ice_does_not_hold_the_carrier() -> None:
     # Friction mu accelerates by mu g at most.
     speed = np.linalg.norm(driving.velocity(simulator).translational())
     assert speed == pytest.approx(0.02 * 9.81 * 2.0, rel=0.1)
+    # A tyre that slides is deflected no farther than friction can hold it.
+    deflections = context.get_discrete_state(1).value().reshape(4, 2)
+    stiffness = Carrier().cornering * WEIGHT / 4.0 / Carrier().relaxation_length
+    forces = stiffness * np.linalg.norm(deflections, axis=1)
+    assert forces == pytest.approx(0.02 * driving.loads(simulator), rel=0.1)
+
+
+@pytest.mark.parametrize("curvature", [2.0, -2.0])
+def test_steering_has_a_stop_and_a_rate(curvature: float) -> None:
+    turning = world(controls=(0.5, curvature))
+    simulator = turning.simulator()
+    context = turning.wheels.GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(0.405)
+    assert context.get_discrete_state(0).value() == pytest.approx([0.205, np.copysign(0.205, curvature)])
+    simulator.AdvanceTo(2.0)
+    assert context.get_discrete_state(0).value() == pytest.approx([0.5, np.copysign(0.35, curvature)])
 
 
 def test_half_the_step_gives_the_same_drive() -> None:
@@ -217,6 +233,19 @@ def test_driver_follows_the_route_on_bumps() -> None:
         tilts.append(RollPitchYaw(driving.pose(simulator).rotation()).vector()[:2])
     assert max(off) < 0.5
     assert np.degrees(np.std(tilts, axis=0)).min() > 0.5
+
+
+def test_driver_looks_for_the_route_where_the_rear_axle_is() -> None:
+    driving = world(route=0, along=20.0)
+    route = strip_roads(100.0, 100.0)[0]
+    simulator = driving.simulator()
+    driver = driving.diagram.GetSubsystemByName("driver")
+    context = driver.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    context.SetDiscreteState(0, [0.0, 60.0, 0.0])
+    for time in (0.01, 4.0):
+        simulator.AdvanceTo(time)
+        rear = driving.pose(simulator) @ np.array([-0.8, 0.0, 0.0])
+        assert context.get_discrete_state(0).value()[1] == pytest.approx(route.nearest(rear[:2]), abs=0.25)
 
 
 def test_driver_stops_after_the_last_round() -> None:

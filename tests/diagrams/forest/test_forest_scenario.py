@@ -13,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.ray_casting import Hits, RayCaster
-from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster, raster_size
 from vtbdrake.components.world_model import (
     LocalFrame,
     Quantity,
@@ -25,7 +25,7 @@ from vtbdrake.components.world_model import (
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 from vtbdrake_diagrams.forest.stand import Stand
 from vtbdrake_diagrams.forest.vegetation import BREAST_HEIGHT, Vegetation, branches, crowns, trunks, undergrowth
 from vtbdrake_diagrams.forest.world import add_ground, add_surface
@@ -236,6 +236,27 @@ def test_drive_continues_exactly_from_a_fork(drive: tuple[VirtualTestbed, list[S
     testbed.simulator(other, restored=True).AdvanceTo(1.0)
     simulator.AdvanceTo(1.0)
     assert not testbed.snapshot(other).compare(testbed.snapshot(context))
+
+
+@pytest.mark.parametrize("make", [ForestScenario, PlainScenario])
+def test_detectors_know_the_angles_between_rays(make: type[CarrierScenario]) -> None:
+    scanner, accuracy = make().scanner, make().scanner_accuracy()
+    rays = raster(*raster_size(scanner), scanner.azimuth, scanner.elevation)
+    elevations, azimuths = np.arcsin(rays[:, 2]), np.arctan2(rays[:, 1], rays[:, 0])
+    assert np.diff(np.unique(elevations.round(9))) == pytest.approx(accuracy["elevation_step"])
+    assert np.diff(np.unique(azimuths.round(9))) == pytest.approx(accuracy["azimuth_step"])
+
+
+def test_unit_knows_the_errors_of_its_map_and_its_mast() -> None:
+    scenario = ForestScenario(seed=2, length=40.0, width=40.0, map="poor", scanner_forward=-0.5, scanner_height=3.0)
+    world_map = scenario.global_map()
+    unit, low = scenario.unit(world_map), replace(scenario, scanner_height=2.0).unit(world_map)
+    # Neighbours of the poor map share their errors over 40 m; see `MAPS`.
+    assert unit.tracker.correlation == unit.locator.correlation == 40.0
+    assert unit.tracker.sensor == (-0.5, 0.0)
+    # A vertical that is off displaces what is seen from a high mast.
+    assert unit.tracker.scan_deviation == pytest.approx(1.5 * low.tracker.scan_deviation)
+    assert low.tracker.scan_deviation > 0.0
 
 
 def test_start_beyond_a_round_is_no_round_driven() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
@@ -12,7 +13,8 @@ from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.unit import TRACKING
-from vtbdrake_diagrams.forest.perception import SHOWN, PresentPose, moved, shown
+from vtbdrake.scan import Scan
+from vtbdrake_diagrams.forest.perception import SHOWN, PresentPose, ScanLandmarks, moved, shown
 
 X_WH, MOTION = np.array([3.0, -2.0, 2.5]), np.array([1.2, 0.3, 0.4])
 C = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.001]])
@@ -60,7 +62,31 @@ def test_pose_goes_on_with_the_last_motion() -> None:
     assert estimate[0] == pytest.approx(1.0)
     expected = compose(X_WH, compose(inverse(on_circle(then)), on_circle(1.0)))
     np.testing.assert_allclose(estimate[1:4], expected, atol=1e-6)
-    assert np.trace(estimate[4:13].reshape(3, 3)) > np.trace(C)
+    # It has grown with the way of half a second, and with the time.
+    _, grown = moved(X_WH, C, compose(inverse(on_circle(then)), on_circle(1.0)), DriftModel(), 1.0 - then)
+    np.testing.assert_allclose(estimate[4:13].reshape(3, 3), grown, rtol=1e-6)
+
+
+def test_landmarks_are_seen_in_the_level_frame() -> None:
+    """A carrier that is tilted and turned sees a point of the world where it is in H."""
+    roll, pitch, heading, time = 0.1, -0.2, 0.7, 5.0
+    X_BL = RigidTransform(RollPitchYaw(0.0, 0.3, 0.0), [0.9, 0.1, 2.0])
+    X_HB = RigidTransform(RollPitchYaw(roll, pitch, 0.0), [0.0, 0.0, 0.0])
+    points_H = np.array([[8.0, 3.0, 0.5], [-2.0, 6.0, 1.0]])
+    points_L = (X_HB @ X_BL).inverse().multiply(points_H.T).T
+    ranges = np.linalg.norm(points_L, axis=1)
+    scan = Scan(points_L / ranges[:, None], ranges, np.zeros(2), time)
+    history = np.array([[t, roll, pitch, 4.0, -3.0, heading] for t in (5.02, 5.0, 4.98)]).ravel()
+    seen = {}
+
+    def detect(points: np.ndarray, settings: str, *, p_HoLo_H: np.ndarray) -> Landmarks:
+        seen.update(points=points, settings=settings, origin=p_HoLo_H)
+        return Landmarks.empty()
+
+    assert len(ScanLandmarks(detect, "settings", X_BL)(scan, history, time)) == 0
+    assert seen["settings"] == "settings"
+    np.testing.assert_allclose(seen["points"], points_H, atol=1e-12)
+    np.testing.assert_allclose(seen["origin"], (X_HB @ X_BL).translation(), atol=1e-12)
 
 
 def test_nearest_landmarks_are_shown() -> None:
