@@ -200,6 +200,19 @@ def test_new_frequency_takes_effect_with_the_next_scan() -> None:
     assert stamps == pytest.approx([0.4, 0.5, 0.6])
 
 
+def test_beams_that_change_in_a_scan_take_effect_with_the_next() -> None:
+    of = world(wall())
+    simulator = of.simulator(X_WT=at(4.5))
+    simulator.AdvanceTo(0.11)
+    of.write(simulator.get_mutable_context(), rows=4.0)
+    (before,) = world(wall()).scans(0.2, X_WT=at(4.5))
+    (after,) = world(wall(), config=replace(CONFIG, rows=4)).scans(0.2, X_WT=at(4.5))
+    for until, expected in ((0.21, before), (0.41, after)):
+        simulator.AdvanceTo(until)
+        directions = of.scan(simulator.get_context()).directions_L
+        np.testing.assert_array_equal(directions, expected.directions_L)
+
+
 def test_noise_is_that_of_the_error_model_and_repeatable() -> None:
     of = world(wall(), errors=ErrorModel(noise=0.02, bias=0.1, seed=3))
     scans = of.scans(1.0, X_WT=at(4.5))

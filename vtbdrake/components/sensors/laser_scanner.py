@@ -162,8 +162,8 @@ class LaserScanner(LeafSystem):
     firing time: these follow from poses and velocities at the end of the slice, which are taken as constant. So a
     moving target is distorted as in reality, up to a h^2 / 2 at an acceleration a in slices of length h. A scan is
     shown at the end of the slice in which it ends. A reader that is updated at the same instant by an unrestricted
-    update (a `SlowPart`) sees it one slice later. The frequency need not divide that of the slices. Frequency and rays
-    per second may be changed at any time, and take effect with the next scan.
+    update (a `SlowPart`) sees it one slice later. The frequency need not divide that of the slices. Frequency, rays
+    per second and rows may be changed at any time, and take effect with the next scan.
 
     A beam returns from a Lambertian surface that it hits at the distance r under the angle a of incidence. It is
     detected if the received power (Hoefle and Pfeifer, "Correction of laser scanning intensity data: data and
@@ -183,7 +183,7 @@ class LaserScanner(LeafSystem):
 
     The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
     ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``scan_rows``,
-    ``scan_columns`` and ``fired`` (rays) of the present scan are state.
+    ``scan_columns``, ``scan_by_columns`` and ``fired`` (rays) of the present scan are state.
     """
 
     __slots__ = NO_DICT
@@ -273,7 +273,8 @@ class LaserScanner(LeafSystem):
         self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
         self.codecs = {int(self._progress): _PROGRESS_CODEC}
         # Of the present scan; without rows, none has begun.
-        names = {"scan_start": "s", "scan_period": "s", "scan_rows": "1", "scan_columns": "1", "fired": "1"}
+        names = dict.fromkeys(("scan_start", "scan_period"), "s")
+        names |= dict.fromkeys(("scan_rows", "scan_columns", "scan_by_columns", "fired"), "1")
         self._present = int(self.DeclareDiscreteState(len(names)))
         self.DeclareStateOutputPort("scan", self._scan)
         return tuple(
@@ -289,7 +290,7 @@ class LaserScanner(LeafSystem):
         """Go on where a scanner stands that has shown ``scan`` last; the present scan begins anew."""
         context.SetAbstractState(self._scan, scan)
         context.SetAbstractState(self._progress, ScanInProgress())
-        context.SetDiscreteState(self._present, np.zeros(5))
+        context.SetDiscreteState(self._present, np.zeros(6))
 
     def _calc_settings(self, context: Context, output: Value) -> None:
         values = context.get_numeric_parameter(0).value()
@@ -302,12 +303,12 @@ class LaserScanner(LeafSystem):
         settings: _Settings = self.get_cache_entry(self._settings).Eval(context)
         now = context.get_time()
         start, period, *counts = context.get_discrete_state(self._present).value().tolist()
-        rows, columns, fired = map(int, counts)
+        rows, columns, by_columns, fired = map(int, counts)
         slices = context.get_abstract_state(int(self._progress)).get_value().slices
         # No scan has begun, or the context has been set to a later time.
         if not rows or start + (fired + 0.5) * period / (rows * columns) < now - 1.5 * self._slice_period:
-            start, period, (rows, columns) = now, 1.0 / settings.config.frequency, raster_size(settings.config)
-            slices, fired = (), 0
+            start, slices, fired = now, (), 0
+            period, rows, columns, by_columns = _next_scan(settings.config)
         tick = round(now / self._slice_period)
         generator = noise_generator(seed=int(settings.errors.seed), stream=self._stream, tick=tick, channel=_CHANNEL)
         while True:
@@ -315,7 +316,7 @@ class LaserScanner(LeafSystem):
             due = min(rays, int((now + _ROUNDING - start) / period * rays + 0.5))
             if due > fired:
                 config = settings.config
-                rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=config.rows > 0)
+                rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=bool(by_columns))
                 directions = rays_L[fired:due]
                 times = (np.arange(fired, due) + 0.5) * (period / rays)
                 kept, ranges = self._fire(context, settings, generator, directions, times + (start - now))
@@ -326,14 +327,10 @@ class LaserScanner(LeafSystem):
             returns = ScanInProgress(slices).returns()
             scan = Scan(returns[:, :3], returns[:, 3], np.minimum(returns[:, 4] - period, 0.0), start + period)
             state.get_mutable_abstract_state(int(self._scan)).set_value(scan)
-            start, period, (rows, columns) = (
-                start + period,
-                1.0 / settings.config.frequency,
-                raster_size(settings.config),
-            )
-            slices, fired = (), 0
+            start, slices, fired = start + period, (), 0
+            period, rows, columns, by_columns = _next_scan(settings.config)
         state.get_mutable_abstract_state(int(self._progress)).set_value(ScanInProgress(slices))
-        state.get_mutable_discrete_state().set_value(self._present, [start, period, rows, columns, fired])
+        state.get_mutable_discrete_state().set_value(self._present, [start, period, rows, columns, by_columns, fired])
         return EventStatus.Succeeded()
 
     def _fire(
@@ -398,6 +395,11 @@ def raster_size(config: LaserScannerConfig) -> tuple[int, int]:
     rays = config.rays_per_second / config.frequency
     rows = int(config.rows) or max(1, round(sqrt(rays * config.elevation / config.azimuth)))
     return rows, max(1, round(rays / rows))
+
+
+def _next_scan(config: LaserScannerConfig) -> tuple[float, int, int, bool]:
+    """Return the period of a scan that begins now (s), its rows and columns, and whether it goes column by column."""
+    return 1.0 / config.frequency, *raster_size(config), config.rows > 0
 
 
 @lru_cache(16)
