@@ -199,6 +199,8 @@ def test_maps_and_parameters_are_checked():
         ConstellationMap(landmarks([[0.0, 0.0], [1.0, 1.0]]))
     with pytest.raises(ValueError, match="share lies between 0 and 1"):
         ConstellationMap(landmarks(np.eye(3, 2)), share=1.0)
+    with pytest.raises(ValueError, match="correlation is finite and at least 0, .*, nan and 16"):
+        ConstellationMap(landmarks(np.eye(3, 2)), correlation=np.nan)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 40.0])

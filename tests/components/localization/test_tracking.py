@@ -4,6 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -83,6 +84,34 @@ def test_detections_that_are_displaced_together_are_matched():
     tracker = Tracker(exact, scan_deviation=0.1)
     state, _ = tracker.update(tracker.start(np.zeros(3), surely)[0], scan)
     np.testing.assert_allclose(state.pose, 0.0, atol=0.01)
+
+
+def test_pairs_that_are_improbable_together_are_dropped():
+    """Each may be right, but four errors of 3.3 deviations in one scan are too many."""
+    rng = np.random.default_rng(2)
+    places = np.array([[x, y] for x in (-9.0, -3.0, 3.0, 9.0) for y in (-4.0, 4.0)])
+    exact = Landmarks(places, np.tile(1e-8 * np.eye(2), (8, 1, 1)), np.full(8, 0.3), np.full(8, np.inf))
+    tracker = Tracker(exact, least_deviation=0.0, bias_deviation=1e-6)
+    surely = np.diag([1e-4, 1e-4, 1e-5]) ** 2
+    scan = Landmarks(places, np.tile(0.01**2 * np.eye(2), (8, 1, 1)), np.full(8, 0.3), np.full(8, np.inf))
+    state, matches = tracker.update(tracker.start(np.zeros(3), surely)[0], scan)
+    assert len(matches.pairs) == 8
+    angles = rng.uniform(0.0, 2.0 * np.pi, 4)
+    shifts = np.vstack([0.033 * np.column_stack([np.cos(angles), np.sin(angles)]), np.zeros((4, 2))])
+    displaced = Landmarks(places + shifts, scan.covariances, scan.diameters, scan.diameter_deviations)
+    _, matches = tracker.update(state, displaced)
+    assert 4 <= len(matches.pairs) < 8 and matches.is_fused
+    assert {4, 5, 6, 7} <= set(matches.pairs[:, 0])
+    assert 5.0 < matches.nis <= chi2.ppf(tracker.gate, 2 * len(matches.pairs))
+
+
+def test_an_uncertain_position_is_a_loss():
+    tracker = Tracker(drive(0, ACCURATE).map, largest_deviation=0.5)
+    state, _ = tracker.start(np.zeros(3), np.diag([0.1, 0.1, 0.0]) ** 2)
+    for way, is_lost in ((100.0, False), (300.0, True)):
+        motion = np.array([way, 0.0, 0.0])
+        # Along the way, its deviation is 0.03 m times the root of the metres.
+        assert tracker.is_lost(tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]))) == is_lost
 
 
 def test_fusing_the_map_in_each_scan_is_inconsistent():

@@ -125,6 +125,17 @@ def test_bad_times_and_poses_are_ignored_and_counted():
         unit.step(state, one.scans[0], X_OH=np.zeros(6), time=100.0)
 
 
+def test_impossible_settings_are_refused():
+    unit = unit_for(drive(3, ACCURATE, reach=18.0).map)
+    for settings, message in (
+        ({"submap_length": 0.0}, "submap_length .* is positive, in m, not 0.0"),
+        ({"try_every": (2.0, -1.0)}, r"distance .* and a time .* at least 0, not \(2"),
+        ({"try_every": (2.0, np.nan)}, r"distance .* and a time .* at least 0, not \(2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(unit, **settings)
+
+
 def test_no_trees_in_sight_is_no_error():
     one = drive(3, ACCURATE, reach=18.0)
     unit = unit_for(one.map)

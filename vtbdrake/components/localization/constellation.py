@@ -34,7 +34,7 @@ less the errors of a map are like that, the less its curvature says about its di
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log, pi
+from math import inf, log, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,9 +182,9 @@ class ConstellationMap:
     def __init__(self, landmarks: Landmarks, *, correlation: float = 0.0, share: float = 0.4, fewest: int = 16) -> None:
         if len(landmarks) < 3:
             raise ValueError(f"a constellation needs a map of at least 3 landmarks, not {len(landmarks)}")
-        if not 0.0 < share < 1.0 or correlation < 0.0 or fewest < 2:
+        if not (0.0 < share < 1.0 and 0.0 <= correlation < inf and fewest >= 2):
             raise ValueError(
-                "share lies between 0 and 1, correlation is at least 0 and fewest at least 2, "
+                "share lies between 0 and 1, correlation is finite and at least 0, and fewest at least 2, "
                 f"not {share}, {correlation} and {fewest}"
             )
         self.landmarks = landmarks

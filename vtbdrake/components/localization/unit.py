@@ -112,6 +112,9 @@ class LocalizationUnit:
         try_every: Metres travelled or seconds, whichever comes first, between matches without a guess.
         begins_with_submap: Whether tracking begins with all landmarks that were gathered, not with those of the last
             scan: for sensors of which one sample shows too few for a pose. Their errors are then taken as independent.
+
+    Raises:
+        ValueError: The length of the submap is not positive, or a distance or time between matches is negative.
     """
 
     locator: ConstellationMap
@@ -120,6 +123,14 @@ class LocalizationUnit:
     submap_length: float = 40.0
     try_every: tuple[float, float] = (2.0, 2.0)
     begins_with_submap: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.submap_length > 0.0:
+            raise ValueError(f"the submap_length of a localization unit is positive, in m, not {self.submap_length!r}")
+        if len(self.try_every) != 2 or not all(limit >= 0.0 for limit in self.try_every):
+            raise ValueError(
+                f"try_every of a localization unit is a distance (m) and a time (s), at least 0, not {self.try_every}"
+            )
 
     def start(self) -> UnitState:
         """Return the memory before the first scan."""
