@@ -4,7 +4,7 @@
 once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
 map localizes, as that of the DPS would. ``--simulated`` takes simulated detections (`detections`) instead.
 
-What counts, fixed before any result was seen:
+What counts, fixed before any of the forests from `SEED` on was driven:
 
 * Errors of position and heading are those of all scans at which the unit says that it is tracking, from the first fix
   to the end, over all forests; nothing is left out.
