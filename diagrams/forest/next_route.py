@@ -22,6 +22,7 @@ import vtbdrake as vtb
 from vtbdrake.cli.output import table
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
+from vtbdrake_diagrams.forest.scanner_choice import COMPARED, distance_off
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import MAPS, Stand
 
@@ -29,8 +30,7 @@ Array = NDArray[np.float64]
 
 SEED = 400_000
 ROUTE = "u.route"
-POSE = "sim.sys.carrier.base.pose"
-POSITION, COVARIANCE = "dps.env.pose.position", "dps.env.pose.covariance"
+COVARIANCE = "dps.env.pose.covariance"
 FOUND = 3.0
 """When the carrier is asked, in s: it has found itself by then."""
 HORIZON = 40.0
@@ -46,7 +46,7 @@ UNKNOWN = 2.0
 
 @dataclass(frozen=True)
 class MappedStand(Stand):
-    """A stand as a map shows it: the trees are where the map has them. Its own map is the same.
+    """A stand as a map shows it: the trees are where the map has them.
 
     Attributes:
         errors: The name of the errors of the map, see `MAPS`.
@@ -118,7 +118,7 @@ def route_reasoner(scenario: RouteScenario, **options: Any) -> Reasoner:
 
 
 @dataclass(frozen=True)
-class Choice:
+class RouteAnswer:
     """A decision, and what came of every route.
 
     Attributes:
@@ -142,7 +142,7 @@ class Choice:
         return int((self.errors < self.errors[self.chosen]).sum())
 
 
-def decide_and_drive(seed: int) -> Choice:
+def decide_and_drive(seed: int) -> RouteAnswer:
     """Let the carrier decide in the forest of a seed, and drive every route in the true forest.
 
     Raises:
@@ -158,7 +158,7 @@ def decide_and_drive(seed: int) -> Choice:
     problem = vtb.Problem(
         scenario=scenario,
         parameters=[vtb.Parameter(ROUTE, 0.0, len(scenario.routes()) - 1.0)],
-        quality=vtb.Quality(squared_error, of=["time", POSITION, POSE], reading="integral", minimize=True),
+        quality=vtb.Quality(squared_error, of=COMPARED, reading="integral", minimize=True),
         horizon=HORIZON,
         sample_period=SAMPLE_PERIOD,
         start=start,
@@ -170,15 +170,15 @@ def decide_and_drive(seed: int) -> Choice:
         if candidate.rollouts:
             expected[round(float(candidate.values[ROUTE]))] = candidate.rollouts[0].value / COUNTED
     errors = np.sqrt([rollout.value / COUNTED for rollout in sweep.rollouts])
-    return Choice(decision, expected, errors)
+    return RouteAnswer(decision, expected, errors)
 
 
-def squared_error(time: float, position: Array, truth: Array) -> float:
-    """Return the squared error of the position in m^2; 0 before the time that counts."""
+def squared_error(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
+    """Return the square of `distance_off` in m^2; 0 before the time that counts, and `UNKNOWN` squared at most."""
     if time < FOUND + HORIZON - COUNTED:
         return 0.0
-    error = float(((np.asarray(position) - np.asarray(truth)[:2]) ** 2).sum())
-    return min(error, UNKNOWN**2) if np.isfinite(error) else UNKNOWN**2
+    error = distance_off(time, position, told, truth, velocity)
+    return min(error, UNKNOWN) ** 2 if np.isfinite(error) else UNKNOWN**2
 
 
 def main() -> None:

@@ -40,17 +40,37 @@ BEAMS = (4, 8, 16, 32)
 """Numbers of beams, over the same field of view, with the same number of rays per second."""
 
 
-def position_error(time: float, position: Array, truth: Array) -> float:
-    """Return how far the pose of the DPS is from the true one, in m; 0 before `SETTLING`.
+COMPARED = (
+    "time",
+    "dps.env.pose.position",
+    "dps.env.pose.time",
+    "sim.sys.carrier.base.pose",
+    "sim.sys.carrier.base.velocity",
+)
+"""The addresses of the arguments of `position_error`."""
+
+
+def distance_off(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
+    """Return how far the position that the DPS tells is from the true one at that time, in m; NaN without a pose.
+
+    The DPS told it up to one of its periods ago. How far the carrier has come since then is no error.
 
     Args:
         time: In s.
         position: Of the DPS, (2,) in m; NaN without a pose.
+        told: The time for which it holds, in s.
         truth: The true pose of the carrier, (6,) in m and rad.
+        velocity: Its true velocity, angular (rad/s) and linear (m/s), (6,).
     """
+    place = np.asarray(truth)[:2] - (time - float(told)) * np.asarray(velocity)[3:5]
+    return float(np.hypot(*(np.asarray(position) - place)))
+
+
+def position_error(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
+    """Return `distance_off`, but 0 before `SETTLING`, and `UNKNOWN` if it is larger or if there is no pose."""
     if time < SETTLING:
         return 0.0
-    error = float(np.hypot(*(np.asarray(position) - np.asarray(truth)[:2])))
+    error = distance_off(time, position, told, truth, velocity)
     return min(error, UNKNOWN) if np.isfinite(error) else UNKNOWN
 
 
@@ -68,7 +88,7 @@ def scanner_problem(beams: int, *, seeds: Sequence[int]) -> vtb.Problem:
         parameters=[vtb.Parameter("scenario.scanner_height", min(HEIGHTS), max(HEIGHTS))],
         quality=vtb.Quality(
             position_error,
-            of=["time", "dps.env.pose.position", "sim.sys.carrier.base.pose"],
+            of=COMPARED,
             reading="integral",
             minimize=True,
         ),

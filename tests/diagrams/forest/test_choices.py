@@ -24,13 +24,15 @@ from vtbdrake_diagrams.forest.scanner_choice import (
 from vtbdrake_diagrams.forest.scanner_choice import UNKNOWN as FAR
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 
-TRUTH = np.array([3.0, 4.0, 0.5, 0.0, 0.0, 1.0])
+# The true pose and velocity, and the time of the pose of the DPS: the carrier has come 3 cm and 4 cm since then.
+TRUTH, VELOCITY, LAG = np.array([3.03, 4.04, 0.5, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0, 1.5, 2.0, 0.0]), 0.02
 
 
 def test_error_counts_from_when_the_pose_has_settled() -> None:
-    assert position_error(SETTLING - 0.1, np.zeros(2), TRUTH) == 0.0
-    assert position_error(SETTLING, np.array([3.3, 4.4]), TRUTH) == pytest.approx(0.5)
-    assert position_error(SETTLING, np.full(2, np.nan), TRUTH) == FAR
+    early, told = SETTLING - 0.1, SETTLING - LAG
+    assert position_error(early, np.zeros(2), early - LAG, TRUTH, VELOCITY) == 0.0
+    assert position_error(SETTLING, np.array([3.3, 4.4]), told, TRUTH, VELOCITY) == pytest.approx(0.5)
+    assert position_error(SETTLING, np.full(2, np.nan), told, TRUTH, VELOCITY) == FAR
 
 
 def test_the_best_scanner_has_the_least_mean_error() -> None:
@@ -64,5 +66,5 @@ def test_routes_are_judged_after_they_have_parted() -> None:
     assert deviation(late - 1.0, np.eye(3)) == 0.0
     assert deviation(late, np.diag([0.09, 0.16, 1.0])) == pytest.approx(0.5)
     assert deviation(late, np.diag([np.inf, np.inf, np.inf])) == UNKNOWN
-    assert squared_error(late, np.array([3.3, 4.4]), TRUTH) == pytest.approx(0.25)
-    assert squared_error(late, np.full(2, np.nan), TRUTH) == UNKNOWN**2
+    assert squared_error(late, np.array([3.3, 4.4]), late - LAG, TRUTH, VELOCITY) == pytest.approx(0.25)
+    assert squared_error(late, np.full(2, np.nan), late - LAG, TRUTH, VELOCITY) == UNKNOWN**2
