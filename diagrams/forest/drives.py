@@ -24,6 +24,7 @@ from multiprocessing import get_context
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
@@ -42,6 +43,8 @@ Array = NDArray[np.float64]
 
 INDEPENDENT = 100.0
 """Distance in m along the path from which on estimates count as independent."""
+REACH = 20.0
+"""Within this distance in m of the path, trees count as seen, see `least_error_along`; assumed."""
 STANDING = 2.0
 """How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
@@ -288,23 +291,38 @@ def nees_bounds(count: int) -> tuple[float, float]:
     return low, high
 
 
-def shared_displacement(errors: MapErrors, *, size: float = 100.0) -> float:
-    """Return the RMS displacement in m, in the plane, of a whole map by what the errors of its trees have in common.
+def least_error(errors: MapErrors, places: Array, *, noise: float = 0.02) -> float:
+    """Return the least RMS error in m, in the plane, of an unbiased estimate of the position by trees on a map.
 
-    It is sqrt(2) s sqrt(c), where s is the standard deviation of the map per axis and c the mean correlation of the
-    errors of two places, exp(-r^2 / (2 L^2)), over the square that the map shows. Nothing that is seen or travelled
-    within the map tells of it, so that no estimate of the position has a smaller error in the mean.
+    It is that of an estimate that knows the heading, and where the trees are around it, up to independent errors. What
+    the errors of the map have in common shows only in how they vary from place to place: with the covariances
+    C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis, where s is the standard deviation of the map, the
+    best linear estimate (Gauss and Markov) has the error sqrt(2 / (1' C^-1 1)).
 
     Args:
-        errors: The errors of the map.
-        size: The side of the square in m.
+        errors: Those of the map.
+        places: Where the trees are in m, shape (n, 2).
+        noise: Standard deviation in m, per axis, by which it is known where each tree is around the carrier [assumed].
     """
-    if errors.correlation == 0.0:
-        return 0.0
-    middles = (np.arange(400) + 0.5) / 400 * size
-    per_axis = np.exp(-0.5 * ((middles[:, np.newaxis] - middles) / errors.correlation) ** 2).mean()
-    # The correlation is a product of one factor per axis.
-    return float(np.sqrt(2.0) * errors.position * per_axis)
+    squares = ((places[:, np.newaxis] - places) ** 2).sum(axis=2)
+    shared = np.exp(-0.5 * squares / errors.correlation**2) if errors.correlation > 0.0 else np.eye(len(places))
+    C = errors.position**2 * shared + noise**2 * np.eye(len(places))
+    return float(np.sqrt(2.0 / np.linalg.solve(C, np.ones(len(places))).sum()))
+
+
+def least_error_along(drives: Mapping[int, Drive], errors: MapErrors) -> float:
+    """Return the RMS of `least_error` over drives, by the trees within `REACH` of each; no map lacks any of them.
+
+    Args:
+        drives: By the seed of the forest.
+        errors: Those of the map.
+    """
+    least = []
+    for seed, drive in drives.items():
+        places = forest(seed).truth().positions()[:, :2]
+        near = cKDTree(drive.truth[:, :2]).query(places)[0] < REACH
+        least.append(least_error(errors, places[near]))
+    return _rms(least)
 
 
 def _rms(values: ArrayLike) -> float:
@@ -433,8 +451,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.simulated)
-    found = []
-    for tracks in drives.through(range(chosen.seed, chosen.seed + chosen.forests), workers=chosen.workers):
+    found, seeds = [], range(chosen.seed, chosen.seed + chosen.forests)
+    for tracks in drives.through(seeds, workers=chosen.workers):
         found.append(tracks)
         told = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
         print(f"forest {len(found)}: {told}", flush=True)
@@ -442,6 +460,8 @@ def main() -> None:
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
     print(f"{len(found)} forests, {path:.0f} m of path, range bias {chosen.bias:g} m")
+    least = least_error_along({seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}, MAPS["poor"])
+    print(f"least error of an unbiased estimate on a poor map, by all trees within {REACH:g} m: {least:.2f} m")
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake_diagrams.forest.answers import over_lcm
-from vtbdrake_diagrams.forest.drives import shared_displacement
+from vtbdrake_diagrams.forest.drives import REACH, Drive, forest, least_error, least_error_along
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
@@ -16,13 +17,32 @@ def test_unit_over_lcm_finds_the_simulated_pose() -> None:
     assert found.difference > 0.0
 
 
-def test_displacement_is_that_of_maps() -> None:
-    errors = MapErrors(position=0.7, correlation=40.0)
-    means = []
-    for seed in range(100):
-        stand = Stand(seed=seed, density=100.0)
-        # Without missing and wrong trees, the sums of all positions differ by those of the errors.
-        means.append(stand.map(errors).positions()[:, :2].mean(axis=0) - stand.trees().positions()[:, :2].mean(axis=0))
+def test_least_error_is_that_of_generalized_least_squares() -> None:
+    """The mean of draws, weighted by their covariance: two trees, and the trees of a stand."""
+    two = np.array([[0.0, 0.0], [30.0, 0.0]])
+    errors, shared = MapErrors(position=0.7, correlation=40.0), np.exp(-(30.0**2) / (2.0 * 40.0**2))
+    # By symmetry, both count alike: each axis has the variance of the mean of both.
+    variance = 0.7**2 * (1.0 + shared) / 2.0 + 0.1**2 / 2.0
+    assert least_error(errors, two, noise=0.1) == pytest.approx(np.sqrt(2.0 * variance))
+    places = Stand(seed=1, length=60.0, width=40.0, density=300.0).trees().positions()[:, :2]
+    independent = least_error(MapErrors(position=0.3), places, noise=0.4)
+    assert independent == pytest.approx(np.sqrt(2.0) * 0.5 / np.sqrt(len(places)))
+    # More trees tell more, but far less than independent ones would; and better than their mean.
+    assert least_error(MAPS["poor"], places) < least_error(MAPS["poor"], places[:20]) < 0.7 * np.sqrt(2.0)
+    assert least_error(MAPS["poor"], places) > 0.5
+
+
+def test_no_mean_of_maps_errs_by_less() -> None:
+    stand = Stand(seed=2, length=60.0, width=40.0, density=300.0)
+    places, errors = stand.trees().positions()[:, :2], MapErrors(position=0.7, correlation=40.0)
+    means = [stand.map(errors, seed=k).positions()[:, :2].mean(axis=0) - places.mean(axis=0) for k in range(150)]
     rms = np.sqrt((np.array(means) ** 2).sum(axis=1).mean())
-    assert rms == pytest.approx(shared_displacement(errors), rel=0.2)
-    assert shared_displacement(MAPS["accurate"]) == 0.0
+    assert least_error(errors, places) < rms < np.sqrt(2.0) * 0.7
+
+
+def test_least_error_is_by_the_trees_beside_the_path() -> None:
+    stand, path = forest(5).stand(), np.array([[50.0 + k, 50.0, 0.0] for k in range(10)])
+    drive = Drive(np.arange(10.0), path, path, (Landmarks.empty(),) * 10)
+    places = stand.trees().positions()[:, :2]
+    near = np.hypot(places[:, 0] - np.clip(np.round(places[:, 0]), 50.0, 59.0), places[:, 1] - 50.0) < REACH
+    assert least_error_along({5: drive}, MAPS["poor"]) == pytest.approx(least_error(MAPS["poor"], places[near]))
