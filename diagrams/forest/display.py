@@ -25,6 +25,7 @@ from vtbdrake.monitoring.live.client import watch
 from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model
 from vtbdrake.visualization.world_model import text_strokes
+from vtbdrake_diagrams.forest.scenario import CarrierScenario
 
 Array = NDArray[np.float64]
 
@@ -146,6 +147,10 @@ def ellipse(place: Array, covariance: Array) -> Array:
 @timeout_option
 def main(scenario: Scenario, url: str, fields: tuple[tuple[str, Any], ...], every: int, timeout: float) -> None:
     """Show a running localization unit in a browser, until Ctrl-C or its end."""
+    if not isinstance(scenario, CarrierScenario):
+        raise BadInputError(
+            f"{type(scenario).__name__} has no localization unit: give a ForestScenario or PlainScenario"
+        )
     try:
         scenario = scenario.with_fields(settings(fields))
         meshcat = make_meshcat()

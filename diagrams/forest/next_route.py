@@ -72,6 +72,10 @@ class RouteScenario(ForestScenario):
     # Whether the simulated forest is that of the map, without clutter: what the carrier imagines.
     is_imagined: bool = field(default=False, kw_only=True)
 
+    def validate(self) -> None:
+        super().validate()
+        self.require(map_file=(not self.map_file, "empty: what the carrier imagines is grown from the seed"))
+
     def mental(self) -> RouteScenario:
         """Return what the carrier simulates when it reasons."""
         own = {item.name: getattr(self, item.name) for item in fields(self)}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.next_route import (
     COUNTED,
     FOUND,
@@ -59,6 +60,11 @@ def test_imagined_forest_is_that_of_the_map() -> None:
     np.testing.assert_array_equal(mental.global_map().positions(), mapped)
     assert len(scenario.truth()) != len(mapped)
     assert mental.undergrowth == 0.0 and mental.mental() == mental
+
+
+def test_maps_from_files_are_not_imagined() -> None:
+    with pytest.raises(ScenarioError, match="map_file must be empty: what the carrier imagines"):
+        RouteScenario(map_file="forest.geojson").validate()
 
 
 def test_routes_are_judged_after_they_have_parted() -> None:
