@@ -122,6 +122,21 @@ def test_diameter_of_a_trunk_that_is_half_hidden_is_unknown() -> None:
     assert abs(error[1, 1]) < 2.0 * np.sqrt(found.covariances[order[1]][1, 1])
 
 
+def test_trunk_that_the_right_camera_sees_in_part_may_be_thicker() -> None:
+    """Its left part would be beside the right image."""
+    tree = np.array([[6.4, 4.6, 0.4]])
+    whole = disparity(tree, LEVEL, ground=False)
+    cut = np.where(whole > np.arange(640), np.nan, whole)
+    assert 0.2 < np.isfinite(cut).sum() / np.isfinite(whole).sum() < 0.8
+    found = detect_stereo_trunks(cut, CAMERA, EXACT, X_HC=LEVEL)
+    assert np.isinf(found.diameter_deviations).all()
+    across = along_and_across(found.positions - tree[:, :2], tree, LEVEL)[0, 1]
+    e = (tree[0, :2] - LEVEL.translation()[:2]) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    deviation = np.sqrt(e @ found.covariances[0] @ e / (e @ e))
+    # What is unseen is at most as wide as what is seen.
+    assert 0.03 < abs(across) < 2.0 * deviation < found.diameters[0] + 0.1
+
+
 def test_neither_ground_nor_stumps_nor_walls_are_trunks() -> None:
     nothing = np.full((480, 640), np.nan)
     stumps = disparity(TREES, LEVEL, height=1.0)
