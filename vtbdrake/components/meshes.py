@@ -44,7 +44,7 @@ def obj_mesh(
 
 
 def _lines(form: str, rows: NDArray[Any]) -> str:
-    """Return a line of text for each row of numbers, (n, k); formatting all at once takes half the time."""
+    """Return a line of text for each row of numbers, (n, k), formatted at once, which is faster."""
     return (form + "\n") * len(rows) % tuple(rows.ravel().tolist())
 
 

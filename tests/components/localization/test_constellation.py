@@ -183,6 +183,31 @@ def test_trees_in_a_square_lattice_are_not_sure():
     assert not ConstellationMap(landmarks(places)).locate(local).is_sure
 
 
+@pytest.mark.parametrize(
+    ("seed", "missing"), [(2, None), (43, "count"), (93, "likelihood"), (44, "margin"), (53, "fit")]
+)
+def test_each_condition_of_the_test_of_uniqueness_counts(seed, missing):
+    """Places, qualities of map and detection, and clutter of which one condition alone does not hold."""
+    rng = np.random.default_rng(seed)
+    places = scattered(rng, side=60.0, count=120, spacing=2.0)
+    of_map, of_local = rng.choice([0.1, 0.3, 0.6]), rng.choice([0.05, 0.3, 0.6])
+    X_WH = np.array([30.0, 30.0, rng.uniform(-pi, pi)])
+    reach, false, missed = rng.choice([11.0, 14.0]), int(rng.integers(0, 60)), rng.choice([0.1, 0.5])
+    local = seen(places, X_WH, rng, reach=reach, deviation=of_local, false=false, missed=missed)
+    mapped = landmarks(places + of_map * rng.normal(size=places.shape), deviation=of_map)
+    fix = ConstellationMap(mapped).locate(local)
+    variance = of_map**2 + of_local**2 + 0.02**2
+    poses = np.prod(np.ptp(mapped.positions, axis=0)) / (2.0 * pi * variance) * 2.0 * pi * 10.0 / np.sqrt(variance)
+    holds = {
+        "count": len(local) >= 16,
+        "likelihood": fix.log_likelihood > np.log(poses) + np.log(200.0),
+        "margin": fix.margin >= max(5.0, 0.5 * fix.log_likelihood),
+        "fit": fix.fit >= 0.6,
+    }
+    assert [name for name, good in holds.items() if not good] == ([missing] if missing else [])
+    assert fix.is_sure == (missing is None)
+
+
 def test_too_few_landmarks_are_never_sure():
     stand = Stand(seed=1)
     constellation = ConstellationMap(map_landmarks(stand.map(ACCURATE)))

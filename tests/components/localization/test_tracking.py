@@ -105,6 +105,37 @@ def test_pairs_that_are_improbable_together_are_dropped():
     assert 5.0 < matches.nis <= chi2.ppf(tracker.gate, 2 * len(matches.pairs))
 
 
+def spread_out(places, deviation):
+    n = len(places)
+    return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, np.inf))
+
+
+def test_landmarks_that_may_be_others_enter_with_less_certainty():
+    places, variance = np.array([[2.0, 0.0], [0.0, -2.0]]), 0.045
+    tracker = Tracker(spread_out(places, variance**0.5), least_deviation=0.0, bias_deviation=1e-6)
+    state, _ = tracker.start(np.zeros(3), 1e-12 * np.eye(3))
+    state, matches = tracker.update(state, spread_out(places, variance**0.5))
+    assert len(matches.pairs) == 2
+    # Two detections within 2 m; twice their density competes with the normal density of a match without error.
+    density, others = 1.0 / (2.0 * np.pi * 2.0 * variance), 2.0 * 2.0 / (np.pi * 2.0**2)
+    p = density / (density + others)
+    assert 0.8 < p < 0.9
+    np.testing.assert_allclose(state.covariance[4:, 4:], np.eye(4) / (p**2 / variance + 1.0 / variance), atol=1e-6)
+
+
+@pytest.mark.parametrize(("deviations", "is_lost"), [(0.5, False), (2.2, True)])
+def test_first_matches_that_fit_badly_are_a_loss(deviations, is_lost):
+    places = np.array([[x, y] for x in (-9.0, 0.0, 9.0) for y in (-9.0, -3.0, 3.0, 9.0)])
+    tracker = Tracker(spread_out(places, 0.1), least_deviation=0.0, bias_deviation=1e-6)
+    state, _ = tracker.start(np.zeros(3), 1e-12 * np.eye(3))
+    angles = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(places))
+    errors = deviations * np.hypot(0.1, 0.1) * np.column_stack([np.cos(angles), np.sin(angles)])
+    for rows in np.arange(12).reshape(4, 3):
+        state, matches = tracker.update(state, spread_out((places + errors)[rows], 0.1))
+        assert len(matches.pairs) == 3
+    assert tracker.is_lost(state) == is_lost
+
+
 def test_an_uncertain_position_is_a_loss():
     tracker = Tracker(drive(0, ACCURATE).map, largest_deviation=0.5)
     state, _ = tracker.start(np.zeros(3), np.diag([0.1, 0.1, 0.0]) ** 2)

@@ -82,6 +82,21 @@ class Wrong:
         return self
 
 
+@pytest.mark.parametrize(("speed", "calls"), [(0.0, [0, 10, 20]), (2.5, [0, 4, 8, 12, 16, 20])])
+def test_matching_is_tried_after_some_metres_or_seconds(speed, calls):
+    one = drive(3, ACCURATE, reach=18.0)
+    tried = []
+    locator = Wrong(np.zeros(3), np.eye(3), is_sure=False)
+    unit = unit_for(one.map, locator)
+    state = unit.start()
+    for k in range(24):
+        before = state.tried_at[1]
+        _, state = unit.step(state, one.scans[0], X_OH=[speed * PERIOD * k, 0.0, 0.0], time=PERIOD * k)
+        if state.tried_at[1] != before:
+            tried.append(k)
+    assert tried == calls
+
+
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_a_wrong_first_pose_ends_soon(errors):
     for seed in range(4):
