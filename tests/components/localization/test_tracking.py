@@ -103,6 +103,13 @@ def test_pairs_that_are_improbable_together_are_dropped():
     assert 4 <= len(matches.pairs) < 8 and matches.is_fused
     assert {4, 5, 6, 7} <= set(matches.pairs[:, 0])
     assert 5.0 < matches.nis <= chi2.ppf(tracker.gate, 2 * len(matches.pairs))
+    # With errors like these in all of them, a single one would be left: the scan does not show the place.
+    angles = rng.uniform(0.0, 2.0 * np.pi, 8)
+    shifts = 0.033 * np.column_stack([np.cos(angles), np.sin(angles)])
+    displaced = Landmarks(places + shifts, scan.covariances, scan.diameters, scan.diameter_deviations)
+    failed, matches = tracker.update(state, displaced)
+    assert failed.failures == 1 and not matches.is_fused
+    np.testing.assert_array_equal(failed.mean, state.mean)
 
 
 def spread_out(places, deviation):

@@ -288,14 +288,18 @@ class Tracker:
         if not len(landmarks):
             return state, _NO_MATCHES
         found = self._associate(state, landmarks)
-        is_known = np.isin(found.pairs[:, 1], state.indices)
-        if self._is_elsewhere(state, landmarks, len(found.pairs), int(is_known.sum())):
-            return replace(state, failures=state.failures + 1), Matches(found.pairs)
+        failed = replace(state, failures=state.failures + 1)
+        if self._is_elsewhere(state, landmarks, found.pairs):
+            return failed, Matches(found.pairs)
         if len(found.pairs) < 2:
             return state, Matches(found.pairs)
+        is_known = np.isin(found.pairs[:, 1], state.indices)
         new = found.select(~is_known).first(self.most - len(state.indices))
         extended = self._extended(state, new.pairs[:, 1], new.probability)
         fused, matches = self._fused(extended, landmarks, np.vstack([found.pairs[is_known], new.pairs]))
+        # What is left of the pairs may be too few.
+        if self._is_elsewhere(state, landmarks, matches.pairs):
+            return failed, Matches(matches.pairs)
         evidence = min(self.credit, state.evidence + self._evidence(new.squares))
         return replace(fused, evidence=evidence, failures=0), matches
 
@@ -465,8 +469,9 @@ class Tracker:
 
     # -- health
 
-    def _is_elsewhere(self, state: TrackState, landmarks: Landmarks, matched: int, again: int) -> bool:
-        """Return whether a scan does not show the place, with matched detections and landmarks seen again."""
+    def _is_elsewhere(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> bool:
+        """Return whether a scan with these pairs of detection and landmark does not show the place."""
+        matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
         recent = state.mean[_FIXED:].reshape(-1, 2)[state.is_recent]
         # At the edge of what is seen, landmarks come and go.
         reach = 0.7 * np.hypot(*landmarks.positions.T).max()
