@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
@@ -39,7 +40,7 @@ from vtbdrake.scan import Scan
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.carrier import Carrier
-from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay
+from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.perception import Localizer
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
@@ -348,3 +349,9 @@ def test_display_follows_the_pose(drive: Drive) -> None:
         covariance = drive.seen["dps.env.pose.covariance"][k][:2, :2]
         np.testing.assert_allclose(ellipse @ ellipse.T, 9.0 * covariance, rtol=1e-6)
     assert drawn(meshcat, "set_property")["carrier"] is True
+
+
+def test_display_of_another_scenario_is_refused() -> None:
+    result = CliRunner().invoke(main, ["vtbdrake_diagrams.cart_pole.scenario:CartPoleScenario", "--url", "tcpq://x:1"])
+    assert result.exit_code != 0
+    assert "CartPoleScenario has no localization unit" in result.output
