@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 
 from tests.components.localization.scans import Scene, hills
@@ -43,3 +45,15 @@ def test_beyond_the_border_the_ground_goes_on_level():
     places = np.random.default_rng(3).uniform(-20.0, 20.0, (2000, 2))
     ground = fitted(np.column_stack([places, 0.1 * places[:, 0]]))
     np.testing.assert_allclose(*ground.at([[22.0, 0.0], [80.0, 0.0]]), atol=1e-6)
+
+
+def test_far_reaching_scanners_need_no_more_memory_than_their_surface():
+    """A square of 400 m has 10,000 nodes: a matrix of these would have 866 MB."""
+    places = np.random.default_rng(4).uniform(-190.0, 190.0, (40_000, 2))
+    points = np.column_stack([places, 0.05 * places[:, 0]])
+    tracemalloc.start()
+    ground = fitted(points, reach=200.0)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_allclose(ground.at([[100.0, 20.0], [-80.0, 0.0]]), [5.0, -4.0], atol=0.02)
+    assert peak < 300e6

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
+from scipy.sparse import kron
 
 Array = NDArray[np.float64]
 
@@ -107,9 +108,10 @@ def _stiffness(m: int) -> Array:
     """Return the upper band (2 m + 1, m^2) of the matrix of the squared second differences of m times m nodes."""
     one, first = np.eye(m), np.diff(np.eye(m), axis=0)
     second = np.diff(first, axis=0)
-    parts = (np.kron(second, one), np.kron(one, second), np.sqrt(2.0) * np.kron(first, first))
-    matrix = sum(part.T @ part for part in parts) + 1e-9 * np.eye(m * m)
+    factors = ((second, one, 1.0), (one, second, 1.0), (first, first, 2.0))
+    matrix = sum(weight * kron(a.T @ a, b.T @ b, format="csr") for a, b, weight in factors)
     band = np.zeros((2 * m + 1, m * m))
     for k in range(2 * m + 1):
-        band[2 * m - k, k:] = np.diagonal(matrix, k)
+        band[2 * m - k, k:] = matrix.diagonal(k)
+    band[-1] += 1e-9
     return band
