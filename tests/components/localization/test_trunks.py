@@ -206,3 +206,5 @@ def test_bad_input_is_rejected():
         TrunkDetector(range_noise=0.0)
     with pytest.raises(ValueError, match="two positive heights"):
         TrunkDetector(heights=(2.0, 1.0))
+    with pytest.raises(ValueError, match="cell must be in m, at least a 2000th of the reach, not 0.01"):
+        TrunkDetector(reach=40.0, cell=0.01)

@@ -71,7 +71,7 @@ class RockDetector:
             "largest_width": (self.largest_width < inf, "in m, finite"),
             "least_points": (self.least_points >= 2, "at least 2"),
             "ground_height": (-inf < self.ground_height < inf, "in m, finite"),
-            "cell": (0.01 <= self.cell < inf, "in m, at least 0.01"),
+            "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
             "elongation": (0.0 <= self.elongation < 1.0, "a share from 0 to below 1"),
         }
         for name, (good, expected) in checks.items():

@@ -118,7 +118,7 @@ class TrunkDetector:
             "typical_diameter": (0.0 < self.typical_diameter < inf, "in m, positive"),
             "diameter_spread": (0.0 < self.diameter_spread < inf, "in m, positive"),
             "lean": (0.0 < self.lean < 0.5, "in rad, above 0 and below 0.5"),
-            "cell": (0.01 <= self.cell < inf, "in m, at least 0.01"),
+            "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
             "largest_misfit": (self.largest_misfit > 0.0, "positive"),
             "position_floor": (0.0 <= self.position_floor < inf, "in m, at least 0"),
             "diameter_floor": (0.0 <= self.diameter_floor < inf, "in m, at least 0"),
