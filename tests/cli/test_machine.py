@@ -74,6 +74,7 @@ def test_machine_dies_on_request(hub: Hub) -> None:
         (ROBOT, ("--noise", "torque=1"), 2, "noise is added to vector sensor signals"),
         (ROBOT, ("--noise", "position=[1,2]"), 2, "one standard deviation"),
         (ROBOT, ("--set", "sim.sys.Acrobot.elbow.angle=1"), 2, "there is no variable"),
+        (ROBOT, ("--field", "masss=1"), 2, "no field 'masss'"),
         (ROBOT, ("--brake", "hard"), 2, "'hard' is not one of"),
         (ROBOT, ("--url", "tcpq://127.0.0.1:1"), 1, "no LCM bus at tcpq://127.0.0.1:1"),
     ],

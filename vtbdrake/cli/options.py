@@ -210,6 +210,13 @@ set_option = option(
     parse=parse_setting,
     multiple=True,
 )
+field_option = option(
+    "--field NAME=VALUE",
+    "Set a field of the scenario: a number, true, false or a text. May be repeated.",
+    name="scenario_fields",
+    parse=parse_field,
+    multiple=True,
+)
 url_option = option(
     "--url URL", "The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.", parse=parse_url, required=True
 )

@@ -13,9 +13,9 @@ from vtbdrake.child_process import ending_signals, logging_in_thread
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
+    field_option,
     option,
     output,
-    parse_field,
     parse_snapshot,
     positive,
     scenario_argument,
@@ -48,13 +48,7 @@ MOST_FAULTS = 20  # that are printed at the end
     parse=parse_snapshot,
 )
 @set_option
-@option(
-    "--field NAME=VALUE",
-    "Set a field of the scenario: a number, true, false or a text. May be repeated.",
-    name="fields",
-    parse=parse_field,
-    multiple=True,
-)
+@field_option
 @option("--period S", "The period of a cycle, in seconds, instead of that of the scenario.", type=float)
 @option("--pace SIGNAL", "Begin a cycle with each message of this sensor signal, not by the clock.")
 @option("--seconds S", "End after S seconds.  [default: endless]", parse=positive, type=float)
@@ -82,7 +76,7 @@ def run(
     url: str,
     snapshot: Snapshot | None,
     values: tuple[Setting, ...],
-    fields: tuple[tuple[str, object], ...],
+    scenario_fields: tuple[tuple[str, object], ...],
     period: float | None,
     pace: str | None,
     seconds: float | None,
@@ -108,7 +102,7 @@ def run(
     logging.basicConfig(format="%(asctime)s %(message)s")
     for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
         logger.setLevel(logging.INFO)
-    scenario = scenario.with_fields(settings(fields))
+    scenario = scenario.with_fields(settings(scenario_fields))
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
     loop = scenario.deploy(
