@@ -56,8 +56,12 @@ SCANS = 5.0
 """Scans per second."""
 DENSITIES = (605.0, 1210.0)
 """Trees per hectare of the plots that `stand` cites; roads are cleared of them afterwards."""
-SEED = 200_000
-"""Of the first forest. No constant of the localization may be chosen by forests from this seed on."""
+SEED = 600_000
+"""Of the first forest. No constant of the localization may be chosen by forests from this seed on.
+
+Forests from 200,000 and from 500,000 on were driven before, and do not count any more: the duration of the errors of
+the vertical was not considered in the first ones, and the noise of the sensors was the same in all.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,7 +391,7 @@ def forest(seed: int, *, range_bias: float = 0.0) -> ForestScenario:
     """Return the scenario of a drive: a stand as dense as published plots, every third one clustered.
 
     Args:
-        seed: Determines stand, route and where on it the drive begins.
+        seed: Determines stand, route, where on it the drive begins, and the noise of all sensors.
         range_bias: Of the scanner, in m.
     """
     rng = np.random.default_rng([seed, 9])
@@ -397,6 +401,8 @@ def forest(seed: int, *, range_bias: float = 0.0) -> ForestScenario:
         density=float(rng.uniform(*DENSITIES)),
     )
     scenario.scanner_errors.bias = range_bias
+    for errors in (scenario.scanner_errors, scenario.imu_errors, scenario.odometry_errors):
+        errors.seed = seed
     routes = scenario.routes()
     number = int(rng.integers(len(routes)))
     return replace(scenario, route=number, start=float(rng.uniform(0.0, routes[number].length)))

@@ -44,9 +44,10 @@ PERCEPTIONS = ("scanner", "stereo")
 # What a detector assumes of a scanner whose ranges are exact, in m.
 _LEAST_RANGE_NOISE = 0.005
 
-# How far the vertical is off, in rad, which displaces what a high sensor sees: assumed, and more than the 3 mrad that
-# it is in the simulation, as its errors last.
-_LEVELLING = 0.005
+# How far the vertical is off, in rad, which displaces what a high sensor sees. In the simulation it is 3 mrad, for
+# about a second at a time. The tracker takes the scans, five per second, as independent: then such an error counts as
+# one that is sqrt(2 * 1 s * 5 Hz) times as large.
+_LEVELLING = 0.01
 
 
 def plant_config() -> MultibodyPlantConfig:

@@ -118,4 +118,7 @@ def test_forests_differ_and_are_reproducible() -> None:
     one = forest(1)
     assert one == forest(1) and one != forest(2)
     assert {forest(seed).stand_kind for seed in range(3)} == {"natural", "clustered"}
+    # Nor do two drives share the noise of a sensor: their errors are independent.
+    for name in ("scanner_errors", "imu_errors", "odometry_errors"):
+        assert getattr(one, name).seed != getattr(forest(2), name).seed
     assert forest(1, range_bias=0.02) == replace(one, scanner_errors=replace(one.scanner_errors, bias=0.02))
