@@ -155,6 +155,20 @@ def test_bias_of_gyros_is_learned_at_rest():
     assert abs(with_rest) < 4e-3 < 0.03 < abs(without)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noisy_wheels_and_rocking_at_rest_are_no_bias(seed):
+    drive, bias = Drive(still=3.0), np.array([0.001, -0.001, 0.002])
+    samples = drive.samples()[:150]
+    rng = np.random.default_rng(seed)
+    rocking = np.outer(
+        np.exp(-T * np.arange(150) / 0.8) * np.cos(2.0 * np.pi * 1.5 * T * np.arange(150)), [1.0, 0.7, 0.0]
+    )
+    samples[:, :3] += bias + 0.015 * rocking + 2e-3 * rng.normal(size=(150, 3))
+    samples[:, 6] += 0.02 * rng.normal(size=150)
+    # Of about 120 samples; a single one of a carrier that rocks would be off by 8e-3.
+    np.testing.assert_allclose(value(samples, "gyro_bias"), bias, atol=1e-3)
+
+
 def test_samples_that_are_not_finite_are_left_out():
     samples = Drive().samples()[:300]
     broken = samples.copy()

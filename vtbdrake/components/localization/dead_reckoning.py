@@ -120,8 +120,10 @@ class DeadReckoning(LeafSystem):
         p_A <- p_A + T v cos(pitch) [cos(heading), sin(heading)], halfway,   [x, y] = p_A - axle [cos(heading), ...].
 
     *Bias of the gyros.* While the carrier stands still, what the gyros measure is their bias. A Kalman filter estimates
-    it: a random walk with the deviation ``bias_drift``, measured with ``gyro_noise``. The carrier stands still when
-    speed and rates have stayed below ``still_speed`` and ``still_rate`` for half a second.
+    it: a random walk with the deviation ``bias_drift``, measured with ``gyro_noise``, in which rocking on the springs
+    is included. The carrier stands still when for half a second the rates have stayed below ``still_rate``, the mean
+    speed, with a time constant of half a second, below ``still_speed``, and no speed was above four times that: wheel
+    sensors are noisy at rest, too.
 
     A sample with a number that is not finite is left out and counted in ``ignored``: speed and turn rate go on.
     """
@@ -149,12 +151,12 @@ class DeadReckoning(LeafSystem):
         past[:, 0] = -period * np.arange(1, length + 1)
         motion = self.DeclareDiscreteState(np.array([-period, *[0.0] * (MOTION - 1)]))
         history = self.DeclareDiscreteState(past.ravel())
-        # [up, samples, bias, its variance, samples at rest, ignored]
-        inner = self.DeclareDiscreteState([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, _BIAS_DEVIATION**2, 0.0, 0.0])
+        # [up, samples, bias, its variance, samples at rest, ignored, mean speed]
+        inner = self.DeclareDiscreteState([0.0, 0.0, 1.0, *[0.0] * 4, _BIAS_DEVIATION**2, *[0.0] * 3])
         self.DeclareStateOutputPort("motion", motion)
         self.DeclareStateOutputPort("history", history)
         self._motion, self._history, self._inner = int(motion), int(history), int(inner)
-        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 1e-3, axle]))
+        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 5e-3, axle]))
         bounds = (0.0, inf)
         self.variables = (
             discrete_state("time", self._motion, unit="s"),
@@ -171,6 +173,7 @@ class DeadReckoning(LeafSystem):
             discrete_state("gyro_bias_variance", self._inner, start=7, unit="rad^2/s^2", bounds=bounds),
             discrete_state("samples_at_rest", self._inner, start=8, bounds=bounds),
             discrete_state("ignored", self._inner, start=9, bounds=bounds),
+            discrete_state("mean_speed", self._inner, start=10, unit="m/s"),
             parameter("levelling_time", settings, unit="s", bounds=bounds),
             parameter("still_speed", settings, start=1, unit="m/s", bounds=bounds),
             parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
@@ -216,15 +219,18 @@ class DeadReckoning(LeafSystem):
         state.set_value(self._history, np.concatenate((motion[:POSE], past[:-POSE])))
 
     def _gyro_bias(self, context: Context, sample: list[float], inner: list[float]) -> tuple[list[float], float, float]:
-        """Return the gyros' bias (rad/s), its variance, and the number of samples at rest up to now."""
+        """Return the gyros' bias (rad/s), its variance, and the number of samples at rest; the mean speed goes on."""
         _, still_speed, still_rate, drift, noise, _ = context.get_numeric_parameter(0).value().tolist()
         bias, variance = inner[4:7], inner[7] + drift**2 * self._period
-        if abs(sample[6]) > still_speed or any(abs(rate) > still_rate for rate in sample[:3]):
+        speed, rates = sample[6], sample[:3]
+        inner[10] += max(self._period / _SETTLING_TIME, 1.0 / (inner[3] + 1.0)) * (speed - inner[10])
+        moves = abs(inner[10]) > still_speed or abs(speed) > 4.0 * still_speed
+        if moves or any(abs(rate) > still_rate for rate in rates):
             return bias, variance, 0.0
         at_rest = inner[8] + 1.0
         if at_rest * self._period > _SETTLING_TIME:
             gain = variance / (variance + max(noise, 1e-9) ** 2)
-            bias = [b + gain * (rate - b) for b, rate in zip(bias, sample[:3], strict=True)]
+            bias = [b + gain * (rate - b) for b, rate in zip(bias, rates, strict=True)]
             variance *= 1.0 - gain
         return bias, variance, at_rest
 
