@@ -170,9 +170,10 @@ def decide_and_drive(seed: int) -> RouteAnswer:
     numbers = range(len(scenario.routes()))
     sweep = problem.sweep(values=[(float(number),) for number in numbers], progress=False)
     expected = np.full(len(numbers), np.nan)
-    for candidate in decision.candidates[1:]:
+    # The plan in use, the first candidate, sets nothing: the carrier stays on its route.
+    for candidate in decision.candidates:
         if candidate.rollouts:
-            expected[round(float(candidate.values[ROUTE]))] = candidate.rollouts[0].value / COUNTED
+            expected[round(float(candidate.values.get(ROUTE, scenario.route)))] = candidate.rollouts[0].value / COUNTED
     errors = np.sqrt([rollout.value / COUNTED for rollout in sweep.rollouts])
     return RouteAnswer(decision, expected, errors)
 
