@@ -23,7 +23,7 @@ CYCLES = 150
 PATIENCE = 60.0
 """The longest time to wait for a result of the slow part, in s."""
 LARGEST_DIFFERENCE = 1e-3
-"""Of the pose over LCM from the simulated one, in m and rad: points travel with 32 bits."""
+"""The largest difference of the pose over LCM from the simulated one, in m and rad: points travel with 32 bits."""
 JUDGED = ("accurate", "remote")
 """The maps by which the row holds. The goal of the third is below what can be reached: see `least_error_along`."""
 

@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from drake import lcmt_scope
 from pydrake.common.value import Value
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import (
-    Adder,
     ConstantValueSource,
-    ConstantVectorSource,
-    Demultiplexer,
-    Multiplexer,
     ZeroOrderHold,
 )
 
 from vtbdrake.components.localization.dead_reckoning import DeadReckoning, DriftModel
+from vtbdrake.components.sensors.calibration import make_calibration
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.fallback import Hold
 from vtbdrake.deployment import Deployment
@@ -76,7 +72,7 @@ def make_dps(
         drift: How the dead reckoning drifts.
     """
     builder = DiagramBuilder()
-    sense = builder.AddNamedSystem("sense", _make_sense())
+    sense = builder.AddNamedSystem("sense", make_calibration({"imu": 6, "odometry": 1}))
     env = builder.AddNamedSystem("env", _make_env(world_map, localizer, eyes, latency=latency, drift=drift))
     impl = builder.AddNamedSystem("impl", _make_impl())
     for signal in ("imu", "odometry"):
@@ -89,23 +85,6 @@ def make_dps(
     dps = builder.Build()
     dps.set_name("dps")
     return dps
-
-
-def _make_sense() -> Diagram:
-    """Return the system that adds the parameter ``offset`` to the raw values of IMU and odometry."""
-    builder = DiagramBuilder()
-    sizes = [6, 1]
-    raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
-    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
-    measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
-    split = builder.AddNamedSystem("split", Demultiplexer(sizes))
-    builder.Connect(raw.get_output_port(), measured.get_input_port(0))
-    builder.Connect(offset.get_output_port(), measured.get_input_port(1))
-    builder.Connect(measured.get_output_port(), split.get_input_port())
-    for k, signal in enumerate(("imu", "odometry")):
-        builder.ExportInput(raw.get_input_port(k), signal)
-        builder.ExportOutput(split.get_output_port(k), signal)
-    return builder.Build()
 
 
 def _make_env(

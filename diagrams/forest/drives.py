@@ -57,7 +57,7 @@ SCANS = 5.0
 DENSITIES = (605.0, 1210.0)
 """Trees per hectare of the plots that `stand` cites; roads are cleared of them afterwards."""
 SEED = 600_000
-"""Of the first forest. No constant of the localization may be chosen by forests from this seed on.
+"""The seed of the first forest. No constant of the localization may be chosen by forests from this seed on.
 
 Forests from 200,000 and from 500,000 on were driven before, and do not count any more: the duration of the errors of
 the vertical was not considered in the first ones, and the noise of the sensors was the same in all.

@@ -11,16 +11,13 @@ from pydrake.common.value import Value
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import (
-    Adder,
     ConstantValueSource,
-    ConstantVectorSource,
-    Demultiplexer,
-    Multiplexer,
     Saturation,
 )
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.tracking import TargetTracker
+from vtbdrake.components.sensors.calibration import make_calibration
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
@@ -76,7 +73,7 @@ def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Dia
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through.
     """
     builder = DiagramBuilder()
-    sense = builder.AddNamedSystem("sense", _make_sense())
+    sense = builder.AddNamedSystem("sense", make_calibration({"joint_position": len(JOINT_NAMES), "imu": 6}))
     env = builder.AddNamedSystem("env", _make_env(eyes, period=period))
     impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
     act = builder.AddNamedSystem("act", _make_act(wheels=wheels))
@@ -95,23 +92,6 @@ def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Dia
     dps = builder.Build()
     dps.set_name("dps")
     return dps
-
-
-def _make_sense() -> Diagram:
-    """Return the system that adds the parameter ``offset`` to the raw values of encoders and IMU."""
-    builder = DiagramBuilder()
-    sizes = [len(JOINT_NAMES), 6]
-    raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
-    offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
-    measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
-    split = builder.AddNamedSystem("split", Demultiplexer(sizes))
-    builder.Connect(raw.get_output_port(), measured.get_input_port(0))
-    builder.Connect(offset.get_output_port(), measured.get_input_port(1))
-    builder.Connect(measured.get_output_port(), split.get_input_port())
-    for k, signal in enumerate(("joint_position", "imu")):
-        builder.ExportInput(raw.get_input_port(k), signal)
-        builder.ExportOutput(split.get_output_port(k), signal)
-    return builder.Build()
 
 
 def _make_env(eyes: Eyes, *, period: float) -> Diagram:
