@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from vtbdrake.components.localization.ground import fit_ground
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.scene import Cells, Clusters, Scene
+from vtbdrake.components.settings import check_settings
 
 Array = NDArray[np.float64]
 
@@ -74,9 +75,7 @@ class RockDetector:
             "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
             "elongation": (0.0 <= self.elongation < 1.0, "a share from 0 to below 1"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"RockDetector: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings("RockDetector", self, checks)
 
 
 def detect_rocks(points_H: ArrayLike, detector: RockDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:

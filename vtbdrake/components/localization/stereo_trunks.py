@@ -22,6 +22,7 @@ from scipy.ndimage import convolve1d, find_objects, label
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.perception.stereo import StereoCamera
+from vtbdrake.components.settings import check_settings
 
 Array = NDArray[np.float64]
 
@@ -83,9 +84,7 @@ class StereoTrunkDetector:
             "fattening": (0.0 <= self.fattening < inf, "in pixels, at least 0"),
             "floor": (0.0 <= self.floor < inf, "in m, at least 0"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"StereoTrunkDetector: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings("StereoTrunkDetector", self, checks)
 
 
 def detect_stereo_trunks(

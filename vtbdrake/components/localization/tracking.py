@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, rotation, transform
+from vtbdrake.components.settings import check_settings
 from vtbdrake.components.world_model.association import chi_square_quantile
 
 Array = NDArray[np.float64]
@@ -229,9 +230,7 @@ class Tracker:
             "first_credit": (self.first_credit > 0.0, "positive"),
             "largest_deviation": (self.largest_deviation > 0.0, "in m, positive"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"Tracker: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings("Tracker", self, checks)
         object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions))
         # Of a detection beside that of the pose: of the map, the bias and the scan.
         largest = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1].max()

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from vtbdrake.components.localization.ground import fit_ground
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.scene import Cells, Clusters, Scene
+from vtbdrake.components.settings import check_settings
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -123,9 +124,7 @@ class TrunkDetector:
             "position_floor": (0.0 <= self.position_floor < inf, "in m, at least 0"),
             "diameter_floor": (0.0 <= self.diameter_floor < inf, "in m, at least 0"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"TrunkDetector: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings("TrunkDetector", self, checks)
 
 
 def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:

@@ -19,6 +19,7 @@ from pydrake.systems.framework import (
 )
 
 from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
+from vtbdrake.components.settings import check_settings
 from vtbdrake.state import Element, discrete_state, parameter
 from vtbdrake.state.declarations import weakly
 
@@ -90,9 +91,7 @@ class ErrorModel:
             "outlier_size": (0.0 <= self.outlier_size < inf, "a standard deviation, finite and not negative"),
             "seed": (0 <= self.seed <= 2**53 and self.seed == int(self.seed), "a whole number between 0 and 2^53"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"{owner}: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings(owner, self, checks)
 
 
 @dataclass(frozen=True)

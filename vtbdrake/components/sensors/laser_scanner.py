@@ -27,6 +27,7 @@ from pydrake.systems.framework import (
 from vtbdrake.components.environment.haze import false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator
+from vtbdrake.components.settings import check_settings
 from vtbdrake.scan import Scan
 from vtbdrake.state import Codec, Element, discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT, weakly
@@ -98,9 +99,7 @@ class LaserScannerConfig:
             "reflectivity": (0.0 <= self.reflectivity <= 1.0, "a share between 0 and 1"),
             "divergence": (0.0 <= self.divergence < 0.5, "in rad, between 0 and 0.5"),
         }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ValueError(f"LaserScanner: {name} must be {expected}, not {getattr(self, name)!r}")
+        check_settings("LaserScanner", self, checks)
 
 
 _FIELDS = tuple(field.name for field in fields(LaserScannerConfig))
