@@ -26,7 +26,7 @@ from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScanner
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.scan import Scan
 from vtbdrake.state.systems import pose_from_array
-from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.visualization.plots import Picture, finish
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
@@ -84,17 +84,11 @@ class ApproachScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        checks = {
-            "seed": (self.seed >= 0, "not negative"),
-            "tumble_deg": (
-                0.0 <= self.tumble_deg <= 4.5,
-                "within [0, 4.5] deg/s: beyond, the first scan sees no front",
-            ),
-            "closing_speed": (0.0 <= self.closing_speed <= 0.5, "within [0, 0.5] m/s"),
-        }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ScenarioError(f"ApproachScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        self.require(
+            seed=(self.seed >= 0, "not negative"),
+            tumble_deg=(0.0 <= self.tumble_deg <= 4.5, "within [0, 4.5] deg/s: beyond, the first scan sees no front"),
+            closing_speed=(0.0 <= self.closing_speed <= 0.5, "within [0, 0.5] m/s"),
+        )
 
     def interface(self) -> Interface:
         return Interface(

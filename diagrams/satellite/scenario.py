@@ -96,22 +96,19 @@ class SatelliteScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        checks = {
-            "seed": (self.seed >= 0, "not negative"),
-            "tumble_deg": (0.0 <= self.tumble_deg <= _LARGEST_TUMBLE_DEG, f"within [0, {_LARGEST_TUMBLE_DEG:g}] deg/s"),
-            "distance": (self.distance >= 1.8, "at least 1.8 m: nearer, the satellites would touch"),
-            "perception": (self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
-            "onlookers": (self.onlookers in ONLOOKERS, f"one of {', '.join(PERCEPTIONS[:3])}, or empty"),
-            "image_width": (self.image_width > 0, "positive, in pixels"),
-            "image_height": (self.image_height > 0, "positive, in pixels"),
-            "field_of_view": (0.0 < self.field_of_view < np.pi, "between 0 and pi rad"),
-            "camera_rate": (0.0 < self.camera_rate <= 0.5 / PERIOD, f"above 0 and at most {0.5 / PERIOD:g} images/s"),
-            "lamp": (self.lamp >= 0.0, "not negative"),
-            "plant_config": (self.plant_config.time_step > 0.0, "of a discrete plant: servos and gripper need it"),
-        }
-        for name, (good, expected) in checks.items():
-            if not good:
-                raise ScenarioError(f"SatelliteScenario.{name} must be {expected}, not {getattr(self, name)!r}")
+        self.require(
+            seed=(self.seed >= 0, "not negative"),
+            tumble_deg=(0.0 <= self.tumble_deg <= _LARGEST_TUMBLE_DEG, f"within [0, {_LARGEST_TUMBLE_DEG:g}] deg/s"),
+            distance=(self.distance >= 1.8, "at least 1.8 m: nearer, the satellites would touch"),
+            perception=(self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
+            onlookers=(self.onlookers in ONLOOKERS, f"one of {', '.join(PERCEPTIONS[:3])}, or empty"),
+            image_width=(self.image_width > 0, "positive, in pixels"),
+            image_height=(self.image_height > 0, "positive, in pixels"),
+            field_of_view=(0.0 < self.field_of_view < np.pi, "between 0 and pi rad"),
+            camera_rate=(0.0 < self.camera_rate <= 0.5 / PERIOD, f"above 0 and at most {0.5 / PERIOD:g} images/s"),
+            lamp=(self.lamp >= 0.0, "not negative"),
+            plant_config=(self.plant_config.time_step > 0.0, "of a discrete plant: servos and gripper need it"),
+        )
         try:
             self.light.check()
             for name in ("imu_errors", "joint_errors", "pose_errors", "camera_errors", "scanner_errors"):

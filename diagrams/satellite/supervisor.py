@@ -95,6 +95,20 @@ class Guidance:
         return Guidance(mode, follows > 0.5, distance, rate, opening, flip > 0.5)
 
 
+@dataclass
+class _Step:
+    """What an update changes: the mode, the guidance, for how long the gripper is steady (s), and the attempts."""
+
+    mode: float
+    reason: float
+    distance: float
+    rate: float
+    opening: float
+    flip: float
+    steady: float
+    attempts: float
+
+
 class Supervisor(LeafSystem):
     """A state machine that leads a capture from sensor data alone.
 
@@ -200,55 +214,65 @@ class Supervisor(LeafSystem):
         fingers = self._joints.Eval(context)[ARM_JOINTS:]
         go = float(self._capture.Eval(context)[0])
         still = bool((np.abs(fingers - memory[5:]) < 5e-4 * T / 0.02).all())
-        gap = float(fingers.sum())
-        holds = 0.6 * self._bar < gap < 1.4 * self._bar
-        rate, entered = 0.0, mode
+        holds = 0.6 * self._bar < float(fingers.sum()) < 1.4 * self._bar
         in_mode, since = in_mode + T, since + T if mode != WAIT else 0.0
 
+        step = _Step(mode, reason, distance, 0.0, opening, flip, steady, attempts)
         trouble = self._trouble(mode, go, relative, since, p)
         fresh = relative.age < p["hold_after"]
         if trouble:
-            entered, reason = ABORT, trouble
+            step.mode, step.reason = ABORT, trouble
         elif mode == WAIT:
             if go > 0.5 and relative.valid and fresh and not self._unreachable(relative, p):
-                entered, reason, distance = APPROACH, _FIX, p["standoff"]
-                flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
+                step.mode, step.reason, step.distance = APPROACH, _FIX, p["standoff"]
+                step.flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
         elif mode in (APPROACH, TRACK) and fresh:
-            error, angle = self._errors(relative, distance, flip)
-            close = error < p["position_tolerance"] and angle < p["orientation_tolerance"]
-            steady = steady + T if close else 0.0
-            if mode == APPROACH:
-                if steady > 0.5:
-                    entered, reason = TRACK, _BEFORE
-            elif distance > 0.0:
-                rate = -min(p["closing_speed"], distance / T) if close else 0.0
-                distance += rate * T
-            else:
-                steady = steady if error < p["grip_tolerance"] else 0.0
-                if steady > p["grip_time"]:
-                    entered, reason = GRIP, _AT_BAR
+            self._steer(step, relative, p)
         elif mode == GRIP:
-            opening = 0.0
-            steady = steady + T if still else 0.0
-            if steady > 0.3 and in_mode > 0.5:
-                if holds:
-                    entered, reason = RETREAT, _HELD
-                elif attempts + 1.0 >= p["attempts"]:
-                    entered, reason = ABORT, MISSED_ALL
-                else:
-                    entered, reason, attempts = APPROACH, _MISSED, attempts + 1.0
-                    distance, opening = p["standoff"], self._opening
+            self._grip(step, still, holds, in_mode, p)
         elif mode == RETREAT and in_mode > p["retreat_time"]:
-            entered, reason = HOLD, _STOPPED
+            step.mode, step.reason = HOLD, _STOPPED
         elif mode in (RETREAT, HOLD) and not holds and still:
-            entered, reason = ABORT, SLIPPED
-        if entered == ABORT:
-            opening = self._opening
-        if entered != mode:
-            in_mode = steady = 0.0
-        follows = entered in (APPROACH, TRACK, GRIP) and fresh
-        state.set_value(self._state, np.array([entered, follows, distance, rate, opening, flip]))
-        state.set_value(self._memory, np.array([reason, in_mode, since, steady, attempts, *fingers]))
+            step.mode, step.reason = ABORT, SLIPPED
+        if step.mode == ABORT:
+            step.opening = self._opening
+        if step.mode != mode:
+            in_mode = step.steady = 0.0
+        follows = step.mode in (APPROACH, TRACK, GRIP) and fresh
+        guidance = [step.mode, follows, step.distance, step.rate, step.opening, step.flip]
+        state.set_value(self._state, np.array(guidance))
+        state.set_value(self._memory, np.array([step.reason, in_mode, since, step.steady, step.attempts, *fingers]))
+
+    def _steer(self, step: _Step, relative: Relative, p: dict[str, float]) -> None:
+        """Approach the fixture, or go in along its axis."""
+        T = self._period
+        error, angle = self._errors(relative, step.distance, step.flip)
+        close = error < p["position_tolerance"] and angle < p["orientation_tolerance"]
+        step.steady = step.steady + T if close else 0.0
+        if step.mode == APPROACH:
+            if step.steady > 0.5:
+                step.mode, step.reason = TRACK, _BEFORE
+        elif step.distance > 0.0:
+            step.rate = -min(p["closing_speed"], step.distance / T) if close else 0.0
+            step.distance += step.rate * T
+        else:
+            step.steady = step.steady if error < p["grip_tolerance"] else 0.0
+            if step.steady > p["grip_time"]:
+                step.mode, step.reason = GRIP, _AT_BAR
+
+    def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: dict[str, float]) -> None:
+        """Close the fingers; ``still`` tells whether they rest, ``holds`` whether the bar is between them."""
+        step.opening = 0.0
+        step.steady = step.steady + self._period if still else 0.0
+        if step.steady <= 0.3 or in_mode <= 0.5:
+            return
+        if holds:
+            step.mode, step.reason = RETREAT, _HELD
+        elif step.attempts + 1.0 >= p["attempts"]:
+            step.mode, step.reason = ABORT, MISSED_ALL
+        else:
+            step.mode, step.reason, step.attempts = APPROACH, _MISSED, step.attempts + 1.0
+            step.distance, step.opening = p["standoff"], self._opening
 
     def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: dict[str, float]) -> float:
         """Return the reason for an abort, or 0."""
