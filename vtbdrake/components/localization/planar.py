@@ -16,6 +16,12 @@ def rotation(heading: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
+def rotations(headings: Array) -> Array:
+    """Return `rotation` of n headings (rad), shape (n, 2, 2)."""
+    c, s = np.cos(headings), np.sin(headings)
+    return np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
+
+
 def wrap(angle: float) -> float:
     """Return the angle (rad) in [-pi, pi) that means the same direction."""
     return float((angle + pi) % (2.0 * pi) - pi)

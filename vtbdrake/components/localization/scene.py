@@ -1,14 +1,17 @@
-"""What a scanner sees around it: its points by direction and distance, and clusters of them."""
+"""What detectors of landmarks see in a scan: its points by direction and distance, and clusters of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
+
+from vtbdrake.components.localization.ground import fit_ground
+from vtbdrake.components.settings import check_settings
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -17,48 +20,90 @@ Indices = NDArray[np.intp]
 _HIDDEN = 0.25
 
 
+@dataclass(frozen=True)
+class ScanDetector:
+    """What detectors of landmarks in scans have in common.
+
+    Attributes:
+        azimuth_step: Angle between neighbouring rays of a row of the scanner in rad.
+        elevation_step: Angle between its neighbouring rows in rad.
+        range_noise: Standard deviation of its ranges in m.
+        reach: Distance in m from the scanner up to which landmarks are looked for.
+        ground_height: The z in H of the ground under the scanner in m: 0 if the origin of B is on the ground.
+        cell: Edge length in m of the cells in which points are gathered.
+
+    Raises:
+        ValueError: A value that no detector can have.
+    """
+
+    azimuth_step: float = 2.0 * pi / 1250
+    elevation_step: float = pi / 6.0 / 16
+    range_noise: float = 0.02
+    reach: float = 25.0
+    ground_height: float = 0.0
+    cell: float = 0.15
+
+    def __post_init__(self) -> None:
+        checks = {
+            "azimuth_step": (0.0 < self.azimuth_step < 0.1, "in rad, above 0 and below 0.1"),
+            "elevation_step": (0.0 < self.elevation_step < 0.5, "in rad, above 0 and below 0.5"),
+            "range_noise": (0.0 < self.range_noise < inf, "in m, positive"),
+            "reach": (0.0 < self.reach <= 200.0, "in m, positive and at most 200"),
+            "ground_height": (-inf < self.ground_height < inf, "in m, finite"),
+            "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
+        }
+        check_settings(type(self).__name__, self, checks)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """The points of a scan, with the scanner at the origin.
 
     Attributes:
-        points: In m, z up, (n, 3).
-        distances: In the plane, in m, (n,).
+        points: Positions in m, z up, (n, 3).
+        distances: Horizontal distances in m, (n,).
         azimuths: Directions in the plane in rad, (n,).
-        slopes: z / distance, (n,).
+        slopes: The quotients z / distance, (n,).
+        heights: Heights over the ground in m, (n,).
     """
 
     points: Array
     distances: Array
     azimuths: Array
     slopes: Array
+    heights: Array
 
     @classmethod
-    def of(cls, points: ArrayLike, eye: ArrayLike, *, reach: float) -> Scene:
-        """Return points (n, 3) as seen from ``eye`` (3,), up to a distance in the plane; all in m.
+    def of(cls, points_H: ArrayLike, p_HoLo_H: ArrayLike, detector: ScanDetector) -> Scene:
+        """Return the points within the reach of a detector, as the scanner sees them.
+
+        Args:
+            points_H: The points in the level frame H of the carrier in m, shape (n, 3).
+            p_HoLo_H: Where the scanner is, shape (3,) in m.
+            detector: The reach, and the height of the ground beneath the scanner.
 
         Raises:
-            ValueError: The points or the eye have another shape, or are not finite.
+            ValueError: The points or the place of the scanner have another shape, or are not finite.
         """
-        seen, origin = np.asarray(points, dtype=float), np.asarray(eye, dtype=float)
-        if seen.ndim != 2 or seen.shape[1] != 3 or origin.shape != (3,):
-            raise ValueError(
-                f"points have the shape (n, 3), the scanner's place (3,), not {seen.shape}, {origin.shape}"
-            )
-        if not (np.isfinite(seen).all() and np.isfinite(origin).all()):
+        seen, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
+        if seen.ndim != 2 or seen.shape[1] != 3 or eye.shape != (3,):
+            raise ValueError(f"points have the shape (n, 3), the scanner's place (3,), not {seen.shape}, {eye.shape}")
+        if not (np.isfinite(seen).all() and np.isfinite(eye).all()):
             raise ValueError("points and the scanner's place are finite numbers: leave rays without a return out")
-        seen = seen - origin
+        seen = seen - eye
         distances = np.hypot(seen[:, 0], seen[:, 1])
-        near = np.flatnonzero((distances <= reach) & (distances > 0.0))
+        near = np.flatnonzero((distances <= detector.reach) & (distances > 0.0))
         seen, distances = seen[near], distances[near]
-        return cls(seen, distances, np.arctan2(seen[:, 1], seen[:, 0]), seen[:, 2] / distances)
+        ground = fit_ground(seen, np.array([0.0, 0.0, detector.ground_height - eye[2]]), reach=detector.reach)
+        heights = seen[:, 2] - ground.at(seen[:, :2])
+        return cls(seen, distances, np.arctan2(seen[:, 1], seen[:, 0]), seen[:, 2] / distances, heights)
 
     def __len__(self) -> int:
         return len(self.distances)
 
     def select(self, rows: Indices) -> Scene:
         """Return the points with these indices."""
-        return Scene(self.points[rows], self.distances[rows], self.azimuths[rows], self.slopes[rows])
+        return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +185,14 @@ class Clusters:
         total: Array = np.add.reduceat(values, self.starts, axis=0)
         return total
 
-    def hidden_edges(self, *, azimuth_step: float, elevation_step: float, gap: float) -> NDArray[np.bool_]:
+    def hidden_edges(self, detector: ScanDetector, *, gap: float) -> NDArray[np.bool_]:
         """Return whether something nearer begins where a cluster ends, to the right and to the left, (k, 2).
 
         Args:
-            azimuth_step: Angle between neighbouring rays of a row in rad.
-            elevation_step: Angle between neighbouring rows in rad.
+            detector: The angles between rays.
             gap: By how much it is nearer than the points of the cluster, in m.
         """
+        azimuth_step, elevation_step = detector.azimuth_step, detector.elevation_step
         columns, lowest = max(round(2.0 * pi / azimuth_step), 1), self.scene.slopes.min()
         lines = int((self.scene.slopes.max() - lowest) / elevation_step) + 1
         line = ((self.scene.slopes - lowest) / elevation_step).astype(np.intp)

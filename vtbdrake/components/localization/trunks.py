@@ -22,14 +22,14 @@ for a measurement beside the ranges. Covariances are those of the weighted least
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, pi
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.components.localization.ground import fit_ground
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.scene import Cells, Clusters, Scene
+from vtbdrake.components.localization.planar import rotations
+from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetector, Scene
 from vtbdrake.components.settings import check_settings
 
 Array = NDArray[np.float64]
@@ -54,26 +54,21 @@ _NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
-class TrunkDetector:
-    """How trunks are found. The steps must be those of the scanner.
+class TrunkDetector(ScanDetector):
+    """How trunks are found. The other attributes are those of `ScanDetector`: the angles must be those of the scanner.
+
+    Trunks whose bark is less than two cells apart are one object, which is mostly refused.
 
     Attributes:
-        azimuth_step: Angle between neighbouring rays of a row in rad.
-        elevation_step: Angle between neighbouring rows in rad.
-        range_noise: Standard deviation of a range in m.
         roughness: Standard deviation of the surface of a trunk from a cylinder in m: bark, ovality.
-        reach: Distance in m from the scanner up to which trunks are looked for.
         heights: The lower and the upper end of the slice over the ground in m.
         reference_height: Height over the ground in m of the point of the axis that is the position of the landmark.
-        ground_height: The z in H of the ground under the scanner in m: 0 if the origin of B is on the ground.
         least_diameter: The least diameter of a trunk in m.
         largest_diameter: Its largest diameter in m.
         upright_share: The share of the rows passing a place that must be returned from there.
         typical_diameter: Mean in m of the diameters to be expected before anything is measured.
         diameter_spread: Their standard deviation in m.
         lean: Standard deviation of the lean in rad, per axis, before anything is measured.
-        cell: Edge length in m of the cells in which points are gathered; trunks whose bark is less than two cells apart
-            are one object, which is mostly refused.
         largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
         position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight, and the foot
             of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad below breast height.
@@ -83,43 +78,32 @@ class TrunkDetector:
         ValueError: A value that no detector can have.
     """
 
-    azimuth_step: float = 2.0 * pi / 1250
-    elevation_step: float = pi / 6.0 / 16
-    range_noise: float = 0.02
     roughness: float = 0.005
-    reach: float = 25.0
     heights: tuple[float, float] = (0.7, 2.7)
     reference_height: float = 1.3
-    ground_height: float = 0.0
     least_diameter: float = 0.04
     largest_diameter: float = 0.7
     upright_share: float = 0.5
     typical_diameter: float = 0.2
     diameter_spread: float = 0.15
     lean: float = 0.03
-    cell: float = 0.15
     largest_misfit: float = 2.0
     position_floor: float = 0.015
     diameter_floor: float = 0.01
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         low, high = self.heights
         checks = {
-            "azimuth_step": (0.0 < self.azimuth_step < 0.1, "in rad, above 0 and below 0.1"),
-            "elevation_step": (0.0 < self.elevation_step < 0.5, "in rad, above 0 and below 0.5"),
-            "range_noise": (0.0 < self.range_noise < inf, "in m, positive"),
             "roughness": (0.0 <= self.roughness < inf, "in m, at least 0"),
-            "reach": (0.0 < self.reach <= 200.0, "in m, positive and at most 200"),
             "heights": (0.0 < low < high < inf, "in m, two positive heights, the lower one first"),
             "reference_height": (0.0 <= self.reference_height < inf, "in m, at least 0"),
-            "ground_height": (-inf < self.ground_height < inf, "in m, finite"),
             "least_diameter": (0.0 < self.least_diameter < self.largest_diameter, "in m, below the largest_diameter"),
             "largest_diameter": (self.largest_diameter < inf, "in m, finite"),
             "upright_share": (0.0 <= self.upright_share <= 1.0, "a share from 0 to 1"),
             "typical_diameter": (0.0 < self.typical_diameter < inf, "in m, positive"),
             "diameter_spread": (0.0 < self.diameter_spread < inf, "in m, positive"),
             "lean": (0.0 < self.lean < 0.5, "in rad, above 0 and below 0.5"),
-            "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
             "largest_misfit": (self.largest_misfit > 0.0, "positive"),
             "position_floor": (0.0 <= self.position_floor < inf, "in m, at least 0"),
             "diameter_floor": (0.0 <= self.diameter_floor < inf, "in m, at least 0"),
@@ -141,23 +125,18 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: Arr
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    eye = np.asarray(p_HoLo_H, dtype=float)
-    scene = Scene.of(points_H, eye, reach=detector.reach)
-    if not len(scene):
-        return Landmarks.empty()
-    ground = fit_ground(scene.points, np.array([0.0, 0.0, detector.ground_height - eye[2]]), reach=detector.reach)
-    heights = scene.points[:, 2] - ground.at(scene.points[:, :2])
-    clusters = _upright(scene, heights, detector)
+    scene = Scene.of(points_H, p_HoLo_H, detector)
+    clusters = _upright(scene, detector)
     if not len(clusters.rows):
         return Landmarks.empty()
-    return _Fit(clusters, heights[clusters.rows] - detector.reference_height, detector).trunks(eye[:2])
+    return _Fit(clusters, detector).trunks(np.asarray(p_HoLo_H)[:2])
 
 
-def _upright(scene: Scene, heights: Array, detector: TrunkDetector) -> Clusters:
-    """Return the points that stand above each other in the slice; ``heights`` are those over the ground in m, (n,)."""
+def _upright(scene: Scene, detector: TrunkDetector) -> Clusters:
+    """Return the points that stand above each other in the slice."""
     low, high = detector.heights
-    chosen = np.flatnonzero((heights >= low) & (heights < high))
-    heights, distances = heights[chosen], scene.distances[chosen]
+    chosen = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
+    heights, distances = scene.heights[chosen], scene.distances[chosen]
     cells = Cells.of(scene.points[chosen], size=detector.cell, reach=detector.reach)
     layer = (high - low) / _LAYERS
     filled = np.zeros((cells.side**2, _LAYERS), dtype=bool)
@@ -169,8 +148,8 @@ def _upright(scene: Scene, heights: Array, detector: TrunkDetector) -> Clusters:
     seen = np.bitwise_count(bits.ravel()[cells.flat])
     # The layers in which rays passed: no more than the field of view has rows there.
     eye_heights = heights - scene.points[chosen, 2]
-    top = np.minimum(eye_heights + distances * scene.slopes.max(), high)
-    bottom = np.maximum(eye_heights + distances * scene.slopes.min(), low)
+    top = np.minimum(eye_heights + distances * scene.slopes.max(initial=-inf), high)
+    bottom = np.maximum(eye_heights + distances * scene.slopes.min(initial=inf), low)
     passed = (top - bottom) / np.maximum(detector.elevation_step * distances, layer)
     upright = np.flatnonzero(seen >= np.maximum(detector.upright_share * passed, 2.0))
     rows, owners = cells.connected(upright)
@@ -184,16 +163,13 @@ class _Fit:
     [x, y, r, l_x, l_y]: its axis at the reference height, its radius, its lean.
     """
 
-    def __init__(self, clusters: Clusters, heights: Array, detector: TrunkDetector) -> None:
-        """Prepare the fit; ``heights`` are those of the n points over the reference height in m."""
-        self._clusters, self._heights, self._detector = clusters, heights, detector
+    def __init__(self, clusters: Clusters, detector: TrunkDetector) -> None:
+        self._clusters, self._detector = clusters, detector
+        # Over the reference height.
+        self._heights = clusters.scene.heights[clusters.rows] - detector.reference_height
         self._variance = detector.range_noise**2 + detector.roughness**2
         self._cosines, self._sines = np.cos(clusters.azimuths), np.sin(clusters.azimuths)
-        self._hidden = clusters.hidden_edges(
-            azimuth_step=detector.azimuth_step,
-            elevation_step=detector.elevation_step,
-            gap=detector.cell + _GATE * self._variance**0.5,
-        )
+        self._hidden = clusters.hidden_edges(detector, gap=detector.cell + _GATE * self._variance**0.5)
         self._columns = self._persistent()
         self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
 
@@ -213,8 +189,7 @@ class _Fit:
         # Without enough points on it, a fit says where the trunk is no better than the cluster does.
         good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (0.5 * detector.largest_diameter) ** 2
         good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
-        c, s = np.cos(clusters.bearings), np.sin(clusters.bearings)
-        R = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)[good]
+        R = rotations(clusters.bearings[good])
         positions = origin + np.einsum("kij,kj->ki", R, cylinders[good, :2])
         P = R @ covariances[good, :2, :2] @ R.transpose(0, 2, 1) + detector.position_floor**2 * np.eye(2)
         deviations = np.hypot(2.0 * np.sqrt(covariances[good, 2, 2]), detector.diameter_floor)
