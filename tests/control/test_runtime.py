@@ -9,6 +9,7 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.fallback import FallbackController, Zero
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
@@ -420,6 +421,23 @@ def test_loop_that_overslept_sends_no_dps_command():
     runtime.run(cycles=6)
     assert (np.linalg.norm(sent(bridge), axis=1) > 0.0).tolist() == [True] * 4 + [False] * 2
     assert runtime.guards.latched[0].kind == "missed" and runtime.statistics.misses == 50
+
+
+def test_loop_that_overslept_reads_all_that_has_waited():
+    used = []
+
+    def fall_back(last_sent, sensed, known, dt):
+        used.append(sensed["position"][0])
+        return last_sent
+
+    fallback = {"velocity": FallbackController(fall_back, otherwise=Zero())}
+    guards = Guards(ServoScenario(rate=0.0).interface(), PERIOD, fallback=fallback)
+    waiting = [0.05, 0.06, 0.07, 0.08]  # One poll does not read them all.
+    runtime, bridge, _ = switched(rate=0.0, lateness=[0.0] * 4 + [50.4 * PERIOD], guards=guards)
+    runtime.run(cycles=4)
+    bridge.sensors = lambda t: {"position": [waiting.pop(0), 0.0], "speed": [0.0, 0.0]} if waiting else {}
+    runtime.run(cycles=1)
+    assert used == [0.08]
 
 
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])

@@ -45,6 +45,14 @@ def test_signal_is_stale_beyond_max_age() -> None:
     assert kind(monitor, 1.0625, sample) is None
 
 
+def test_stale_signal_tells_which_messages_were_rejected() -> None:
+    monitor, sample = SensorMonitor(signal()), ReceivedSignal()
+    for _ in range(3):
+        sample.reject("not finite")
+    reason = "sensor signal encoders has never arrived; messages rejected so far: 3 not finite"
+    assert monitor.check(1.0, sample).reason == reason
+
+
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 @pytest.mark.parametrize("size", [2, 100])
 @pytest.mark.parametrize("place", [0, -1])

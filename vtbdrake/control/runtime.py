@@ -33,6 +33,7 @@ from vtbdrake.testbed.interrupt import Interruptible
 _log = logging.getLogger(__name__)
 
 _LOG_PERIOD = 1.0  # s, for messages that could be logged in every cycle
+_MOST_POLLS = 100  # of what has waited while the loop was held up
 
 
 class Runtime(Stepped):
@@ -228,6 +229,8 @@ class Runtime(Stepped):
         begin = self.clock.now()
         if poll:
             self.bridge.poll()
+        if lateness > self.period:
+            self._read_backlog()
         now = self.clock.now()
         self._serve()
         self.take_commands()
@@ -262,6 +265,12 @@ class Runtime(Stepped):
                 _log.exception("a watcher of the loop raised, and is removed")
                 self._watchers.remove(watcher)
         return done
+
+    def _read_backlog(self) -> None:
+        """Receive all that has waited while the loop was held up: a fallback takes what has just arrived for new."""
+        for _ in range(_MOST_POLLS):
+            if not self.bridge.poll():
+                return
 
     def _overrun(self, lateness: float, worked: float) -> int:
         """Return how many deadlines have passed before anything is sent: after an overrun the inputs are stale.

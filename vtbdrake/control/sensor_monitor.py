@@ -105,10 +105,15 @@ class SensorMonitor(StalenessMonitor):
     def stale(self, now: float, received: ReceivedSignal) -> Fault:
         """Return the fault of a signal that is too old or has never arrived."""
         name = self.signal.name
-        if not received.count:
-            return Fault(now, name, "stale", f"sensor signal {name} has never arrived")
-        age = f"{1e3 * received.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
-        return Fault(now, name, "stale", f"sensor signal {name} is stale: {age}")
+        if received.count:
+            age = f"{1e3 * received.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
+            reason = f"sensor signal {name} is stale: {age}"
+        else:
+            reason = f"sensor signal {name} has never arrived"
+        if received.rejected:
+            rejected = ", ".join(f"{count} {why}" for why, count in received.rejected.items())
+            reason += f"; messages rejected so far: {rejected}"
+        return Fault(now, name, "stale", reason)
 
     def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
         """Return the fault of a new sample, or None."""
