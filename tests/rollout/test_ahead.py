@@ -1,5 +1,7 @@
 """Workers that are given their next rollout ahead: it is not bound to the fate of the one before it."""
 
+import os
+import signal
 import time
 from math import inf
 
@@ -8,7 +10,7 @@ import pytest
 
 from tests.rollout.scenarios import HANG, KILL, TreacherousScenario
 from tests.testbeds import PendulumScenario
-from vtbdrake.rollout import ProcessExecutor, Quality, RolloutTask, SerialExecutor, worker_processes
+from vtbdrake.rollout import Cutoff, ProcessExecutor, Quality, RolloutTask, SerialExecutor, worker_processes
 
 THETA = "sim.sys.Pendulum.theta.position"
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -109,3 +111,15 @@ def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
         list(executor.run(task, _points(1)))
         assert _watched(executor, task, _points(3))[1] == 2
     assert caplog.text == ""
+
+
+@pytest.mark.parametrize("seconds", [inf, 0.2])
+def test_a_worker_that_is_stopped_between_rollouts_is_replaced(seconds, caplog):
+    with ProcessExecutor(1, time_limit=1.0 if seconds == inf else inf) as executor:
+        list(executor.run(TASK, _points(1)))
+        os.kill(executor._workers[0].child.pid, signal.SIGSTOP)
+        results = dict(executor.run(TASK, _points(2), cutoff=Cutoff(deadline=time.monotonic() + seconds)))
+        assert len(results) == (2 if seconds == inf else 0)
+        assert not any(result.failed for result in results.values())
+        assert ("longer than its time limit" in caplog.text) == (seconds == inf)
+        assert len(dict(executor.run(TASK, _points(2)))) == 2

@@ -21,7 +21,7 @@ from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds, failed
+from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds, failed, split
 from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
@@ -112,7 +112,7 @@ class ProcessExecutor(Executor):
             left = len(points)
             while left:
                 finished: list[tuple[int, RolloutResult]] = []
-                replies = self._replies(cutoff)
+                replies = self._replies(call)
                 if not self._workers:
                     raise WorkerError("the executor was closed while it had rollouts to run")
                 for worker, index, reply in replies:
@@ -184,10 +184,18 @@ class ProcessExecutor(Executor):
                     raise WorkerError(str(error)) from error
             return False
         self._starts_lost = 0
+        if len(worker.jobs) == 1:
+            self._expect(worker, call)
         return True
 
-    def _replies(self, cutoff: Cutoff | None) -> list[tuple[_Worker, int, Any]]:
+    def _expect(self, worker: _Worker, call: _Call) -> None:
+        """Limit the time in which a worker begins its next rollout, if it has the testbed of that: else it is stopped."""
+        if worker.warm and not split(call.points[worker.jobs[0]])[0]:
+            worker.begin(self._time_limit, call.cutoff)
+
+    def _replies(self, call: _Call) -> list[tuple[_Worker, int, Any]]:
         """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
+        cutoff = call.cutoff
         busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
         if not busy:
             return []
@@ -210,6 +218,8 @@ class ProcessExecutor(Executor):
                     else:
                         reply = pickle.loads(message)
                         worker.finish(*reply)
+                        if worker.jobs:
+                            self._expect(worker, call)
                         replies.append((worker, index, reply[1]))
                 except (EOFError, OSError):
                     code = worker.child.wait()
@@ -253,6 +263,7 @@ class _Worker:
         self._start = b""  # Of the rollouts that it is given; empty if they begin at the task's own s0.
         self.jobs: deque[int] = deque()  # The rollout that it runs, and one that was given ahead.
         self.deadline = inf
+        self.warm = False  # True after the first rollout of a task: it has the testbed.
         self.brief = False  # True after a short rollout.
         self.grown = False  # True when its memory has grown so much that it must be replaced.
 
@@ -267,7 +278,7 @@ class _Worker:
             self.child.wait_until_ready(None)
             self.connection = Connection(self.child.connection.detach())
         if self._task != task:
-            self.brief = False
+            self.warm = self.brief = False
             self.connection.send_bytes(b"T" + task)
             self._task = task
         if not self.has(start):
@@ -276,7 +287,7 @@ class _Worker:
         self.connection.send_bytes(message)
 
     def begin(self, time_limit: float, cutoff: Cutoff | None) -> None:
-        """Start the time limit: the worker has its testbed and begins its rollout."""
+        """Start the time limit: the worker has its testbed, and begins its rollout or is about to."""
         now = time.monotonic()
         self.deadline = now + time_limit
         if cutoff is not None:
@@ -287,6 +298,7 @@ class _Worker:
         assert index == self.jobs[0], "a worker answers to another rollout than its own"
         self.jobs.popleft()
         self.deadline = inf
+        self.warm = True
         self.brief = isinstance(outcome, RolloutResult) and outcome.wall_time < _BRIEF
 
     def kill(self) -> None:
