@@ -303,6 +303,8 @@ def test_an_old_belief_is_refused(tracked):
     starter.start(belief, now=0.7)
     with pytest.raises(BeliefError, match=r"of t = 0.63 s and 0.12 s old, but at most 0.1 s"):
         starter.start(belief, now=0.75)
+    with pytest.raises(BeliefError, match="nan s old"):
+        starter.start(belief, now=float("nan"))
 
 
 def test_a_world_without_rules_is_refused():

@@ -216,6 +216,7 @@ def test_when_the_time_is_over_rollouts_under_way_are_cancelled(name, executors,
     assert [candidate.status for candidate in decision.candidates] == ["unfinished"]
     assert "1 did not finish" in decision.message
     assert "the budget of 0.05 s is spent" in decision.message
+    assert "not even that of the plan in use" in decision.warnings[0]
 
 
 def test_a_budget_of_time_gives_the_best_so_far(mass):
@@ -224,6 +225,26 @@ def test_a_budget_of_time_gives_the_best_so_far(mass):
     assert decision.end == "time"
     assert decision.quality == min(finished)
     assert decision.health.used >= 1.0
+
+
+class Losing(SerialExecutor):
+    """Cancels the first rollout, as a deadline does where a worker was lost."""
+
+    def run(self, *arguments, **options):
+        return (found for found in super().run(*arguments, **options) if found[0])
+
+
+def test_a_decision_without_the_plan_in_use_is_poor(mass):
+    decision = decide(make(executor=Losing(), method="random", budget=Budget(rollouts=3, seconds=1e4)), mass)
+    assert [candidate.status for candidate in decision.candidates] == ["unfinished", "eligible", "eligible"]
+    assert decision.warnings == ("the plan in use has not finished: the decision may be worse than none",)
+
+
+def test_a_late_decision_is_poor(mass):
+    # One sample of three seconds: it cannot end earlier.
+    decision = decide(make(sample_period=3.0, budget=Budget(seconds=1e-3)), mass)
+    late, *_ = [warning for warning in decision.warnings if "its budget is 0.001 s" in warning]
+    assert f"it took {decision.health.elapsed:.3g} s" in late
 
 
 def test_of_two_budgets_the_one_that_ends_first_counts(mass):
@@ -484,6 +505,17 @@ def test_health_tells_improvement_margin_and_time(mass):
     assert decision.health.rollouts == 3
     assert decision.health.used == pytest.approx(0.1)
     assert 0.0 < decision.health.rollout_time * 3 <= decision.health.elapsed
+
+
+def test_a_candidate_that_there_is_not_has_no_motion(mass):
+    reasoner = make(budget=Budget(rollouts=2))
+    with pytest.raises(ValueError, match="the candidates 0 to 1, and no 2"):
+        reasoner.motion(decide(reasoner, mass), 2)
+
+
+def test_a_method_of_random_numbers_from_the_clock_says_so():
+    assert make(method="CEM").reproducible
+    assert not make(method="GN_ESCH").reproducible
 
 
 def test_a_quality_that_ignores_the_decision_is_reported(mass):

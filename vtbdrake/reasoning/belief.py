@@ -236,7 +236,7 @@ class Starter:
         if not isinstance(belief, Belief):
             raise BeliefError(f"a rollout begins from a Belief, from Belief.of(testbed, context), say, not {belief!r}")
         age = now - belief.dps.time
-        if age > self._max_age:
+        if not age <= self._max_age:
             raise BeliefError(
                 f"the belief is of t = {belief.dps.time:g} s and {age:g} s old, but at most {self._max_age:g} s are "
                 "allowed (max_age)"

@@ -259,6 +259,11 @@ class _Thinker:
         ((path, part),) = parts.items()
         self._variables = {element.name: testbed.variables()[f"{path}.{element.name}"] for element in part.variables}
         self._places = {name: testbed.dps_layout.slice_of(variable) for name, variable in self._variables.items()}
+        if not reasoner.reproducible:
+            raise ValueError(
+                f"{self._arguments['method']} takes its random numbers from the clock, so that a run could not be "
+                "repeated: take CEM, say"
+            )
         for element in self._arguments["decision"]:
             if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
                 raise ValueError(f"a reasoner on board decides {path}.{_CANDIDATE}, not {element.address}")

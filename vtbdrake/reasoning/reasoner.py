@@ -84,6 +84,8 @@ class Reasoner:
         space: what is decided.
         budget: how much a decision may take.
         samples: how many samples of the belief each candidate is simulated from.
+        reproducible: whether a decision can be repeated; false with the few methods that take their random numbers from
+            the clock.
 
     Raises:
         ValueError: an address is not part of the DPS, the mental scenario has other commands, the budget does not
@@ -148,7 +150,9 @@ class Reasoner:
         self._seed = as_whole("a seed", seed)
         # A method that cannot decide this is refused here. Candidate 0 is not its own.
         affordable = None if budget.rollouts is None else max(budget.rollouts // self.samples - 1, 1)
-        self.solver(0.0, budget=affordable).close()
+        solver = self.solver(0.0, budget=affordable)
+        solver.close()
+        self.reproducible = solver.reproducible
         self._workers = checked_workers(workers)
         self._owned = not isinstance(executor, Executor)
         self.executor = _make_executor(executor, self.problem, budget, workers, time_limit)
@@ -254,7 +258,14 @@ class Reasoner:
         Args:
             decision: a decision of this reasoner.
             candidate: the number of the candidate.
+
+        Raises:
+            ValueError: the decision has no such candidate.
         """
+        if not 0 <= candidate < len(decision.candidates):
+            raise ValueError(
+                f"the decision has the candidates 0 to {len(decision.candidates) - 1}, and no {candidate!r}"
+            )
         task = replace(self.task, record=("plant.state",), pruning=None)
         values = decision.candidates[candidate].values if candidate else {}
         result = RolloutRunner(task, self.problem.testbed).run(values, start=decision.starts[0])

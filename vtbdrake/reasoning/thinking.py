@@ -40,6 +40,10 @@ _ROUND = 8
 _KNOWN_BATCHES = 50
 
 
+# A decision is late if it took so many times its wall time.
+_LATE = 1.5
+
+
 class _BudgetSpentError(Exception):
     """The end of a decision in the middle of a batch."""
 
@@ -244,7 +248,7 @@ class Thinking:
             end=end,
             message=message if best is not None else f"no candidate is eligible ({_why_none(candidates)}); {message}",
             time=self._time,
-            warnings=tuple(_warnings(candidates, ranked, results)),
+            warnings=tuple(_warnings(candidates, ranked, results, elapsed, budget)),
             name=problem.objectives[0].name,
             minimize=problem.objectives[0].minimize,
             starts=tuple(self._starts),
@@ -289,7 +293,11 @@ def _why_none(candidates: Sequence[Candidate]) -> str:
 
 
 def _warnings(
-    candidates: Sequence[Candidate], ranked: Sequence[Candidate], results: Sequence[RolloutResult]
+    candidates: Sequence[Candidate],
+    ranked: Sequence[Candidate],
+    results: Sequence[RolloutResult],
+    elapsed: float,
+    budget: Budget,
 ) -> Iterator[str]:
     """Yield what speaks against a decision.
 
@@ -297,11 +305,22 @@ def _warnings(
         candidates: all.
         ranked: the eligible ones, from the best to the worst.
         results: all rollouts that have finished.
+        elapsed: the wall time of the decision, in seconds.
+        budget: how much it might take.
     """
     failures = [result.message for result in results if result.failed]
     if failures:
         yield f"{len(failures)} of {len(results)} rollouts failed, the first: {failures[0]}"
-    if len(candidates) == 1:
+    if not results:
+        yield "no rollout has finished, not even that of the plan in use: the budget is too small, or one is too slow"
+    elif len(candidates) == 1:
         yield "nothing but the plan in use was tried: the budget is too small, or a rollout too slow"
+    elif candidates[0].status == UNFINISHED:
+        yield "the plan in use has not finished: the decision may be worse than none"
+    if budget.seconds is not None and elapsed > _LATE * budget.seconds:
+        yield (
+            f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a worker was lost, or the time from one "
+            "sample to the next is too long"
+        )
     if len(ranked) > 1 and ranked[0].quality == ranked[-1].quality:
         yield f"all {len(ranked)} eligible candidates are equally good: within the horizon, the quality ignores them"

@@ -189,7 +189,7 @@ class ProcessExecutor(Executor):
         return True
 
     def _expect(self, worker: _Worker, call: _Call) -> None:
-        """Limit the time in which a worker begins its next rollout, if it has the testbed of that: else it is stopped."""
+        """Limit the time until a worker begins its next rollout, if it has the testbed of that already."""
         if worker.warm and not split(call.points[worker.jobs[0]])[0]:
             worker.begin(self._time_limit, call.cutoff)
 
