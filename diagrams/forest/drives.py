@@ -2,7 +2,8 @@
 
 ``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each forest
 once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
-map localizes, as that of the DPS would. ``--simulated`` takes simulated detections (`detections`) instead.
+map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the scanner,
+``--simulated`` takes simulated detections (`detections`).
 
 What counts, fixed before any of the forests from `SEED` on was driven:
 
@@ -49,7 +50,7 @@ STANDING = 2.0
 """How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
 _POSE = "sim.sys.carrier.base.pose"
-_SCAN, _SCAN_TIME = "dps.env.scan_arrival.sample", "dps.env.scan_arrival.time"
+_ARRIVAL = "dps.env.{eye}_arrival"
 _HISTORY = "dps.env.dead_reckoning.history"
 
 SCANS = 5.0
@@ -185,7 +186,7 @@ def simulated_drive(
 
 
 def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
-    """Simulate a carrier that stands at first, and return what its DPS detects in each scan, and its odometry.
+    """Simulate a carrier that stands at first, and return what its DPS detects in each sample, and its odometry.
 
     Args:
         scenario: The carrier in its world; its map does not matter.
@@ -195,11 +196,13 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         RuntimeError: The carrier does not get there in twice the time that it should take.
     """
     testbed, see = scenario.build(), scenario.sight()
-    pose, scan, time, history = (testbed.reader(address) for address in (_POSE, _SCAN, _SCAN_TIME, _HISTORY))
+    arrivals = [_ARRIVAL.format(eye=signal.name) for signal in scenario.eyes()]
+    pose, time, history = (testbed.reader(address) for address in (_POSE, f"{arrivals[-1]}.time", _HISTORY))
+    samples = [testbed.reader(f"{arrival}.sample") for arrival in arrivals]
     simulator = testbed.simulator()
     context = simulator.get_mutable_context()
     testbed.write(context, {_SPEED: 0.0})
-    period = 1.0 / scenario.scanner.frequency
+    period = scenario.eye_period
     limit = STANDING + 2.0 * length / scenario.speed + 10.0
     rows: list[tuple[float, Array, Array]] = []
     landmarks: list[Landmarks] = []
@@ -213,11 +216,12 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         if due > STANDING:
             testbed.write(context, {_SPEED: scenario.speed})
         truth = pose(context)[[0, 1, 5]]
-        # By then the scan has arrived, and its time lies within the history.
+        # By then the sample has arrived, and its time lies within the history.
         simulator.AdvanceTo(due + 2.0 * PERIOD)
         taken, past = float(time(context)), history(context)
         rows.append((taken, truth, carrier_pose_at(past, taken)[3:]))
-        landmarks.append(see(scan(context), past, taken) if taken >= SETTLED else Landmarks.empty())
+        seen = [sample(context) for sample in samples]
+        landmarks.append(see(*seen, past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:
             travelled += float(np.hypot(*(truth - rows[-2][1])[:2]))
     times, truths, reckoned = (np.array(column) for column in zip(*rows, strict=True))
@@ -387,20 +391,23 @@ def row(name: str, found: Score) -> tuple[str, ...]:
     )
 
 
-def forest(seed: int, *, range_bias: float = 0.0) -> ForestScenario:
+def forest(seed: int, *, range_bias: float = 0.0, perception: str = "scanner") -> ForestScenario:
     """Return the scenario of a drive: a stand as dense as published plots, every third one clustered.
 
     Args:
         seed: Determines stand, route, where on it the drive begins, and the noise of all sensors.
         range_bias: Of the scanner, in m.
+        perception: ``scanner`` or ``stereo``.
     """
     rng = np.random.default_rng([seed, 9])
     scenario = ForestScenario(
         seed=seed,
+        perception=perception,
         stand_kind="clustered" if seed % 3 == 2 else "natural",
         density=float(rng.uniform(*DENSITIES)),
     )
     scenario.scanner_errors.bias = range_bias
+    scenario.stereo.seed = seed
     for errors in (scenario.scanner_errors, scenario.imu_errors, scenario.odometry_errors):
         errors.seed = seed
     routes = scenario.routes()
@@ -416,15 +423,17 @@ class Drives:
         length: Of each, in m.
         range_bias: Of the scanner, in m.
         is_simulated: Whether detections are simulated, instead of the scanner.
+        perception: What the carrier sees with, if they are not: ``scanner`` or ``stereo``.
     """
 
     length: float = 50.0
     range_bias: float = 0.0
     is_simulated: bool = False
+    perception: str = "scanner"
 
     def __call__(self, seed: int) -> dict[str, Track]:
         """Return what units with each of the maps say in the forest of a seed."""
-        scenario = forest(seed, range_bias=self.range_bias)
+        scenario = forest(seed, range_bias=self.range_bias, perception=self.perception)
         # One thread: matrices are small, and threads that wait for each other take most of the time.
         with threadpool_limits(1):
             if self.is_simulated:
@@ -451,12 +460,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--forests", type=int, default=20)
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--bias", type=float, default=0.0, help="of the ranges, in m")
+    parser.add_argument("--bias", type=float, default=0.0, help="of the scanner's ranges, in m")
     parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
-    parser.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
+    eyes = parser.add_mutually_exclusive_group()
+    eyes.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
+    eyes.add_argument("--stereo", action="store_true", help="a pair of cameras instead of a scanner")
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.simulated)
+    if chosen.stereo and chosen.bias:
+        parser.error("--bias is one of the scanner's ranges: leave it out with --stereo")
+    perception = "stereo" if chosen.stereo else "scanner"
+    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.simulated, perception)
     found, seeds = [], range(chosen.seed, chosen.seed + chosen.forests)
     for tracks in drives.through(seeds, workers=chosen.workers):
         found.append(tracks)

@@ -206,9 +206,14 @@ class CarrierScenario(Scenario):
                 f"the motion of the last {HISTORY_LENGTH:g} s"
             )
 
+    @property
+    def eye_period(self) -> float:
+        """The time from one sample of what the DPS sees landmarks with to the next, in s."""
+        return 1.0 / self.scanner.frequency
+
     def eyes(self) -> list[Signal]:
         """Return the signals of what the DPS sees landmarks with."""
-        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency)]
+        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.eye_period)]
 
     def interface(self) -> Interface:
         last = len(self.routes()) - 1.0
@@ -239,7 +244,13 @@ class CarrierScenario(Scenario):
         """Return how the DPS localizes itself on a map, which has errors as ``map`` says."""
         landmarks, correlation = map_landmarks(world_map, self.landmark), MAPS[self.map].correlation
         x, y, z = self.X_BL.translation().tolist()
-        tracker = Tracker(landmarks, sensor=(x, y), scan_deviation=_LEVELLING * z, correlation=correlation)
+        tracker = Tracker(
+            landmarks,
+            sensor=(x, y),
+            field_of_view=self.scanner.azimuth,
+            scan_deviation=_LEVELLING * z,
+            correlation=correlation,
+        )
         return LocalizationUnit(ConstellationMap(landmarks, correlation=correlation), tracker)
 
     def make_dps(self) -> Diagram:
@@ -249,7 +260,7 @@ class CarrierScenario(Scenario):
         return make_dps(world_map, localizer, eyes, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
-        return make_deployment(scan_map("SCAN", "scan"), period=1.0 / self.scanner.frequency)
+        return make_deployment(scan_map("SCAN", "scan"), period=self.eye_period)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
@@ -384,13 +395,17 @@ class ForestScenario(CarrierScenario):
         else:
             self.stereo.check()
 
+    @property
+    def eye_period(self) -> float:
+        return super().eye_period if self.perception == "scanner" else 1.0 / self.stereo.rate
+
     def eyes(self) -> list[Signal]:
         if self.perception == "scanner":
             return super().eyes()
         from pydrake.systems.sensors import ImageRgba8U
 
         image = ImageRgba8U(self.stereo.width, self.stereo.height)
-        return [Signal(name, model_value=image, max_age=5.0 / self.stereo.rate) for name in IMAGES]
+        return [Signal(name, model_value=image, max_age=5.0 * self.eye_period) for name in IMAGES]
 
     def sight(self) -> Callable[..., Landmarks]:
         if self.perception == "scanner":
@@ -399,13 +414,17 @@ class ForestScenario(CarrierScenario):
         return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetector(), X_BC)
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
-        return replace(super().unit(world_map), begins_with_submap=self.perception == "stereo")
+        unit = super().unit(world_map)
+        if self.perception == "scanner":
+            return unit
+        tracker = replace(unit.tracker, field_of_view=self.stereo.camera().field_of_view)
+        return replace(unit, tracker=tracker, begins_with_submap=True)
 
     def deployment(self) -> Deployment:
         if self.perception == "scanner":
             return super().deployment()
         images = image_array_map("IMAGES", {name: name for name in IMAGES})
-        return make_deployment(images, period=1.0 / self.stereo.rate)
+        return make_deployment(images, period=self.eye_period)
 
     def add_eyes(self, builder: VirtualTestbedBuilder) -> None:
         if self.perception == "scanner":

@@ -44,6 +44,8 @@ class StereoConfig:
     baseline: float = 0.3
     # Standard deviation of the read noise, in counts of 255.
     noise: float = 1.5
+    # Determines the noise.
+    seed: int = 0
     # The largest disparity in pixels, a multiple of 16: what is nearer is not seen.
     largest_disparity: int = 32
 
@@ -149,7 +151,7 @@ def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfi
             info=config.info(),
             X_FC=X_LC,
             stream=stream,
-            errors=ErrorModel(noise=config.noise),
+            errors=ErrorModel(noise=config.noise, seed=config.seed),
         )
         builder.add("sense", signal.replace("image", "camera"), camera)
         connect_camera(builder.diagram_builder, camera, builder.scene_graph, light=lit)

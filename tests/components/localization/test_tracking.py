@@ -117,14 +117,17 @@ def spread_out(places, deviation):
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, np.inf))
 
 
-def test_landmarks_that_may_be_others_enter_with_less_certainty():
-    places, variance = np.array([[2.0, 0.0], [0.0, -2.0]]), 0.045
-    tracker = Tracker(spread_out(places, variance**0.5), least_deviation=0.0, bias_deviation=1e-6)
+@pytest.mark.parametrize(("view", "variance"), [(2.0 * np.pi, 0.045), (np.pi, 0.025)])
+def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
+    places = np.array([[2.0, 0.0], [0.0, -2.0]])
+    settings = {"least_deviation": 0.0, "bias_deviation": 1e-6, "field_of_view": view}
+    tracker = Tracker(spread_out(places, variance**0.5), **settings)
     state, _ = tracker.start(np.zeros(3), 1e-12 * np.eye(3))
     state, matches = tracker.update(state, spread_out(places, variance**0.5))
     assert len(matches.pairs) == 2
-    # Two detections within 2 m; twice their density competes with the normal density of a match without error.
-    density, others = 1.0 / (2.0 * np.pi * 2.0 * variance), 2.0 * 2.0 / (np.pi * 2.0**2)
+    # Two detections within 2 m; twice their density in the view competes with the normal density of a match without
+    # error.
+    density, others = 1.0 / (2.0 * np.pi * 2.0 * variance), 2.0 * 2.0 / (view / 2.0 * 2.0**2)
     p = density / (density + others)
     assert 0.8 < p < 0.9
     np.testing.assert_allclose(state.covariance[4:, 4:], np.eye(4) / (p**2 / variance + 1.0 / variance), atol=1e-6)
@@ -282,6 +285,7 @@ def test_the_state_stays_small_and_is_a_value():
         ({"correlation": -1.0}, "correlation must be in m, at least 0"),
         ({"scan_deviation": -0.1}, "scan_deviation must be in m, at least 0"),
         ({"least_deviation": np.nan}, "least_deviation must be in m, at least 0, not nan"),
+        ({"field_of_view": 7.0}, "field_of_view must be in rad, within"),
         ({"most": 0}, "most must be at least 1"),
         ({"correlated_share": 1.0}, "correlated_share must be a share from 0 to below 1"),
     ],

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.drives import (
     GOALS,
@@ -114,6 +115,16 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     np.testing.assert_allclose(pose, drive.truth[-1], atol=0.2)
 
 
+def test_recorded_cameras_see_trees_where_they_are() -> None:
+    scenario = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
+    drive = recorded_drive(scenario, length=0.2)
+    assert np.diff(drive.times) == pytest.approx(1.0 / scenario.stereo.rate)
+    trees = map_landmarks(scenario.truth()).seen_from(inverse(drive.truth[-1])).positions
+    distances = np.linalg.norm(drive.landmarks[-1].positions[:, np.newaxis] - trees, axis=2).min(axis=1)
+    assert len(distances) >= 3
+    assert np.median(distances) < 0.4
+
+
 def test_forests_differ_and_are_reproducible() -> None:
     one = forest(1)
     assert one == forest(1) and one != forest(2)
@@ -121,4 +132,5 @@ def test_forests_differ_and_are_reproducible() -> None:
     # Nor do two drives share the noise of a sensor: their errors are independent.
     for name in ("scanner_errors", "imu_errors", "odometry_errors"):
         assert getattr(one, name).seed != getattr(forest(2), name).seed
+    assert one.stereo.seed != forest(2).stereo.seed
     assert forest(1, range_bias=0.02) == replace(one, scanner_errors=replace(one.scanner_errors, bias=0.02))

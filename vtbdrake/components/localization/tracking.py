@@ -20,7 +20,7 @@ are expected of new landmarks, too.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import inf, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -178,6 +178,7 @@ class Tracker:
     Attributes:
         landmarks: The map, in W.
         sensor: s = p_HoLo_H in the plane, in m.
+        field_of_view: The angle in rad in which the detector sees landmarks: how dense its detections are.
         bias_deviation: Standard deviation of the range bias, in m; assumed.
         least_deviation: Standard deviation in m that is added to those of detections, per axis; assumed.
         scan_deviation: Standard deviation in m, per axis, by which all detections of a scan are displaced together;
@@ -198,6 +199,7 @@ class Tracker:
 
     landmarks: Landmarks
     sensor: tuple[float, float] = (0.0, 0.0)
+    field_of_view: float = 2.0 * pi
     bias_deviation: float = 0.03
     least_deviation: float = 0.01
     scan_deviation: float = 0.0
@@ -217,6 +219,7 @@ class Tracker:
         if not len(self.landmarks):
             raise ValueError("the map of a tracker is empty: localization needs landmarks")
         checks = {
+            "field_of_view": (0.0 < self.field_of_view <= 2.0 * pi, "in rad, within (0, 2 pi]"),
             "bias_deviation": (0.0 <= self.bias_deviation < inf, "in m, at least 0"),
             "least_deviation": (0.0 <= self.least_deviation < inf, "in m, at least 0"),
             "scan_deviation": (0.0 <= self.scan_deviation < inf, "in m, at least 0"),
@@ -436,7 +439,7 @@ class Tracker:
         one, two = one[is_pair], two[is_pair]
         density = np.zeros(squares.shape)
         density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
-        area = np.pi * max(1.0, float((landmarks.positions**2).sum(axis=1).max()))
+        area = 0.5 * self.field_of_view * max(1.0, float((landmarks.positions**2).sum(axis=1).max()))
         others = _OTHERS * len(landmarks) / area
         rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
         probability = (density / (others + rivals))[one, two]

@@ -10,6 +10,7 @@ images.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import atan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,6 +67,11 @@ class StereoCamera:
                 f"{info.focal_y():g} pixels"
             )
         return cls(info.width(), info.height(), info.focal_x(), info.center_x(), info.center_y(), baseline)
+
+    @property
+    def field_of_view(self) -> float:
+        """The angle from the left edge of the images to the right one, in rad."""
+        return atan(self.center_x / self.focal_length) + atan((self.width - self.center_x) / self.focal_length)
 
     def depth(self, disparity: ArrayLike) -> Array:
         """Return z_C (m) of disparities (pixels): infinite for 0, NaN for NaN."""
