@@ -15,7 +15,7 @@ from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.cli import BadInputError, one_line
-from vtbdrake.cli.options import field_option, option, scenario_argument, settings, timeout_option, url_option
+from vtbdrake.cli.options import option, scenario_argument, timeout_option, url_option
 from vtbdrake.components.localization.planar import transform
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake.components.world_model import WorldModel
@@ -141,19 +141,15 @@ def ellipse(place: Array, covariance: Array) -> Array:
 @click.command()
 @scenario_argument
 @url_option
-@field_option
 @option("--every N", "Read every Nth cycle.", type=click.IntRange(min=1), default=10)
 @timeout_option
-def main(
-    scenario: Scenario, url: str, scenario_fields: tuple[tuple[str, object], ...], every: int, timeout: float
-) -> None:
+def main(scenario: Scenario, url: str, every: int, timeout: float) -> None:
     """Show a running localization unit in a browser, until Ctrl-C or its end."""
     if not isinstance(scenario, CarrierScenario):
         raise BadInputError(
             f"{type(scenario).__name__} has no localization unit: give a ForestScenario or PlainScenario"
         )
     try:
-        scenario = scenario.with_fields(settings(scenario_fields))
         meshcat = make_meshcat()
         display = DriverDisplay(meshcat, scenario.global_map())
         click.echo(f"the display is at {meshcat.web_url()}")

@@ -28,6 +28,10 @@ def negative(_: float) -> float:
         (["variables", "tests.testbeds:Scenario"], "is abstract: it lacks the methods add_world, interface, make_dps"),
         (["variables", "none.yaml"], "no scenario file none.yaml"),
         (["variables", PENDULUM, "--match", "thetta"], "no address contains 'thetta'"),
+        (
+            ["variables", PENDULUM, "--field", "stifness=2"],
+            "'stifness' of a plain type; did you mean stiffness?",
+        ),
         (["variable", PENDULUM], "No such command 'variable'"),
         ([*ROLLOUT, "--set", "dps.gian=1"], "did you mean dps.gain"),
         ([*ROLLOUT, "--set", "dps.gain=[1,2]"], "has shape (4,)"),
@@ -125,7 +129,7 @@ def test_a_file_has_no_module_imported(tmp_path: Path, source: str, expected: st
 
 def test_scenario_file_that_names_no_class_is_named(tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
-    path.write_text("a: 1\n")
+    path.write_text("a: {b: 1}\n")
     assert error_of("variables", path).startswith(f"Error: {path}: a scenario is named package.module:Class")
 
 

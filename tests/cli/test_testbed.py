@@ -52,6 +52,14 @@ def test_rollout_from_a_file_prints_and_saves_what_the_library_computes(tmp_path
     np.testing.assert_array_equal(saved[:, 2:], result.record["plant.state"])
 
 
+def test_fields_may_be_given_one_by_one(tmp_path: Path) -> None:
+    PendulumScenario(stiffness=2.0).save(tmp_path / "stiff.yaml")
+    options = ("--horizon", 0.2, "--set", f"{ANGLE}=0.5", "--record", ANGLE)
+    run("rollout", f"{PENDULUM}@{tmp_path}/stiff.yaml", *options, "--save", tmp_path / "a.csv")
+    run("rollout", PENDULUM, "--field", "stiffness=2", *options, "--save", tmp_path / "b.csv")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
 def test_recording_as_numpy_archive(tmp_path: Path) -> None:
     program = run("rollout", ACROBOT, "--horizon", 0.2, "--record", "plant.state", "--save", tmp_path / "a.npz")
     assert program.exit_code == 0

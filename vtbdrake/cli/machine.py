@@ -11,7 +11,6 @@ import click
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
-    field_option,
     option,
     parse_setting,
     scenario_argument,
@@ -42,7 +41,6 @@ def _parse_noise(text: str) -> tuple[str, float]:
 @click.command()
 @scenario_argument
 @url_option
-@field_option
 @option(
     "--period S", "The period of a cycle, in seconds; each cycle publishes the state once.", default=_DEFAULT.period
 )
@@ -85,7 +83,6 @@ def _parse_noise(text: str) -> tuple[str, float]:
 def machine(
     scenario: Scenario,
     url: str,
-    scenario_fields: tuple[tuple[str, object], ...],
     lock_step: bool,
     cycles: int | None,
     values: tuple[Setting, ...],
@@ -115,7 +112,6 @@ def machine(
         brake=brake or "",
         **fields,
     )
-    scenario = scenario.with_fields(settings(scenario_fields))
     simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
     for address, value in simulated.perturbed.items():
         click.echo(f"{address} = {value}")

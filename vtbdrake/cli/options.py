@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -202,7 +203,16 @@ def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-scenario_argument = click.argument("scenario", callback=converted(parse_scenario))
+def scenario_argument(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command its argument ``scenario``, with the fields that ``--field`` sets."""
+
+    @wraps(command)
+    def with_scenario(*, scenario: Scenario, scenario_fields: tuple[tuple[str, Any], ...], **others: Any) -> Any:
+        return command(scenario=scenario.with_fields(settings(scenario_fields)), **others)
+
+    return click.argument("scenario", callback=converted(parse_scenario))(_field_option(with_scenario))
+
+
 set_option = option(
     "--set ADDRESS=VALUE",
     "Set a variable in s0 to a number or a JSON list. May be repeated.",
@@ -210,7 +220,7 @@ set_option = option(
     parse=parse_setting,
     multiple=True,
 )
-field_option = option(
+_field_option = option(
     "--field NAME=VALUE",
     "Set a field of the scenario: a number, true, false or a text. May be repeated.",
     name="scenario_fields",

@@ -13,7 +13,6 @@ from vtbdrake.child_process import ending_signals, logging_in_thread
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
-    field_option,
     option,
     output,
     parse_snapshot,
@@ -48,7 +47,6 @@ MOST_FAULTS = 20  # that are printed at the end
     parse=parse_snapshot,
 )
 @set_option
-@field_option
 @option("--period S", "The period of a cycle, in seconds, instead of that of the scenario.", type=float)
 @option("--pace SIGNAL", "Begin a cycle with each message of this sensor signal, not by the clock.")
 @option("--seconds S", "End after S seconds.  [default: endless]", parse=positive, type=float)
@@ -76,7 +74,6 @@ def run(
     url: str,
     snapshot: Snapshot | None,
     values: tuple[Setting, ...],
-    scenario_fields: tuple[tuple[str, object], ...],
     period: float | None,
     pace: str | None,
     seconds: float | None,
@@ -102,7 +99,6 @@ def run(
     logging.basicConfig(format="%(asctime)s %(message)s")
     for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
         logger.setLevel(logging.INFO)
-    scenario = scenario.with_fields(settings(scenario_fields))
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
     loop = scenario.deploy(

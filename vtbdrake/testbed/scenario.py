@@ -246,7 +246,7 @@ class Scenario(ABC):
         known = {name: (owner, kinds) for name, owner, kinds in _scalar_fields(changed)}
         for name, value in values.items():
             if name not in known:
-                near = suggestion(f"scenario.{name}", [f"scenario.{k}" for k in known])
+                near = suggestion(name, known)
                 raise ScenarioError(f"{type(self).__name__} has no field {name!r} of a plain type{near}")
             owner, kinds = known[name]
             setattr(owner, name.rpartition(".")[2], _scalar(value, kinds, f"{type(self).__name__}.{name}"))

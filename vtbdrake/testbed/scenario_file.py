@@ -111,7 +111,9 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path} is not YAML: {error}") from error
-    if not isinstance(document, yaml.MappingNode) or (len(document.value) != 1 and not key):
+    if not isinstance(document, yaml.MappingNode) or (
+        not key and (len(document.value) != 1 or isinstance(document.value[0][1], yaml.ScalarNode))
+    ):
         raise ScenarioError(
             f"{path} must have one key, package.module:Class, with the scenario's fields below it, or name the key "
             f"as package.module:Class@{path}#KEY"
