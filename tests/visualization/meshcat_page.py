@@ -72,6 +72,11 @@ class _Reader:
         return [self.value() for _ in range(count)]
 
 
+def decoded(message: bytes) -> Any:
+    """A message of Meshcat."""
+    return _Reader(message).value()
+
+
 def messages(page: str) -> list[dict[str, Any]]:
     """All commands that the page plays when it is opened."""
     found = re.findall(r"base64,([A-Za-z0-9+/]{8,}={0,2})", page)
@@ -80,7 +85,7 @@ def messages(page: str) -> list[dict[str, Any]]:
         raw = base64.b64decode(text)
         if b"type" in raw[:4096] or b"set_" in raw:
             try:
-                message = _Reader(raw).value()
+                message = decoded(raw)
             except (IndexError, KeyError, struct.error, UnicodeDecodeError):
                 continue
             if isinstance(message, dict) and "type" in message:
