@@ -20,8 +20,9 @@ setup(
             depends=[str(path) for path in _DECLARATIONS],
             include_dirs=[np.get_include()],
             define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")],
-            # The same rounding on every processor: no product and sum in one.
-            extra_compile_args=["-O2", "-ffp-contract=off"],
+            # The same rounding on every processor: no product and sum in one. No debug information, which takes a
+            # quarter of the time to compile.
+            extra_compile_args=["-O2", "-g0", "-ffp-contract=off"],
         )
         for source in _SOURCES
     ],
