@@ -18,6 +18,18 @@ settings.load_profile("patient")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Folders (and the modules in them, all of a kind) that need one Python only. A single module says so by
+# `pytestmark = pytest.mark.one_python`, a single test by the marker itself.
+ONE_PYTHON = ("cli", "notebooks", "visualization")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    folders = [Path(__file__).parent / name for name in ONE_PYTHON]
+    for item in items:
+        if any(folder in item.path.parents for folder in folders):
+            item.add_marker(pytest.mark.one_python)
+
+
 # Message types of a user, made by lcm-gen.
 TYPES = """
 package vtb_test_types;

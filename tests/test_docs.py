@@ -10,6 +10,8 @@ import pytest
 
 import vtbdrake
 
+pytestmark = pytest.mark.one_python
+
 ROOT = Path(__file__).resolve().parents[1]
 ROOTS = [ROOT, ROOT / "vtbdrake"]
 PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -13,6 +13,8 @@ from sysconfig import get_config_var, get_path
 
 import pytest
 
+pytestmark = pytest.mark.one_python
+
 ROOT = Path(__file__).resolve().parents[1]
 COMPILED = sorted(
     path.relative_to(ROOT) for package in ("vtbdrake", "vtbdrake_diagrams") for path in (ROOT / package).rglob("*.pyx")

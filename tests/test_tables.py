@@ -15,6 +15,8 @@ from benchmarks.report import BENCHMARKS, benchmark_all, results_table, write_re
 from vtbdrake_diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
 from vtbdrake_diagrams.tables import Crash, write_json
 
+pytestmark = pytest.mark.one_python
+
 ROOT = Path(__file__).resolve().parents[1]
 
 HEAVY = Answer(

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from vtbdrake.control.statistics import Histogram, LoopStatistics, Threshold
 
+pytestmark = pytest.mark.one_python
+
 PERCENTS = (0.0, 1.0, 50.0, 90.0, 99.0, 99.9, 100.0)
 
 

@@ -21,6 +21,8 @@ from vtbdrake.optimization import Choice, Parameter, Study, StudyError, Trial  #
 from vtbdrake.optimization.optuna_bridge import importances  # noqa: E402
 from vtbdrake.rollout import Constraint, Quality  # noqa: E402
 
+pytestmark = pytest.mark.one_python
+
 matplotlib.use("agg")
 
 STATES = optuna.trial.TrialState

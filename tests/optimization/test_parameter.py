@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from vtbdrake.optimization import Choice, Parameter
 
+pytestmark = pytest.mark.one_python
+
 SPACE = [
     Parameter("a", -2.0, 6.0),
     Parameter("a", 0.01, 100.0, log=True),

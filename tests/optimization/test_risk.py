@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from vtbdrake.optimization import CVaR, Mean, Quantile, Worst
 
+pytestmark = pytest.mark.one_python
+
 qualities = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12).map(np.array)
 risks = st.one_of(
     st.sampled_from([Mean(), Worst()]),

@@ -13,6 +13,8 @@ from vtbdrake.components.localization.planar import inverse, transform, wrap
 from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, Stand
 from vtbdrake_diagrams.forest.trials import Case, run
 
+pytestmark = pytest.mark.one_python
+
 
 def landmarks(places, *, deviation=0.05):
     """Landmarks of which the diameters are not known."""

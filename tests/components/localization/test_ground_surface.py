@@ -5,9 +5,12 @@ from __future__ import annotations
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from tests.components.localization.scans import Scene, hills
 from vtbdrake.components.localization.ground import fit_ground
+
+pytestmark = pytest.mark.one_python
 
 EYE = np.array([0.0, 0.0, 2.0])
 

@@ -8,6 +8,8 @@ import pytest
 from tests.components.localization.scans import Scene, flat, hills, pairs
 from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
 
+pytestmark = pytest.mark.one_python
+
 EYE = np.array([0.1, 0.2, 1.5])
 # For waves of 0.2 m.
 HIGH = RockDetector(least_height=0.2)

@@ -8,6 +8,8 @@ from vtbdrake.components.localization.submap import Submap
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.stand import ACCURATE
 
+pytestmark = pytest.mark.one_python
+
 
 def seen(places, deviation=0.02, diameter=0.3):
     n = len(places)

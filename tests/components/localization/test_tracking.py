@@ -13,6 +13,8 @@ from vtbdrake.components.localization.tracking import Tracker, TrackState
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE
 
+pytestmark = pytest.mark.one_python
+
 START = np.diag([0.1, 0.1, 0.01]) ** 2
 
 

@@ -8,6 +8,8 @@ import pytest
 from tests.components.localization.scans import BREAST, Scene, hills, pairs, raster, trunk_ranges
 from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
 
+pytestmark = pytest.mark.one_python
+
 EYE = np.array([0.2, -0.1, 2.0])
 # The cylinders of these tests have neither bark nor a bend.
 EXACT = TrunkDetector(roughness=0.0, position_floor=0.0, diameter_floor=0.0)

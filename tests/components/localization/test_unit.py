@@ -17,6 +17,8 @@ from vtbdrake.components.localization.unit import (
 )
 from vtbdrake_diagrams.forest.stand import ACCURATE, REMOTE
 
+pytestmark = pytest.mark.one_python
+
 
 def unit_for(landmarks, locator=None):
     return LocalizationUnit(locator or ConstellationMap(landmarks), Tracker(landmarks))

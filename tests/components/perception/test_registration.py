@@ -9,6 +9,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.registration import Faces, Registration, deskew, register_points
 
+pytestmark = pytest.mark.one_python
+
 BOXES = [((0.8, 0.7, 0.6), (0.0, 0.0, 0.0)), ((0.3, 0.2, 0.9), (-0.3, 0.4, 0.1))]
 FACES = Faces.of_boxes([(RigidTransform(center), edges) for edges, center in BOXES])
 EYE = np.array([0.1, -0.2, 0.3])

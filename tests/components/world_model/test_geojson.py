@@ -22,6 +22,8 @@ from vtbdrake.components.world_model import (
     save_geojson,
 )
 
+pytestmark = pytest.mark.one_python
+
 # Near Evo, Finland.
 FRAME = LocalFrame(longitude_deg=25.05, latitude_deg=61.2, height=140.0, x_axis_deg=30.0)
 EQUATOR, FLATTENING = 6378137.0, 1.0 / 298.257223563

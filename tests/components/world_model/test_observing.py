@@ -21,6 +21,8 @@ from vtbdrake.components.world_model import (
     position_estimate,
 )
 
+pytestmark = pytest.mark.one_python
+
 
 def tree(identity: str, xyz: object, *, deviation: object = 0.1, **fields: object) -> WorldObject:
     return WorldObject(identity, "tree", position_estimate(xyz, deviation=deviation), **fields)

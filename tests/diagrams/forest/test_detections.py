@@ -8,6 +8,8 @@ from vtbdrake.components.localization.planar import compose, inverse, transform
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned, gathered, visible
 from vtbdrake_diagrams.forest.stand import Stand
 
+pytestmark = pytest.mark.one_python
+
 
 def trunks(*rows: tuple[float, float, float]) -> Landmarks:
     """Return trunks of (x, y, diameter)."""

@@ -5,6 +5,8 @@ import pytest
 
 from vtbdrake_diagrams.forest.ground import Ground
 
+pytestmark = pytest.mark.one_python
+
 X, Y = np.random.default_rng(0).uniform(0.0, 100.0, (2, 50))
 
 

@@ -6,6 +6,8 @@ import pytest
 from vtbdrake_diagrams.forest.carrier import Carrier
 from vtbdrake_diagrams.forest.routes import Route, strip_roads
 
+pytestmark = pytest.mark.one_python
+
 
 def test_length_of_a_circle() -> None:
     angles = 2.0 * np.pi * np.arange(400) / 400

@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake_diagrams.forest.trials import GOALS, LARGEST_WRONG, Case, Trial, cases, judged, run, verdicts
+
+pytestmark = pytest.mark.one_python
 
 INSIDE = Case("natural", 600.0, "accurate", "inside")
 

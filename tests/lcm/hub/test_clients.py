@@ -8,6 +8,8 @@ import pytest
 
 from vtbdrake.lcm.hub.clients import ClientConnection
 
+pytestmark = pytest.mark.one_python
+
 MAX_QUEUE = 100_000
 
 

@@ -14,6 +14,8 @@ import pytest
 from tests.lcm.hub.clients import TIMEOUT, Client, address, raw_client, receive, record
 from vtbdrake.lcm.hub import Hub, HubAddressError, HubConfig, HubError, HubServer
 
+pytestmark = pytest.mark.one_python
+
 
 def listening(pid: int) -> list[str]:
     """Return the addresses of the listening TCP sockets of a process, as hexadecimal ``address:port``."""

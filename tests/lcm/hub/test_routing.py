@@ -14,6 +14,8 @@ from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, client_name, server
 from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.routing import ProtectedChannel
 
+pytestmark = pytest.mark.one_python
+
 
 def test_message_reaches_every_subscriber_once(hub) -> None:
     clients = [Client(hub.url, "A", "A") for _ in range(3)]

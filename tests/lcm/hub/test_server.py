@@ -40,6 +40,8 @@ from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, HubConfig, server
 from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
+pytestmark = pytest.mark.one_python
+
 DATA = bytes(MEBIBYTE)
 
 

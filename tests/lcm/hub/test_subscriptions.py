@@ -8,6 +8,8 @@ import pytest
 from vtbdrake.lcm.hub.subscriptions import MAX_COST, MAX_SUBSCRIPTIONS, Subscriptions, compile_pattern, literal
 from vtbdrake.lcm.hub.tcpq import TcpqError
 
+pytestmark = pytest.mark.one_python
+
 CHANNELS = ["A", "B", "AB", "AAB", "A.B", "A/B-C", "A\\B", "a1_x", "ARM_STATUS", "LEG_STATUS", "STATUS", "é", "", "A]B"]
 
 

@@ -33,6 +33,8 @@ from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.lcm.hub.tcpq import address_name, peer_user, shortcut_name
 
+pytestmark = pytest.mark.one_python
+
 U32 = struct.Struct(">I").pack
 
 

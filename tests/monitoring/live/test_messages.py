@@ -16,6 +16,8 @@ from vtbdrake.monitoring.live.messages import (
     request_id,
 )
 
+pytestmark = pytest.mark.one_python
+
 
 def encoded(**message):
     return json.dumps(message).encode()

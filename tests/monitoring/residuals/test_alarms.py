@@ -24,6 +24,8 @@ from vtbdrake.monitoring.residuals.alarms import (
     threshold_for,
 )
 
+pytestmark = pytest.mark.one_python
+
 NOISE = {"position": 1e-4, "velocity": 5e-3}
 CONFIG = ResidualConfig(period=PERIOD, settle=0, tolerance={"act.torque": 1e-3})
 SCENARIO = DrivenPendulum(sampled=True)

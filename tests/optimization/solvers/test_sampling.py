@@ -8,6 +8,8 @@ from tests.optimization.solvers.driver import SPHERE, evaluation, solve
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import Evaluation, SolverError, make_solver
 
+pytestmark = pytest.mark.one_python
+
 NAMES = ["predictive-sampling", "CEM", "MPPI"]
 # A range so wide that nothing is clipped; one unit of it is 1 / WIDTH of the cube.
 WIDTH = 200.0
