@@ -12,6 +12,8 @@ from vtbdrake.spline import Spline
 JOINTS = 2
 PERCEIVED = "dps.env.discrete_state_0"
 """The address of the perceived state: positions of cart (m) and pole (rad), then their derivatives, shape (4,)."""
+FORCE = "dps.impl.value"
+"""The address of the force that the DPS commands, in N."""
 
 
 def make_dps(plan: Spline, *, period: float, force_limit: float, planner: System | None = None) -> Diagram:

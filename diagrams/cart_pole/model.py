@@ -59,6 +59,26 @@ class CartPole:
         kinetic += 0.5 * m_p * length**2 * v[1] ** 2
         return float(kinetic - m_p * self.gravity * length * np.cos(q[1]))
 
+    def advanced(self, state: np.ndarray, force: float, dt: float) -> np.ndarray:
+        """Return the state [x, theta, x', theta'] ``dt`` seconds after another one: one step of Runge and Kutta.
+
+        Args:
+            state: Shape (4,), in m and rad.
+            force: On the cart, constant, in N.
+            dt: In seconds.
+        """
+        m_c, m_p, length, g = self.cart_mass, self.pole_mass, self.pole_length, self.gravity
+
+        def rates(s: np.ndarray) -> np.ndarray:
+            sin, cos, rate = np.sin(s[1]), np.cos(s[1]), s[3]
+            a = (force + m_p * sin * (length * rate**2 + g * cos)) / (m_c + m_p * sin**2)
+            return np.array([s[2], rate, a, -(a * cos + g * sin) / length])
+
+        k1 = rates(state)
+        k2 = rates(state + 0.5 * dt * k1)
+        k3 = rates(state + 0.5 * dt * k2)
+        return state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rates(state + dt * k3))
+
 
 def cart_pole_sdf(cart_pole: CartPole | None = None) -> str:
     """Return the text of the SDF model ``cart_pole``.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import inf
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -19,8 +20,8 @@ from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.spline import Spline
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
-from vtbdrake_diagrams.cart_pole.dps import JOINTS, PERCEIVED, make_dps
-from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES
+from vtbdrake_diagrams.cart_pole.dps import FORCE, JOINTS, PERCEIVED, make_dps
+from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES, CartPole
 
 if TYPE_CHECKING:
     from vtbdrake.reasoning import OnboardReasoner
@@ -166,15 +167,23 @@ class CartPoleScenario(Scenario):
         self.add_beliefs(builder)
 
     def add_beliefs(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare that what the DPS perceives sets the joints of the simulated world."""
-        T = self.period
+        """Declare that what the DPS perceives sets the joints of the simulated world.
+
+        What it perceives when it decides was measured two periods before: sensors and ``env`` take one each. A mental
+        copy begins at the present, which follows from the force that acts.
+        """
+        T, model = self.period, CartPole()
         for k, name in enumerate(JOINT_NAMES):
             for i, (value, errors) in enumerate(
                 (("position", self.position_errors), ("velocity", self.velocity_errors))
             ):
-                builder.believe(
-                    f"sim.sys.cart_pole.{name}.{value}",
-                    of=[PERCEIVED],
-                    by=itemgetter(JOINTS * i + k),
-                    age=(1 + errors.latency) * T,
-                )
+                target, entry = f"sim.sys.cart_pole.{name}.{value}", JOINTS * i + k
+                if self.is_mental:
+                    by = partial(_predicted, model, dt=(2 + errors.latency) * T, entry=entry)
+                    builder.believe(target, of=[PERCEIVED, FORCE], by=by)
+                else:
+                    builder.believe(target, of=[PERCEIVED], by=itemgetter(entry), age=(1 + errors.latency) * T)
+
+
+def _predicted(model: CartPole, state: np.ndarray, force: float, *, dt: float, entry: int) -> float:
+    return float(model.advanced(state, float(force), dt)[entry])
