@@ -16,6 +16,7 @@ from tests.monitoring.residuals.line import Ear, Line, Together, loop
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
 from vtbdrake.deployment import Deployment
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
+from vtbdrake.monitoring.residuals.alarms import CalibrationError
 from vtbdrake.state import parameter
 from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
 
@@ -113,6 +114,8 @@ def test_skipped_windows_are_reported_while_running() -> None:
             assert time.monotonic() < end, "skipped windows are not reported"
             together.run(10)
         assert not monitor.history
+        with pytest.raises(CalibrationError, match=r"not 0: run longer; \d+ windows were skipped, because samples"):
+            monitor.calibrate()
 
 
 def test_simulated_sensors_are_not_compared() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import SWITCH, Cycle
-from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, calibrate
+from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, CalibrationError, calibrate
 from vtbdrake.monitoring.residuals.comparison import (
     INDEX,
     SHADOW,
@@ -234,7 +234,16 @@ class ResidualMonitor:
             CalibrationError: There are too few windows.
         """
         residuals = (window.residual for window in self.history)
-        return calibrate(residuals, self.places, horizon=self.config.horizon, period=self.config.period)
+        try:
+            return calibrate(residuals, self.places, horizon=self.config.horizon, period=self.config.period)
+        except CalibrationError as error:
+            if not (self.skipped or self.failed):
+                raise
+            raise CalibrationError(
+                f"{error}; {self.skipped} windows were skipped, because samples were missing (a loop that begins its "
+                f"cycles with the machine's messages misses none: Deployment.pace), and {self.failed} predictions "
+                f"failed{self.error and f' ({self.error})'}"
+            ) from error
 
     def close(self) -> None:
         """End the monitor after its last results have been taken."""
