@@ -57,6 +57,16 @@ def test_a_damaged_log_is_replayed_up_to_the_damage_and_reported(
     assert "the file ends in the middle of an event" in caplog.text
 
 
+def test_cycles_behind_a_gap_count_as_not_compared(path: Path, tmp_path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    middle = content.index(b"VTB_CYCLE", len(content) // 2)
+    content[middle : middle + 40] = bytes(40)
+    (tmp_path / "gap.lcm").write_bytes(content)
+    program = run("replay", tmp_path / "gap.lcm", *SCENARIO)
+    assert program.exit_code == 1 and "identical" in program.stdout
+    assert "the rest of the log was not compared: the replay ends where the log lacks" in program.stderr
+
+
 def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
     (tmp_path / "foreign.py").write_text(f"open({str(tmp_path / 'has_run')!r}, 'w')\n")
     header = read_log(path).header

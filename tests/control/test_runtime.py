@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from vtbdrake.child_process import ending_signals
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import FallbackController, Zero
@@ -543,18 +544,19 @@ def test_interruption_sends_the_fallback_once():
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 
 
-def test_interruption_dropped_by_pybind11_ends_the_loop():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_dropped_by_pybind11_ends_the_loop(number):
     runtime, bridge, _ = switched(rate=0.0)
 
     def watch(cycle):
         if runtime.cycles == 6:
             try:
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(number)
             except KeyboardInterrupt:
                 raise TypeError("incompatible function arguments") from None
 
     runtime.watch(watch)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), ending_signals(signal.default_int_handler):
         runtime.run(cycles=100)
     assert runtime.cycles == 6
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])

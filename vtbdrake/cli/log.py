@@ -39,7 +39,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 def replay(
     log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
-    """Replay a LOG and compare: the exit code is 1 unless all actuator commands are the same, to the last bit.
+    """Replay a LOG and compare: the exit code is 1 unless all actuator commands in it are the same, to the last bit.
 
     With --set, a variable has another value throughout, and nothing is compared.
 
@@ -65,6 +65,8 @@ def replay(
     click.echo(report)
     if report.outcome == DIFFERENT:
         raise FailedError(one_line(f"the replay differs: {report.first_difference}"))
+    if report.ended and not values:
+        raise FailedError(f"the rest of the log was not compared: {report.ended}")
 
 
 @click.command()

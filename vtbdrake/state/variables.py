@@ -263,7 +263,7 @@ def check_address(address: object) -> None:
 
 def suggestion(address: str, known: Iterable[str]) -> str:
     """Return the end of an error message that suggests addresses similar to ``address``."""
-    known = list(known)
+    known = list(dict.fromkeys(known))  # A variable and an output port may share an address.
     near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
     if near:
         return "; did you mean " + " or ".join(near) + "?"

@@ -10,37 +10,41 @@ from typing import Any, Self
 
 
 class Interruptible:
-    """A context manager that raises again what the handler of SIGINT raised inside of it, if that got lost.
+    """A context manager that raises again what a handler of SIGINT or SIGTERM raised inside of it, if that got lost.
 
     Python raises KeyboardInterrupt wherever its main thread is. While pybind11 converts an argument (numpy makes an
     array of a list, say) it drops that exception, and reports arguments that do not fit (TypeError) or tries the next
     overload; and Python drops what is raised in a finalizer. A controller that writes its output at every step loses
     about one Ctrl-C of 25 in this way, and the failed call would pass for a failed simulation.
 
-    Outside the main thread, where no handler runs, and where SIGINT has no handler, it does nothing.
+    Outside the main thread, where no handler runs, and for a signal without a handler, it does nothing.
     """
 
     def __init__(self) -> None:
-        self._handler: Callable[[int, FrameType | None], Any] | None = None
+        self._handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
         self._raised: BaseException | None = None
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            handler = signal.getsignal(signal.SIGINT)
-            if callable(handler):
-                self._handler = handler
-                signal.signal(signal.SIGINT, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                handler = signal.getsignal(number)
+                if callable(handler):
+                    self._handlers[number] = handler
+                    signal.signal(number, self._handle)
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        assert self._handler is not None
         try:
-            self._handler(number, frame)
+            self._handlers[number](number, frame)
         except BaseException as error:
             self._raised = error
-            # At once: this may be raised at the end of the block, before `__exit__` restores the handler.
-            signal.signal(signal.SIGINT, self._handler)
+            # At once: this may be raised at the end of the block, before `__exit__` restores the handlers.
+            self._restore()
             raise
+
+    def _restore(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
 
     def check(self) -> None:
         """Raise the exception of the signal handler, if any; long operations call this from time to time."""
@@ -50,7 +54,6 @@ class Interruptible:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
+        self._restore()
         if error is not self._raised:
             self.check()
