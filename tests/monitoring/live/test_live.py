@@ -129,6 +129,14 @@ def impostor(url: str, channel: str, answers: list[tuple[str, dict[str, Any]]]) 
         thread.join()
 
 
+def test_end_of_the_dps_is_an_answer(hub: Hub) -> None:
+    with (
+        impostor(hub.url, "VTB_SET", [("VTB_SET_ANSWER", {"ended": True})]),
+        pytest.raises(LiveError, match="ended"),
+    ):
+        asked(hub.url, "set", {"a": 1.0})
+
+
 NO_VALUES = [None, 3, [], {}, {"b": 1.0}, *({"a": value} for value in ("1", None, True, {}, [[1.0], 2.0], [None]))]
 
 

@@ -115,6 +115,8 @@ class LiveClient:
         answer = self._answer
         if "error" in answer:
             raise LiveError(str(answer["error"]))
+        if answer.get("ended") is True:
+            raise LiveError("the DPS has ended before it answered")
         if answer.get("ok") is not True:
             raise _invalid(channel, "'ok' or an error", answer)
         return answer
