@@ -6,7 +6,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
+from tests.components.localization.drives import PERIOD, Drive, drive, error, nees
+from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.tracking import Tracker, TrackState
@@ -246,21 +247,42 @@ def test_correlated_errors_of_the_map_are_expected():
 def test_without_detections_covariance_grows_by_the_odometry():
     one = drive(0, ACCURATE)
     tracker, states = tracked(one)
-    state = states[-1]
+    state, drift = states[-1], DriftModel(scale=0.0, rate=0.0)
     before = state.pose_covariance
     for _ in range(50):
         motion = np.array([0.2, 0.0, 0.0])
         state, matches = tracker.update(
-            tracker.predict(state, motion, DRIFT.covariance(motion, PERIOD)), Landmarks.empty()
+            tracker.predict(state, motion, drift.covariance(motion, PERIOD)), Landmarks.empty()
         )
         assert not matches.is_fused
     R_HW = rotation(-states[-1].pose[2])
     along, along_before = ((R_HW @ P[:2, :2] @ R_HW.T)[0, 0] for P in (state.pose_covariance, before))
-    assert along - along_before == pytest.approx(DRIFT.along**2 * 10.0, rel=0.02)
-    grown = before[2, 2] + DRIFT.heading**2 * 50 * PERIOD
+    assert along - along_before == pytest.approx(drift.along**2 * 10.0, rel=0.02)
+    grown = before[2, 2] + drift.heading**2 * 50 * PERIOD
     assert state.pose_covariance[2, 2] == pytest.approx(grown)
     # It is no loss not to see anything.
     assert not tracker.is_lost(state)
+
+
+def test_landmarks_without_a_place_do_not_take_part():
+    """Within the gate of a landmark that may be anywhere, all others would be looked at in each scan."""
+    one = drive(1, ACCURATE)
+    C = one.map.covariances.copy()
+    C[5] = 1e4 * np.eye(2)
+    vague = Landmarks(one.map.positions, C, one.map.diameters, one.map.diameter_deviations)
+    rest = one.map.select(np.arange(len(one.map)) != 5)
+    poses = []
+    for landmarks in (vague, rest):
+        tracker = Tracker(landmarks)
+        state, _ = tracker.start(one.poses[0], START, one.scans[0])
+        for k in range(1, 6):
+            state, matches = tracker.update(tracker.predict(state, *one.motion(k)), one.scans[k])
+        assert matches.is_fused and len(state.indices) < 60
+        poses.append(state.pose)
+    # Only the distribution of all diameters differs.
+    np.testing.assert_allclose(*poses, atol=2e-3)
+    with pytest.raises(ValueError, match="no landmark .* largest_deviation=0.05 m: .* 0.1 m"):
+        Tracker(one.map, largest_deviation=0.05)
 
 
 def test_the_state_stays_small_and_is_a_value():

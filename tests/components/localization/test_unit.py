@@ -1,4 +1,5 @@
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import pytest
 from tests.components.localization.drives import PERIOD, drive, error, nees
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import compose
+from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import (
     LOST,
@@ -163,6 +164,22 @@ def test_no_trees_in_sight_is_no_error():
     deviations = [answer.covariance[0, 0] for answer in answers[11:20]]
     assert (np.diff(deviations) > 0.0).all() and answers[20].covariance[0, 0] < deviations[-1]
     assert answers[-1].status == TRACKING
+
+
+def test_wheels_that_are_off_are_in_the_covariance_of_a_gap():
+    one = drive(3, ACCURATE, reach=18.0, scans=60)
+    motions = [compose(inverse(a), b) for a, b in pairwise(one.poses)]
+    reckoned = [np.zeros(3)]
+    for motion in motions:
+        reckoned.append(compose(reckoned[-1], motion * [1.03, 1.03, 1.0]))
+    scans = [*one.scans[:10], *[Landmarks.empty()] * 50]
+    answers, state = run(unit_for(one.map), scans, reckoned)
+    assert answers[-1].status == TRACKING and not answers[-1].matched
+    # 3 % of 20 m.
+    assert np.linalg.norm(error(answers[-1].pose, one.poses[-1])[:2]) > 0.4
+    assert nees(answers[-1].pose, answers[-1].covariance, one.poses[-1]) < 9.0
+    # In the end, nothing is known any more.
+    assert unit_for(one.map).step(state, scans[-1], X_OH=reckoned[-1], time=1e3)[0].status == LOST
 
 
 def test_the_memory_survives_as_arrays():

@@ -201,7 +201,7 @@ class ConstellationMap:
         # A landmark at the edge has fewer around it, though they are as dense.
         self._densities = np.maximum(counts / (pi * _SURROUNDINGS**2), len(landmarks) / self._area)
         self._roots = np.linalg.cholesky(landmarks.covariances + 1e-12 * np.eye(2))
-        self._variance = 0.5 * float(np.mean(np.trace(landmarks.covariances, axis1=1, axis2=2)))
+        self._variance = 0.5 * float(np.median(np.trace(landmarks.covariances, axis1=1, axis2=2)))
         self._diameter_variances = landmarks.diameter_deviations**2 + _DIAMETER_FLOOR**2
         # Some that stand for the diameters of all.
         self._typical = np.argsort(landmarks.diameters)[np.linspace(0, len(landmarks) - 1, 200).astype(int)]

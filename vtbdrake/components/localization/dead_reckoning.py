@@ -37,22 +37,26 @@ _BIAS_DEVIATION = 0.005
 
 @dataclass(frozen=True)
 class DriftModel:
-    """How dead reckoning drifts: random walks, whose deviations grow with the roots of distance, time and turn.
+    """How dead reckoning drifts: by random walks, and by errors that last. All are standard deviations, and assumed.
 
-    The values are assumed. Errors that last, of the radius of a wheel or of the gyros, are no random walks: the
-    deviations are too large for seconds, and too small for minutes.
+    The walks grow with the roots of distance, time and turn. What lasts, of the radius of a wheel or of the gyros,
+    grows with distance and time themselves: it matters where nothing else tells the pose for long.
 
     Attributes:
         along: Of the distance travelled, in m per root metre.
         across: Of the way that it slips sideways, in m per root metre.
         heading: Of the heading, in rad per root second.
         turn: Of the heading in turns, in rad per root radian.
+        scale: Of the distance travelled, as a share of it that lasts.
+        rate: Of the turn rate, in rad/s, that lasts.
     """
 
     along: float = 0.03
     across: float = 0.01
     heading: float = 0.001
     turn: float = 0.01
+    scale: float = 0.02
+    rate: float = 5e-4
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -61,21 +65,25 @@ class DriftModel:
                     f"{field.name} of a drift is a finite deviation of at least 0, not {getattr(self, field.name)!r}"
                 )
 
-    def covariance(self, motion: ArrayLike, duration: float) -> Array:
+    def covariance(self, motion: ArrayLike, duration: float, *, since: tuple[float, float] = (0.0, 0.0)) -> Array:
         """Return the covariance (3, 3) of a motion X_AB by dead reckoning, in the order x, y (in A, m), heading (rad).
 
         Args:
             motion: X_AB = [x, y, heading] from where the carrier was, (3,) in m and rad. It is about an arc.
             duration: How long it took, in s.
+            since: The distance in m and the time in s for which it had been dead reckoning alone before. The errors
+                that last add up with those of before: the covariance is by how much the variances grow.
         """
         x, y, turned = np.asarray(motion, dtype=float).tolist()
-        length = hypot(x, y)
+        length, (before, elapsed) = hypot(x, y), since
+        along = self.along**2 * length + self.scale**2 * length * (2.0 * before + length)
         heading = self.heading**2 * abs(duration) + self.turn**2 * abs(turned)
+        heading += self.rate**2 * duration * (2.0 * elapsed + duration)
         # What the heading has drifted halfway leads aside.
         across = self.across**2 * length + heading * length**2 / 3.0
         in_chord = np.array(
             [
-                [self.along**2 * length, 0.0, 0.0],
+                [along, 0.0, 0.0],
                 [0.0, across, heading * length / 2.0],
                 [0.0, heading * length / 2.0, heading],
             ]

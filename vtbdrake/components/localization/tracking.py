@@ -63,6 +63,9 @@ _LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
 # Detections, or landmarks to be seen again, from which on that is judged.
 _JUDGED_FROM = 6
 
+# With a larger standard deviation of the heading in rad, the track is lost: derivatives are those of small errors.
+_LARGEST_TURN = 0.2
+
 # The share of first matches that are assumed to be by chance although the pose is right.
 _CHANCE = 0.2
 
@@ -168,12 +171,13 @@ class Tracker:
 
     Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
     not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
-    than ``largest_deviation``, or when first matches of landmarks speak against the pose: the d² of a right match is
-    chi-square distributed, that of a match by chance is uniform within the gate (of 0.95 for first matches). The
-    logarithm of this ratio is summed up to at most ``credit``; below 0, the track is lost (the cumulative sum of Page,
-    Biometrika 41, 1954).
+    than ``largest_deviation`` or the heading by more than 0.2 rad, or when first matches of landmarks speak against
+    the pose: the d² of a right match is chi-square distributed, that of a match by chance is uniform within the gate
+    (of 0.95 for first matches). The logarithm of this ratio is summed up to at most ``credit``; below 0, the track is
+    lost (the cumulative sum of Page, Biometrika 41, 1954).
 
-    Landmarks that were marginalized enter anew if the carrier comes back. Their map error is then used twice.
+    Landmarks that were marginalized enter anew if the carrier comes back. Their map error is then used twice. Those of
+    which the map is less certain than ``largest_deviation`` are left out.
 
     Attributes:
         landmarks: The map, in W.
@@ -212,8 +216,9 @@ class Tracker:
     credit: float = 12.0
     first_credit: float = 6.0
     largest_deviation: float = 2.0
+    _usable: Indices = field(init=False, repr=False)
     _tree: cKDTree = field(init=False, repr=False)
-    _largest_variance: float = field(init=False, repr=False)
+    _variances: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not len(self.landmarks):
@@ -234,11 +239,18 @@ class Tracker:
             "largest_deviation": (self.largest_deviation > 0.0, "in m, positive"),
         }
         check_settings("Tracker", self, checks)
-        object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions))
-        # Of a detection beside that of the pose: of the map, the bias and the scan.
-        largest = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1].max()
+        variances = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1]
+        usable = np.flatnonzero(variances <= self.largest_deviation**2)
+        if not len(usable):
+            raise ValueError(
+                f"no landmark of the map is certain within largest_deviation={self.largest_deviation:g} m: the best "
+                f"one has a standard deviation of {np.sqrt(variances.min()):g} m"
+            )
+        object.__setattr__(self, "_usable", usable)
+        object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions[usable]))
+        # Of a detection beside that of the pose: of each landmark of the map, the bias and the scan.
         deviations = (self.bias_deviation, self.least_deviation, self.scan_deviation)
-        object.__setattr__(self, "_largest_variance", float(largest + np.sum(np.square(deviations))))
+        object.__setattr__(self, "_variances", variances[usable] + float(np.sum(np.square(deviations))))
 
     def start(
         self, X_WH: ArrayLike, covariance: ArrayLike, landmarks: Landmarks | None = None
@@ -307,8 +319,9 @@ class Tracker:
 
     def is_lost(self, state: TrackState) -> bool:
         """Return whether the pose must not be believed any more."""
-        deviation = float(np.sqrt(np.diagonal(state.pose_covariance)[:2].max()))
-        return state.failures >= self.patience or state.evidence < 0.0 or deviation > self.largest_deviation
+        limits = np.array([self.largest_deviation, self.largest_deviation, _LARGEST_TURN])
+        is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
+        return state.failures >= self.patience or state.evidence < 0.0 or is_vague
 
     # -- the state
 
@@ -453,10 +466,13 @@ class Tracker:
         places = transform(state.pose, landmarks.positions)
         P, levers = state.pose_covariance, (landmarks.positions**2).sum(axis=1)
         own = np.trace(landmarks.covariances, axis1=1, axis2=2)
-        variances = own + P[0, 0] + P[1, 1] + levers * P[2, 2] + self._largest_variance
-        reach = np.sqrt(chi_square_quantile(self.gate, 2) * variances)
-        found = self._tree.query_ball_point(places, reach)
-        return np.unique(np.array([index for one in found for index in one], dtype=np.int64))
+        variances = own + P[0, 0] + P[1, 1] + levers * P[2, 2]
+        gate = chi_square_quantile(self.gate, 2)
+        found = self._tree.query_ball_point(places, np.sqrt(gate * (variances + self._variances.max())))
+        rows = np.repeat(np.arange(len(places)), [len(one) for one in found])
+        near = np.concatenate([*found, []]).astype(np.int64)
+        squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
+        return self._usable[np.unique(near[squares <= gate * (variances[rows] + self._variances[near])])]
 
     def _diameter_cost(self, landmarks: Landmarks, seen: Indices, indices: Indices) -> Array:
         """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map."""
