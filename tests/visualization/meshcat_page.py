@@ -80,7 +80,7 @@ def decoded(message: bytes) -> Any:
 def messages(page: str) -> list[dict[str, Any]]:
     """All commands that the page plays when it is opened."""
     found = re.findall(r"base64,([A-Za-z0-9+/]{8,}={0,2})", page)
-    decoded = []
+    commands = []
     for text in found:
         raw = base64.b64decode(text)
         if b"type" in raw[:4096] or b"set_" in raw:
@@ -89,5 +89,5 @@ def messages(page: str) -> list[dict[str, Any]]:
             except (IndexError, KeyError, struct.error, UnicodeDecodeError):
                 continue
             if isinstance(message, dict) and "type" in message:
-                decoded.append(message)
-    return decoded
+                commands.append(message)
+    return commands

@@ -6,6 +6,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform, wrap
+from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.stand import REMOTE, Stand
 
@@ -88,3 +89,7 @@ def test_bad_landmarks_are_rejected():
         map_landmarks(Stand(density=10.0).trees(), "crater")
     with pytest.raises(ValueError, match="no rock"):
         map_landmarks(Stand(density=10.0).trees(), "rock")
+    for diameter in (-0.3, 0.0, 31.0):
+        tree = WorldObject("t", "tree", position_estimate(np.zeros(3)), {"trunk_diameter": Quantity(diameter, "m")})
+        with pytest.raises(ValueError, match=f"of the tree t is {diameter:g} m, but must be .* at most 20 m: are its"):
+            map_landmarks(WorldModel([tree]))

@@ -147,8 +147,12 @@ def test_file_of_other_programs_needs_frame_and_units(tmp_path: Path) -> None:
     (tree,) = load_geojson(path, frame=FRAME, units={"dbh": "m"})
     assert tree.identity == "7" and dict(tree.attributes) == {"dbh": Quantity(0.2, "m")}
     assert np.allclose(tree.p_WoOo_W, 0.0, atol=1e-6)
+    (tree,) = load_geojson(path, frame=FRAME, units={"dbh": "m"}, deviation=0.3)
+    assert np.diag(tree.pose.covariance).tolist() == pytest.approx([np.inf] * 3 + [0.09] * 3)
     with pytest.raises(GeoJsonError, match="give frame="):
         load_geojson(path)
+    with pytest.raises(GeoJsonError, match="deviation in m, finite and at least 0, not nan"):
+        load_geojson(path, frame=FRAME, deviation=np.nan)
     with pytest.raises(GeoJsonError, match=r"feature 0 \(7\): its attribute dbh has no unit"):
         load_geojson(path, frame=FRAME)
 
@@ -185,6 +189,7 @@ TREE = ("features", 1)
         (change((*TREE, "properties", "class"), 3), "tree-1.*class is a text"),
         (change((*TREE, "properties"), None), "tree-1.*properties are an object"),
         (change((*TREE, "properties", "trunk_diameter"), [1]), r"tree-1.*a number or a text, not \[1\]"),
+        (change((*TREE, "properties", "trunk_diameter"), 10**400), "tree-1.*too large"),
         (change((*TREE, "properties", "age_deviation"), 1.0), "tree-1.*deviation of an attribute"),
         (change((*TREE, "properties", "trunk_diameter_deviation"), -1.0), "tree-1.*at least 0, not -1"),
         (change((*TREE, "properties", "Species"), "oak"), "tree-1.*identifier in lower case"),

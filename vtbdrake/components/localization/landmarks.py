@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 DIAMETERS = {"tree": "trunk_diameter", "rock": "width"}
 """The attribute that is the diameter of a landmark, by the class of the object."""
 
+# A map with a larger diameter in m, or with one of 0, is taken to be in other units.
+_LARGEST_DIAMETER = 20.0
+
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
@@ -93,8 +96,8 @@ def map_landmarks(model: WorldModel, kind: str = "tree") -> Landmarks:
         kind: The class: ``"tree"``, with the attribute ``trunk_diameter``, or ``"rock"``, with ``width``.
 
     Raises:
-        ValueError: The class is unknown, there is no such object, or one has no diameter in m, or no variance in the
-            plane.
+        ValueError: The class is unknown, there is no such object, or one has no diameter in m between 0 and 20 m, or
+            no variance in the plane.
     """
     if kind not in DIAMETERS:
         raise ValueError(f"landmarks are of the class {' or '.join(DIAMETERS)}, not {kind!r}")
@@ -102,6 +105,12 @@ def map_landmarks(model: WorldModel, kind: str = "tree") -> Landmarks:
     if not objects:
         raise ValueError(f"the map has no {kind} that is believed to be there: localization needs landmarks")
     diameters = [one.number(DIAMETERS[kind], unit="m") for one in objects]
+    for one, diameter in zip(objects, diameters, strict=True):
+        if not 0.0 < diameter <= _LARGEST_DIAMETER:
+            raise ValueError(
+                f"{DIAMETERS[kind]} of the {kind} {one.identity} is {diameter:g} m, but must be positive and at most "
+                f"{_LARGEST_DIAMETER:g} m: are its units those that the map declares?"
+            )
     deviations = [one.attributes[DIAMETERS[kind]].deviation for one in objects]
     return Landmarks(
         np.array([one.p_WoOo_W[:2] for one in objects]),

@@ -19,7 +19,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -106,16 +106,20 @@ def load_geojson(
     *,
     frame: LocalFrame | None = None,
     units: Mapping[str, str] | None = None,
+    deviation: float = 0.0,
 ) -> WorldModel:
     """Read a world model from a GeoJSON file.
 
     Of the properties, only ``class`` is needed: others have the defaults of `WorldObject`, an orientation along W, and
-    a covariance that is infinite for the rotation and zero for the position. A property that is null is left out.
+    a covariance that is infinite for the rotation and that of `deviation` for the position. A property that is null is
+    left out.
 
     Args:
         path: The file.
         frame: The frame W of the model, for a file that does not declare it.
         units: Units of numeric attributes that the file does not declare, by name.
+        deviation: Standard deviation in m, per axis, of the positions of features without a covariance. 0 says that
+            they are exact: a localization that believes it finds nothing, or is too sure.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -123,7 +127,7 @@ def load_geojson(
     """
     try:
         data = json.loads(Path(path).read_text("utf-8"), parse_constant=_reject, object_pairs_hook=_unique)
-        return _Reader(data, frame, units or {}).model()
+        return _Reader(data, frame, units or {}, deviation).model()
     except (ValueError, RecursionError) as error:
         raise GeoJsonError(f"{path}: {error}") from error
 
@@ -142,7 +146,10 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 class _Reader:
     """Makes a model of what JSON gave."""
 
-    def __init__(self, data: Any, frame: LocalFrame | None, units: Mapping[str, str]) -> None:
+    def __init__(self, data: Any, frame: LocalFrame | None, units: Mapping[str, str], deviation: float) -> None:
+        if not 0.0 <= deviation < inf:
+            raise ValueError(f"deviation is a standard deviation in m, finite and at least 0, not {deviation!r}")
+        self._variance = deviation**2
         if not isinstance(data, dict) or data.get("type") != "FeatureCollection":
             raise ValueError("the file is a GeoJSON FeatureCollection")
         # Programs write this member, which is obsolete since RFC 7946, also for WGS84.
@@ -168,7 +175,7 @@ class _Reader:
                 one = self._object(feature)
                 if one.identity in seen:
                     raise ValueError("another feature has this id, too")
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, OverflowError) as error:
                 raise ValueError(f"{name}: {error}") from error
             seen.add(one.identity)
             objects.append(one)
@@ -215,7 +222,7 @@ class _Reader:
         if not np.abs(position).max() < _FARTHEST:
             far = np.abs(position).max() / 1e3
             raise ValueError(f"it lies {far:.0f} km from the origin of the local frame: this is a map of another place")
-        covariance = np.diag([np.inf] * 3 + [0.0] * 3)
+        covariance = np.diag([np.inf] * 3 + [self._variance] * 3)
         if "covariance" in properties:
             covariance = _covariance(_plain(properties["covariance"]))
         wxyz = _plain(properties.get("orientation", [1.0, 0.0, 0.0, 0.0]))
