@@ -6,9 +6,13 @@ candidates, horizon and cost.
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import casadi
@@ -34,6 +38,8 @@ LIMIT, SPREAD = SCENARIO.force_limit, 20.0  # N: of the force, and of the candid
 B = PLAN.matrix(STEP * np.arange(STEPS))
 HANGING = np.array([0.0, 0.05, 0.0, 0.0])
 TOLERANCE = 1e-9
+# judo needs an older MuJoCo than this one.
+JUDO, JUDO_ENVIRONMENT = "judo-rai==0.1.0", Path(__file__).parents[1] / ".venv-judo"
 
 # The costs of candidates z, shape (n, K), from the state x0 = [q; v]; the result has the shape (n,).
 Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -66,7 +72,7 @@ def predictive_sampling(repeats: int = 200, seeds: int = 8) -> list[Benchmark]:
             better=HIGHER,
             against=f"plans per second of mujoco.rollout {mujoco.__version__}, {fastest}",
             note=f"us per plan of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e6 * np.median(own):.0f}, MuJoCo "
-            f"{micros}; costs {apart:.1g} apart; n = {repeats}",
+            f"{micros}, {judo(repeats)}; costs {apart:.1g} apart; n = {repeats}",
         ),
         Benchmark(
             name="predictive_sampling_quality",
@@ -125,15 +131,10 @@ def compiled_planner(step: casadi.Function) -> Planner:
     return lambda x0, z: rollouts(x0, z).costs
 
 
-def mujoco_planners() -> dict[str, Planner]:
-    """Return one planner per number of threads, which the key tells as text."""
-    return {"1 thread": mujoco_planner(1), "2 threads": mujoco_planner(2)}
-
-
-def mujoco_planner(threads: int) -> Planner:
-    """The cart-pole in MuJoCo, with the numbers of `CartPole`."""
+def mujoco_model() -> str:
+    """The cart-pole for MuJoCo, with the numbers of `CartPole`."""
     m = CartPole()
-    model = mujoco.MjModel.from_xml_string(f"""
+    return f"""
         <mujoco>
           <option timestep="{STEP}" gravity="0 0 {-m.gravity}" integrator="Euler"/>
           <compiler boundinertia="0" boundmass="0"/>
@@ -147,8 +148,45 @@ def mujoco_planner(threads: int) -> Planner:
               </body>
             </body>
           </worldbody>
-          <actuator><motor joint="slider"/></actuator>
-        </mujoco>""")
+          <actuator><motor joint="slider" ctrllimited="true" ctrlrange="-{LIMIT} {LIMIT}"/></actuator>
+        </mujoco>"""
+
+
+def judo(repeats: int) -> str:
+    """Say how long a plan of judo takes, installed in an environment of its own, or why it does not run here."""
+    python = JUDO_ENVIRONMENT / "bin" / "python"
+    given = {
+        "model": mujoco_model(),
+        "candidates": CANDIDATES,
+        "knots": PLAN.knots,
+        "horizon": SCENARIO.duration,
+        "spread": SPREAD,
+        "state": HANGING.tolist(),
+        "repeats": repeats,
+    }
+    run = partial(subprocess.run, check=True, capture_output=True, text=True, timeout=900)
+    try:
+        if not python.exists():
+            run([sys.executable, "-m", "venv", str(JUDO_ENVIRONMENT)])
+        run([str(python), "-m", "pip", "install", "--quiet", JUDO])
+        done = run([str(python), str(Path(__file__).with_name("judo_plans.py"))], input=json.dumps(given))
+    except (OSError, subprocess.SubprocessError) as error:
+        reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        return f"no {JUDO} here ({reason[-1]})"
+    told = json.loads(done.stdout.splitlines()[-1])
+    expected = float(mujoco_planner(1)(HANGING, np.zeros((1, PLAN.knots)))[0])
+    # It leaves out the cost of the present state.
+    apart = abs(told["cost"] + STEP * cost(HANGING) - expected) / expected
+    return f"{JUDO} {1e6 * np.median(told['seconds']):.0f} (cost of a plan without force {apart:.1g} apart)"
+
+
+def mujoco_planners() -> dict[str, Planner]:
+    """Return one planner per number of threads, which the key tells as text."""
+    return {"1 thread": mujoco_planner(1), "2 threads": mujoco_planner(2)}
+
+
+def mujoco_planner(threads: int) -> Planner:
+    model = mujoco.MjModel.from_xml_string(mujoco_model())
     data = [mujoco.MjData(model) for _ in range(threads)]
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     first = np.zeros(mujoco.mj_stateSize(model, kind))
