@@ -68,6 +68,13 @@ def test_links_and_paths_of_a_page_exist(page: Path) -> None:
     assert not missing, f"{page.name} names what is not there: {missing}"
 
 
+def test_architecture_names_every_module_and_folder() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text("utf-8")
+    package = sorted((ROOT / "vtbdrake").iterdir())
+    names = [path.name for path in package if path.suffix == ".py" or (path / "__init__.py").exists()]
+    assert not [name for name in names if name != "__init__.py" and f"`vtbdrake/{name}`" not in text]
+
+
 def test_every_public_name_is_shown_to_users() -> None:
     pages = [*PAGES, *sorted((ROOT / "notebooks").glob("*.ipynb"))]
     shown = set(re.findall(r"\bvtb\.(\w+)", "\n".join(page.read_text("utf-8") for page in pages)))
