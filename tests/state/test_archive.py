@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
@@ -15,7 +16,7 @@ import pytest
 
 from vtbdrake.state import ArchiveError, Snapshot
 from vtbdrake.state import archive as archives
-from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
+from vtbdrake.state.archive import archive_bytes, read_archive, whole_file, write_archive
 
 SNAPSHOT = Snapshot(
     1.5,
@@ -169,6 +170,16 @@ def test_what_would_not_be_read_again_is_not_written(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="save less at once"):
         write_archive(tmp_path / "a", kind="k", version=1, header={}, arrays={"a": np.zeros(1 << 18)})
     assert not list(tmp_path.iterdir())
+
+
+def test_full_disk_is_reported_with_the_file_that_stays_as_it_was(tmp_path):
+    path = tmp_path / "s.vtb"
+    path.write_bytes(b"before")
+    with pytest.raises(OSError, match=r"No space left on device: .*s\.vtb") as caught, whole_file(path) as partial:
+        partial.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert caught.value.filename == str(path)
+    assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
 
 
 def test_equal_snapshots_are_equal():

@@ -113,10 +113,12 @@ def run(
                 _run(runtime, wait=wait, seconds=seconds)
     except (BridgeError, RunawayError) as error:
         raise FailedError(one_line(error)) from error
-    if statistics is not None:
-        write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
     click.echo(runtime.statistics)
-    _report_faults(runtime.guards, begin)
+    try:
+        if statistics is not None:
+            write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
+    finally:
+        _report_faults(runtime.guards, begin)
 
 
 def _report_faults(guards: Guards, begin: float) -> None:

@@ -136,12 +136,16 @@ def _array(data: bytes) -> np.ndarray:
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to, and replace ``path`` by that file at the end.
 
-    After an exception ``path`` is unchanged.
+    After an exception ``path`` is unchanged. An OSError without a file name gets this one.
     """
     target = Path(path)
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     try:
         yield partial
         partial.replace(target)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # A full disk, say.
+            error.filename = os.fspath(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
