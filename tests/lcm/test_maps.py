@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_image, lcmt_robot_state
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_image, lcmt_robot_state, lcmt_scope
 
 from tests.control.arm import ACT, SENSE, command, status
 from vtbdrake.lcm.bridge import LcmBridge
@@ -40,6 +40,11 @@ def reason(message_type: Any, data: bytes) -> str:
 def test_message_is_decoded_as_lcm_gen_does(user_types: ModuleType) -> None:
     data = mixed(user_types).encode()
     assert decode(user_types.mixed_t, data).encode() == data
+
+
+def test_map_shows_itself_in_a_line() -> None:
+    shown = repr(vector_map("STATUS", lcmt_scope, {"angle": "value"}))
+    assert shown.startswith("VectorMap(channel='STATUS'") and "signals=('angle',)" in shown and len(shown) < 150
 
 
 def test_every_truncation_is_rejected(user_types: ModuleType) -> None:

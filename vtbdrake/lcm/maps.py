@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -104,9 +105,9 @@ class LcmMap:
     channel: str
     type: Any
     signals: Sequence[str]
-    decode: Callable[[Any], Mapping[str, Any]] | None = None
-    encode: Callable[[Mapping[str, Any], int], Any] | None = None
-    sent: Callable[[Any], float] = no_time
+    decode: Callable[[Any], Mapping[str, Any]] | None = dataclasses.field(default=None, repr=False)
+    encode: Callable[[Mapping[str, Any], int], Any] | None = dataclasses.field(default=None, repr=False)
+    sent: Callable[[Any], float] = dataclasses.field(default=no_time, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signals", tuple(self.signals))
@@ -211,8 +212,9 @@ def _by_path(fields: Sequence[Field]) -> dict[str, Field]:
 class VectorMap(LcmMap):
     """An `LcmMap` of vector signals; `vector_map` makes one."""
 
-    parts: Mapping[str, Sequence[Field]]  # by signal, the fields that hold its entries, one after the other
-    fields: Sequence[Field]  # all fields of the message type
+    # by signal, the fields that hold its entries, one after the other
+    parts: Mapping[str, Sequence[Field]] = dataclasses.field(repr=False)
+    fields: Sequence[Field] = dataclasses.field(repr=False)  # all fields of the message type
     stamp: str = ""  # path of the field with the sender's time in microseconds; empty if there is none
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
