@@ -19,7 +19,7 @@ from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import MAPS
 
 CYCLES = 150
-"""Cycles of the loop in lock-step with the process that sends the sensors' data."""
+"""The number of cycles of the loop in lock-step with the process that sends the sensors' data."""
 PATIENCE = 60.0
 """The longest time to wait for a result of the slow part, in s."""
 LARGEST_DIFFERENCE = 1e-3

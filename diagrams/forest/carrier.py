@@ -58,7 +58,7 @@ Array = NDArray[np.float64]
 
 INSTANCE = "carrier"
 
-# The scanner's mast ends so far below the scanner's origin, in m.
+# The scanner's mast ends at this distance below the scanner's origin, in m.
 _BELOW_SCANNER = 0.12
 
 _GREEN, _BLACK = np.array([0.2, 0.45, 0.25, 1.0]), np.array([0.1, 0.1, 0.1, 1.0])
@@ -69,23 +69,23 @@ class Carrier:
     """Dimensions, masses and wheels of the carrier; all of them are assumed.
 
     Attributes:
-        length: Of the body in m.
-        width: Over the wheels in m.
-        height: Of the body over the ground in m.
-        clearance: Of the body's lower side over the ground in m.
+        length: Length of the body in m.
+        width: Width over the wheels in m.
+        height: Height of the body's upper side over the ground in m.
+        clearance: Height of its lower side over the ground in m.
         wheel_base: Distance of the axles in m.
         track: Distance of the wheels of an axle in m.
-        wheel_radius: In m; it is only drawn.
-        mass: In kg, without the scanner.
+        wheel_radius: Radius of the wheels in m; it is only drawn.
+        mass: Mass in kg, without the scanner.
         centre_height: Height of the centre of mass over the ground in m.
-        sag: How far springs and tyres give way under the weight in m.
-        damping_ratio: Of the vertical oscillation of the body on its wheels.
+        sag: Static deflection of springs and tyres under the weight in m.
+        damping_ratio: Damping ratio of the vertical oscillation of the body on its wheels.
         cornering: Cornering stiffness per rad of slip angle and N of load.
-        relaxation_length: Sigma in m.
+        relaxation_length: Relaxation length sigma of the tyres in m.
         friction: Coulomb's coefficient mu of tyres and ground.
-        largest_curvature: Of the path of the middle of the rear axle, in 1/m.
-        curvature_rate: How fast the curvature changes, in 1/(m s).
-        acceleration: How fast the speed of the treads changes, in m/s^2.
+        largest_curvature: Largest curvature of the path of the middle of the rear axle in 1/m.
+        curvature_rate: Largest rate of the curvature in 1/(m s).
+        acceleration: Largest acceleration of the treads in m/s^2.
     """
 
     length: float = 2.5
@@ -257,7 +257,7 @@ class Wheels(LeafSystem):
         friction = context.get_numeric_parameter(0).value().item()
         deflections = context.get_discrete_state(1).value().reshape(4, 2)
 
-        R_WB = rotation_matrix(x[self._q : self._q + 4])
+        R_WB = quaternion_matrix(x[self._q : self._q + 4])
         p_WBo, w_WB, v_WBo = x[self._q + 4 : self._q + 7], x[self._v : self._v + 3], x[self._v + 3 : self._v + 6]
         arms = self._p_BoC_B @ R_WB.T
         places = p_WBo + arms
@@ -326,7 +326,7 @@ class Wheels(LeafSystem):
         state.set_value(1, deflections.ravel())
 
 
-def rotation_matrix(q: Array) -> Array:
+def quaternion_matrix(q: Array) -> Array:
     """Return R_WB, shape (3, 3), of a quaternion (w, x, y, z) that may not have unit length."""
     R_WB: Array = RotationMatrix(Quaternion(q / np.sqrt(q @ q))).matrix()
     return R_WB

@@ -36,9 +36,9 @@ WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS)
 """The addresses that the display reads."""
 
 DEVIATIONS = 3.0
-"""Size of the ellipse of the position, in standard deviations."""
+"""The size of the ellipse of the position, in standard deviations."""
 
-# By status: what is written over the carrier, in which colour (of Okabe and Ito's palette).
+# What is written over the carrier, and its colour (of Okabe and Ito's palette), by status.
 _LOOKS = {
     SEARCHING: ("searching", Rgba(0.94, 0.89, 0.26, 1.0)),
     TRACKING: ("tracking", Rgba(0.0, 0.62, 0.45, 1.0)),
@@ -128,7 +128,7 @@ def ellipse(place: Array, covariance: Array) -> Array:
 
     Args:
         place: The middle, (2,) in m.
-        covariance: Of the position, (2, 2) in m^2.
+        covariance: The covariance of the position, (2, 2) in m^2.
     """
     variances, axes = np.linalg.eigh(covariance)
     matrix = np.eye(4)

@@ -25,7 +25,7 @@ from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_loca
 PERIOD = 0.02
 """The period of the DPS, of its IMU and of its wheel odometry, in s."""
 AXLE = -0.8
-"""Where the rear axle, which is not steered, is on x_B, in m."""
+"""The place of the rear axle, which is not steered, on x_B, in m."""
 
 
 def make_deployment(eyes: LcmMap, *, period: float) -> Deployment:
@@ -68,7 +68,7 @@ def make_dps(
         world_map: What the carrier knows of the world, as the localizer uses it.
         localizer: How scans are evaluated.
         eyes: A value of each of the signals that the localizer sees with.
-        latency: From the sample of a scan to its pose, in s.
+        latency: The time from the sample of a scan to its pose, in s.
         drift: How the dead reckoning drifts.
     """
     builder = DiagramBuilder()

@@ -11,10 +11,11 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, 
 
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake_diagrams.forest.carrier import rotation_matrix
+from vtbdrake_diagrams.forest.carrier import quaternion_matrix
 from vtbdrake_diagrams.forest.routes import Route
 
-# The driver looks so far ahead along the route, in m, and looks for the route again if it is farther away than this.
+# The distance along the route of the point that the driver steers to, and the distance from the route beyond which
+# the driver looks for it again, in m.
 _LOOK_AHEAD, _LOST = 3.0, 2.5
 # Two routes are the same road where they are nearer to each other than this, in m.
 _SAME_ROAD = 0.2
@@ -93,7 +94,7 @@ class Driver(LeafSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         number, along, lap = context.get_discrete_state(0).value().tolist()
         x = self._state.Eval(context)[self._q : self._q + 7]
-        forward = rotation_matrix(x[:4])[:2, 0]
+        forward = quaternion_matrix(x[:4])[:2, 0]
         forward = forward / hypot(*forward.tolist())
         place = x[4:6] - self._rear * forward
 

@@ -43,9 +43,9 @@ from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 Array = NDArray[np.float64]
 
 INDEPENDENT = 100.0
-"""Distance in m along the path from which on estimates count as independent."""
+"""Estimates count as independent if they are at least this far apart along the path, in m."""
 REACH = 20.0
-"""Within this distance in m of the path, trees count as seen, see `least_error_along`; assumed."""
+"""Trees within this distance of the path count as seen, in m; see `least_error_along`. Assumed."""
 STANDING = 2.0
 """How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
@@ -54,9 +54,9 @@ _ARRIVAL = "dps.env.{eye}_arrival"
 _HISTORY = "dps.env.dead_reckoning.history"
 
 SCANS = 5.0
-"""Scans per second."""
+"""The number of scans per second."""
 DENSITIES = (605.0, 1210.0)
-"""Trees per hectare of the plots that `stand` cites; roads are cleared of them afterwards."""
+"""The numbers of trees per hectare of the plots that `stand` cites, before roads are cleared."""
 SEED = 600_000
 """The seed of the first forest. No constant of the localization may be chosen by forests from this seed on.
 

@@ -21,7 +21,7 @@ _HILL_WAVES, _BUMP_WAVES = 16, 48
 _GROUND = 2
 
 MESH_CELL = 0.6
-"""Distance of the vertices of the ground's mesh in m."""
+"""The distance of the vertices of the ground's mesh, in m."""
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,14 @@ SEED = 400_000
 ROUTE = "u.route"
 COVARIANCE = "dps.env.pose.covariance"
 FOUND = 3.0
-"""When the carrier is asked, in s: it has found itself by then."""
+"""The time in s at which the carrier is asked: it has found itself by then."""
 HORIZON = 40.0
-"""How far ahead it looks, in s."""
+"""The horizon of the mental rollouts, in s."""
 COUNTED = 25.0
-"""Of the horizon, the last s in which the quality counts: the routes have parted by then."""
+"""The quality counts in so many seconds at the end of the horizon: the routes have parted by then."""
 SAMPLE_PERIOD = 0.5
 TIME_LIMIT = 600.0
-"""Of one rollout, in s: it takes about a third of the horizon on an idle core, and far more on a busy one."""
+"""The longest time that one rollout may take, in s: on an idle core, it takes about a third of the horizon."""
 UNKNOWN = 2.0
 """The deviation and the error of a carrier without a pose, in m [assumed]."""
 

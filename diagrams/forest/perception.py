@@ -45,14 +45,14 @@ from vtbdrake.testbed.slow_part import SlowPart
 
 Array = NDArray[np.float64]
 
-# For how long dead reckoning alone is trusted to know the place, in s; assumed.
+# The time for which dead reckoning alone is trusted to know the place, in s; assumed.
 _PATIENCE = 10.0
 
 SETTLED = 0.5
-"""Until when samples of the eyes count as seeing nothing, in s: the vertical that levels them must be known first."""
+"""Before this time in s nothing is seen: the vertical, which levels scans and images, must be known first."""
 
 SHOWN = 64
-"""How many landmarks the port ``landmarks`` of the localizer shows at most: the nearest."""
+"""The largest number of landmarks that the port ``landmarks`` of the localizer shows: the nearest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class ScanLandmarks:
 
     Attributes:
         detect: The detector, such as `detect_trunks`.
-        settings: Its second argument, such as a `TrunkDetector`.
+        settings: The second argument of ``detect``, such as a `TrunkDetector`.
         X_BL: Pose of the scanner, as the DPS knows it.
     """
 
@@ -226,8 +226,8 @@ def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, dura
 
     Args:
         X_WH: The pose before, (3,) in m and rad.
-        covariance: Its covariance, (3, 3).
-        motion: From there, (3,) in m and rad.
+        covariance: The covariance of this pose, (3, 3).
+        motion: The pose after the motion in the frame of the pose before, (3,) in m and rad.
         drift: How the dead reckoning drifts.
         duration: How long the motion took, in s.
     """
@@ -250,12 +250,12 @@ def add_localizer(
     """Add the slow part ``localizer``, and for each eye, such as ``scan``, its ``scan_arrival`` and the input port.
 
     Args:
-        builder: Of the Diagram ``env`` of the DPS.
+        builder: The builder of the Diagram ``env`` of the DPS.
         reckoning: Remembers the poses of the carrier.
         localizer: What is computed.
         eyes: A value of each of its signals.
         period: The period of the DPS, in s.
-        latency: From the sample of a scan to its pose, in s.
+        latency: The time from the sample of a scan to its pose, in s.
 
     Returns:
         The part, with the outputs of `Localizer`.

@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 # Stream of random numbers, beside those of `stand` and `ground`.
 _ROADS = 3
 
-# Distance of the points of a route in m, and the radius of its bends.
+# The distance of the points of a route, and the radius of its bends, in m.
 _STEP, _BEND = 0.25, 6.0
-# How far the outer roads are from the border of the stand in m.
+# The distance of the outer roads from the border of the stand, in m.
 _BORDER = 8.0
 # Roads wind: waves of this length in m push them aside by this much, as a standard deviation in m.
 _WINDING, _ASIDE, _WAVES = 60.0, 0.8, 6

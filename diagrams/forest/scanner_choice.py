@@ -29,15 +29,15 @@ Array = NDArray[np.float64]
 
 SEED = 300_000
 HORIZON = 10.0
-"""How long the carrier drives, in s."""
+"""The length of a drive, in s."""
 SETTLING = 2.0
-"""From when on the error counts, in s."""
+"""The error counts from this time on, in s."""
 UNKNOWN = 1.0
 """The error of a carrier that does not know its pose, in m [assumed]."""
 HEIGHTS = (1.5, 2.0, 3.0, 4.5)
-"""Heights of the scanner over the ground in m."""
+"""The heights of the scanner over the ground that are compared, in m."""
 BEAMS = (4, 8, 16, 32)
-"""Numbers of beams, over the same field of view, with the same number of rays per second."""
+"""The numbers of beams that are compared, with the same field of view and number of rays per second."""
 
 
 COMPARED = (

@@ -33,16 +33,16 @@ _NAESLUND = (1.2, 0.19)
 _LARGEST_COVERAGE = 0.45
 
 KINDS = ("natural", "clustered", "plantation")
-"""How the trees of a stand stand."""
+"""The kinds of stands, see `Stand`."""
 
-# Of a clustered stand: clusters per hectare, and their radius in m.
+# A clustered stand has so many clusters per hectare, of this radius in m.
 _CLUSTERS, _CLUSTER_RADIUS = 60.0, 6.0
-# Of a plantation: the distance of the rows in m, and how far trees are off their places, per axis, in m.
+# The distance of the rows of a plantation, and the standard deviation per axis with which trees are planted, in m.
 _ROWS, _JITTER = 2.5, 0.15
-# Attempts to place one tree.
+# The number of attempts to place one tree.
 _ATTEMPTS = 2_000
 
-# Waves that add up to a field of correlated errors.
+# The number of waves that add up to a field of correlated errors.
 _WAVES = 400
 
 
@@ -100,7 +100,7 @@ class Stand:
         density: Trees per hectare, before roads are cleared.
         spacing: The least distance of two trees in m; a plantation has its own.
         diameter_scale: Scale of the Weibull distribution of trunk diameters in m.
-        diameter_shape: Its shape; 1 is an exponential distribution, 3.6 nearly a normal one.
+        diameter_shape: Shape of this distribution; 1 is an exponential distribution, 3.6 nearly a normal one.
         least_diameter: The least trunk diameter in m.
         largest_diameter: The largest trunk diameter in m.
         kind: ``natural``, ``clustered`` or ``plantation``.
@@ -215,7 +215,7 @@ class Stand:
         size = np.array([self.length, self.width])
         clusters = round(_CLUSTERS * self.length * self.width / HECTARE) if self.kind == "clustered" else 0
         parents = rng.random((clusters, 2)) * size
-        # By cells that are as wide as the spacing: trees that are too close lie in one of nine cells.
+        # The places by cells that are as wide as the spacing: trees that are too close lie in one of nine cells.
         cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
         places: list[tuple[float, float]] = []
         attempts = 0
@@ -276,9 +276,9 @@ def surveyed(
     """Return places (m, 2) and diameters (m,) as a survey with errors gives them, in random order.
 
     Args:
-        rng: Of the survey.
+        rng: The random numbers of the survey.
         places: x and y of what is there in m, shape (n, 2).
-        diameters: In m, shape (n,).
+        diameters: The diameters in m, shape (n,).
         errors: What is wrong with the survey.
         area: Extents in x and y in m, from 0 on, in which there are entries for nothing.
         false_diameters: Gives the diameters of those in m from numbers that are uniform in [0, 1).

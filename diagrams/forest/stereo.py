@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 IMAGES = ("left_image", "right_image")
-"""The signals of the pair."""
+"""The names of the signals of the left and the right camera."""
 
 # A camera's x is to the right and its y down; the frame L has x ahead and z up.
 _R_LC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))

@@ -31,9 +31,9 @@ Array = NDArray[np.float64]
 
 SEED = 200_000
 FALSE = 25.0
-"""The squared normalized error from which on a detection is false."""
+"""A detection is false if its squared normalized error is larger."""
 BANDS = ((0.0, 6.0), (6.0, 9.0), (9.0, 12.0), (12.0, 16.5))
-"""Distances in m."""
+"""The limits of the distances by which errors are listed, in m."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,15 +36,15 @@ Array = NDArray[np.float64]
 
 SEED = 100_000
 MARGIN = 10.0
-"""Least distance in m of a place from the edge of the stand in the cases ``inside``."""
+"""The least distance of a place ``inside`` from the edge of the stand, in m."""
 LARGEST_TURN = np.radians(10.0)
 DRIVE = 40.0
-"""Length in m of the drive over which landmarks are gathered."""
+"""The length of the drive over which landmarks are gathered, in m."""
 DENSITIES = (300.0, 600.0, 1000.0)
 GOALS = {"accurate": 0.97, "remote": 0.95, "poor": 0.90}
-"""The least share of places inside that are recognized: right and sure."""
+"""The least share of the places inside that must be recognized: right and sure."""
 LARGEST_WRONG = 1e-3
-"""The share of all trials that may be wrong and sure stays below this."""
+"""The share of the trials that are wrong and sure must be less."""
 
 
 @dataclass(frozen=True)

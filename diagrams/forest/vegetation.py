@@ -20,13 +20,13 @@ Array = NDArray[np.float64]
 BREAST_HEIGHT = 1.3
 """The height over the ground in m at which the diameter of a trunk is measured."""
 
-# Facets of a trunk; how deep it stands in the ground, in m.
+# The number of facets of a trunk, and how deep it stands in the ground, in m.
 _FACETS, _ROOTED = 24, 0.5
-# Of a crown, as shares of the tree's height.
+# The height at which a crown begins, and its diameter, as shares of the tree's height.
 _CROWN_BASE, _CROWN_DIAMETER = 0.45, 0.2
-# Of dead branches: heights where they leave the trunk, lengths and radii in m, and their elevation in rad.
+# Dead branches: ranges of the heights where they leave the trunk, of lengths and radii in m; their elevation in rad.
 _BRANCH_HEIGHT, _BRANCH_LENGTH, _BRANCH_RADIUS, _BRANCH_ELEVATION = (0.4, 5.0), (0.3, 1.3), (0.004, 0.012), 0.35
-# Of undergrowth: blades of a bush, its radius and height, the width of a blade, in m.
+# A bush: the number of its blades, and ranges of its radius and height and of the width of a blade, in m.
 _BLADES, _BUSH_RADIUS, _BUSH_HEIGHT, _BLADE_WIDTH = 30, (0.2, 0.6), (0.3, 1.3), (0.01, 0.06)
 
 # Streams of random numbers, beside those of `stand`, `ground`, `routes` and `plain`.

@@ -23,7 +23,7 @@ from vtbdrake_diagrams.forest.vegetation import Vegetation, branches, crowns, tr
 
 Array = NDArray[np.float64]
 
-# How far the ground goes on around a stand, in m.
+# The ground goes on around a stand by this distance, in m.
 _MARGIN = 15.0
 
 # The extents of images with grain in m: of bark, which is drawn out upwards, and of everything else.
@@ -50,7 +50,7 @@ def add_surface(
 
     Args:
         plant: A plant that is registered with a SceneGraph, and not finalized.
-        name: Of the geometry.
+        name: The name of the geometry.
         surface: Vertices and triangles; one without triangles is left out.
         color: Red, green, blue and opacity, from 0 to 1, shape (4,).
         tile: The extent in m, across and upwards, of an image with grain that covers the surface, see `tiled_mesh`;

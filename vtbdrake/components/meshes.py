@@ -24,7 +24,7 @@ def obj_mesh(
     """Return a mesh in Wavefront's format, which Drake's `Mesh` and `Convex` read.
 
     Args:
-        vertices: In m, shape (n, 3).
+        vertices: The vertices in m, shape (n, 3).
         faces: The vertices of each face, counted from 0, counterclockwise from outside.
         normals: The normal of the surface at each vertex, shape (n, 3). Cameras need them.
         name: A hint that appears in Drake's messages.

@@ -57,16 +57,16 @@ _BAD_DIAMETERS = 0.1
 # Landmarks are counted within this radius, in m, for the density around each.
 _SURROUNDINGS = 8.0
 
-# How many poses are looked at: those with most votes, those fitted, those judged.
+# The numbers of poses: those with most votes, those that are fitted, those that are judged.
 _VOTED, _FITTED, _JUDGED = 300, 60, 10
 
-# Steps of expectation maximization.
+# The number of steps of expectation maximization.
 _STEPS = 8
 
-# Landmarks of the map that each local one may be.
+# The number of landmarks of the map that each local one may be: the nearest.
 _NEIGHBOURS = 3
 
-# Samples from which the likelihood of a right pose is computed.
+# The number of samples from which the likelihood of a right pose is computed.
 _SAMPLES = 300
 
 _FACTOR, _LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 200.0, 5.0, 0.5, 0.6
@@ -78,10 +78,10 @@ class Fix:
 
     Attributes:
         pose: The most likely pose X_WH, [x, y, heading] in m and rad, shape (3,).
-        covariance: Its covariance, if it is the right one, shape (3, 3).
+        covariance: The covariance of the pose, if it is the right one, shape (3, 3).
         is_sure: Whether it passes the test of uniqueness. If not, pose and covariance are no measurement.
         log_likelihood: Λ, the logarithm of the likelihood compared with a place that the map does not show.
-        margin: By how much Λ exceeds that of the best other pose, or of a place that the map does not show.
+        margin: The difference of Λ from that of the best other pose, or of a place that the map does not show (0).
         fit: Λ as a share of what is expected of a right pose.
         pairs: Indices of landmarks that are the same, local and on the map, shape (m, 2).
     """
@@ -108,10 +108,10 @@ class _Local:
 
     Attributes:
         places: Positions in C in m, (n, 2).
-        covariances: Of the positions in m², (n, 2, 2).
-        diameters: In m, (n,).
-        diameter_variances: In m², (n,).
-        common: How frequent diameters like these are on the map, (n,) in 1/m.
+        covariances: Covariances of the positions in m², (n, 2, 2).
+        diameters: Diameters in m, (n,).
+        diameter_variances: Variances of the diameters in m², (n,).
+        common: Densities of these diameters among those of the map in 1/m, (n,).
         shared: The functions that make up the displacement of the map at the landmarks, (n, f).
         independent: The share of the map's variance that they leave, (n,).
     """

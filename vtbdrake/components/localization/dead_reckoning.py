@@ -27,11 +27,11 @@ MOTION = 8
 POSE = 6
 """Size of an entry of the port ``history``: [time (s), roll, pitch (rad), x, y (m), heading (rad)]."""
 HISTORY_LENGTH = 1.0
-"""For how long poses are remembered, in s."""
+"""The time for which poses are remembered, in s."""
 
 # Once the carrier has stood still for so long, its gyros show their bias, in s.
 _SETTLING_TIME = 0.5
-# Of the gyros' bias at the start, in rad/s.
+# The standard deviation of the gyros' bias at the start, in rad/s.
 _BIAS_DEVIATION = 0.005
 
 
@@ -43,12 +43,12 @@ class DriftModel:
     grows with distance and time themselves: it matters where nothing else tells the pose for long.
 
     Attributes:
-        along: Of the distance travelled, in m per root metre.
-        across: Of the way that it slips sideways, in m per root metre.
-        heading: Of the heading, in rad per root second.
-        turn: Of the heading in turns, in rad per root radian.
-        scale: Of the distance travelled, as a share of it that lasts.
-        rate: Of the turn rate, in rad/s, that lasts.
+        along: Deviation along the path, in m per root metre.
+        across: Deviation sideways by slip, in m per root metre.
+        heading: Deviation of the heading, in rad per root second.
+        turn: Deviation of the heading in turns, in rad per root radian.
+        scale: Deviation of the scale of the distance, which lasts, as a share.
+        rate: Deviation of the turn rate, which lasts, in rad/s.
     """
 
     along: float = 0.03
@@ -142,8 +142,8 @@ class DeadReckoning(LeafSystem):
         """Declare the system.
 
         Args:
-            period: That of both sensors, in s.
-            axle: Where on x_B the point is that does not move sideways, in m; behind Bo it is negative.
+            period: Sample period of both sensors in s.
+            axle: The place on x_B of the point that does not move sideways, in m; behind Bo it is negative.
 
         Raises:
             ValueError: The period is not positive.
@@ -298,8 +298,8 @@ def carrier_pose_at(history: ArrayLike, time: float) -> Array:
     It is interpolated between the poses of a `DeadReckoning`; outside its history, it is the newest or the oldest one.
 
     Args:
-        history: Its port ``history``, newest first.
-        time: By the clock of the DPS, in s.
+        history: The port ``history`` of a `DeadReckoning`, newest first.
+        time: The time by the clock of the DPS, in s.
     """
     past = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
     return np.array([time, *(np.interp(time, past[:, 0], past[:, k]) for k in range(1, POSE))])
@@ -309,9 +309,9 @@ def body_rotation(roll: float, pitch: float, heading: float = 0.0) -> Array:
     """Return the rotation matrix (3, 3) of a body with this roll and pitch in a level frame, R_HB if heading is 0.
 
     Args:
-        roll: Of the body, in rad.
-        pitch: Of the body, in rad.
-        heading: By which the body is turned from the x axis of the level frame, in rad.
+        roll: Roll of the body in rad.
+        pitch: Pitch of the body in rad.
+        heading: Angle from the x axis of the level frame to the heading of the body in rad.
     """
     matrix: Array = RollPitchYaw(roll, pitch, heading).ToRotationMatrix().matrix()
     return matrix

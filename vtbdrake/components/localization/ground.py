@@ -13,7 +13,7 @@ from scipy.sparse import kron
 
 Array = NDArray[np.float64]
 
-# Distance of the nodes of the surface, and edge length of the cells of which the lowest points count, in m.
+# The distance of the nodes of the surface, and the edge length of the cells whose lowest points count, in m.
 _SPACING, _CELL = 4.0, 1.5
 # From stiff to soft: the weight of the squared second differences of neighbouring nodes (1/m^2), and how far (m) the
 # lowest point of a cell may lie above the surface and still be taken for ground.
@@ -27,8 +27,8 @@ class Ground:
     """A surface over the plane, bilinear between the nodes of a square grid.
 
     Attributes:
-        corner: Of the grid, in m, (2,).
-        heights: Of the nodes, in m, (m, m), by x and y.
+        corner: The node with the least x and y, in m, (2,).
+        heights: The heights of the nodes in m, (m, m), by x and y.
     """
 
     corner: Array
@@ -61,8 +61,8 @@ def fit_ground(points: Array, center: Array, *, reach: float) -> Ground:
     it begins as nearly a plane, and ends as a surface that follows waves of some ten metres.
 
     Args:
-        points: Of the scan, (n, 3) in m, z up.
-        center: A point on the ground beneath the scanner, (3,) in m: there, the scanner sees none.
+        points: The points of the scan, (n, 3) in m, z up.
+        center: A point on the ground beneath the scanner, (3,) in m, where the scanner sees none.
         reach: Half of the edge length of the surface around ``center``, in m.
     """
     m = int(2.0 * reach / _SPACING) + 2

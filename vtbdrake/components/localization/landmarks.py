@@ -26,8 +26,8 @@ class Landmarks:
 
     Attributes:
         positions: The axes of the landmarks in m, shape (n, 2).
-        covariances: Those of the positions in m^2, shape (n, 2, 2).
-        diameters: Their diameters in m, shape (n,).
+        covariances: Covariances of the positions in m^2, shape (n, 2, 2).
+        diameters: Diameters in m, shape (n,).
         diameter_deviations: Standard deviations of the diameters in m, shape (n,); infinite where nothing is known.
 
     Raises:

@@ -40,12 +40,12 @@ class LocalPairs:
     """Pairs of local landmarks in a frame C, in an order that is random: the first of them involve many landmarks.
 
     Attributes:
-        distances: In m, (n,).
-        angles: The directions from the first to the second landmark in rad, (n,).
-        middles: The places half way in m, (n, 2).
+        distances: Distances of the two landmarks in m, (n,).
+        angles: Directions from the first to the second landmark in rad, (n,).
+        middles: Places half way in m, (n, 2).
         deviations: Standard deviations of the difference between a distance here and on the map in m, (n,).
-        diameters: Of the first and the second landmark in m, (n, 2).
-        diameter_variances: In m², (n, 2).
+        diameters: Diameters of the first and the second landmark in m, (n, 2).
+        diameter_variances: Variances of the diameters in m², (n, 2).
     """
 
     distances: Array
@@ -71,8 +71,8 @@ class LocalPairs:
         Args:
             places: Their positions in C in m, (n, 2).
             variances: Variances of their positions per axis in m², (n,).
-            diameters: In m, (n,).
-            diameter_variances: In m², (n,).
+            diameters: Their diameters in m, (n,).
+            diameter_variances: Variances of the diameters in m², (n,).
             map_variance: Variance of the positions on the map per axis in m².
             correlation: Length in m over which the errors of the map are correlated, 0 if they are independent.
         """
@@ -94,13 +94,13 @@ class PairTable:
     32 bytes for each pair, of which a stand with 800 trees/ha has 27 per tree.
 
     Attributes:
-        distances: In m, (n,).
-        angles: The directions from the first to the second landmark in rad, (n,).
-        middles: The places half way in m, (2, n).
-        diameters: Of the first and the second landmark in m, (2, n).
+        distances: Distances of the two landmarks in m, (n,).
+        angles: Directions from the first to the second landmark in rad, (n,).
+        middles: Places half way in m, (2, n).
+        diameters: Diameters of the first and the second landmark in m, (2, n).
         reaches: Squares of the differences of diameters within the gate in m², (2, n).
         low: The least coordinates of landmarks of the map in m, (2,).
-        high: The largest ones.
+        high: The largest coordinates in m, (2,).
     """
 
     distances: Singles
@@ -117,9 +117,9 @@ class PairTable:
 
         Args:
             places: Their positions in a frame M near them in m, (n, 2).
-            tree: The same.
-            diameters: In m, (n,).
-            diameter_variances: In m², (n,).
+            tree: The k-d tree of these positions.
+            diameters: Their diameters in m, (n,).
+            diameter_variances: Variances of the diameters in m², (n,).
         """
         pairs = _pairs(places, tree)
         delta = places[pairs[:, 1]] - places[pairs[:, 0]]

@@ -28,19 +28,19 @@ def wrap(angle: float) -> float:
 
 
 def compose(X_AB: ArrayLike, X_BC: ArrayLike) -> Array:
-    """Return X_AC."""
+    """Return the pose X_AC of a frame C whose pose in B is X_BC."""
     ab, bc = np.asarray(X_AB, dtype=float), np.asarray(X_BC, dtype=float)
     return np.array([*(ab[:2] + rotation(ab[2]) @ bc[:2]), wrap(ab[2] + bc[2])])
 
 
 def inverse(X_AB: ArrayLike) -> Array:
-    """Return X_BA."""
+    """Return the pose X_BA of A in B."""
     ab = np.asarray(X_AB, dtype=float)
     return np.array([*(-(rotation(-ab[2]) @ ab[:2])), wrap(-ab[2])])
 
 
 def transform(X_AB: ArrayLike, points_B: ArrayLike) -> Array:
-    """Return points, shape (n, 2), in A that are given in B."""
+    """Return points in A, shape (n, 2) in m, that are given in B."""
     ab = np.asarray(X_AB, dtype=float)
     points: Array = np.asarray(points_B, dtype=float) @ rotation(ab[2]).T + ab[:2]
     return points

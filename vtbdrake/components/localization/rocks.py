@@ -34,7 +34,7 @@ class RockDetector(ScanDetector):
         least_roundness: How much of the roundness of a circle its outline must have on the visible side.
         least_width: The least width of a rock in m.
         largest_width: The largest width of a rock in m.
-        least_points: The least number of its points.
+        least_points: The least number of points of a rock.
         cell: Edge length in m of the cells in which points are gathered; two rocks closer than this become one.
         elongation: Standard deviation of the diameters of a rock's outline, as a share of their mean.
 
@@ -108,7 +108,7 @@ def _outlines(clusters: Clusters, detector: RockDetector, origin: Array) -> Land
     good &= (roundness > detector.least_roundness) & (far - near < width + detector.cell)
     bearings = (clusters.bearings + middle)[good]
     width, distance = width[good], distance[good]
-    # Of both edges together, each known to a step / sqrt(12).
+    # The variance of the middle of both edges, each known to a step / sqrt(12).
     edge = (step * distance) ** 2 / 24.0
     shape = (detector.elongation * width) ** 2
     along = 0.25 * shape + detector.range_noise**2 + edge

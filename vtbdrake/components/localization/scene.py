@@ -144,8 +144,8 @@ class Clusters:
 
     Attributes:
         scene: All points.
-        rows: Those of the clusters, in their order, (n,).
-        owners: The clusters of these, ascending from 0, (n,).
+        rows: Indices of the points in clusters, cluster by cluster, (n,).
+        owners: The cluster of each, a number that ascends from 0, (n,).
     """
 
     scene: Scene

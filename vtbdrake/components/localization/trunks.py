@@ -35,19 +35,19 @@ from vtbdrake.components.settings import check_settings
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# Layers of the slice, one bit each.
+# The number of layers of the slice, one bit each.
 _LAYERS = 8
 # Iterations of the fit to all points of a trunk, and then to those that lie on it.
 _ITERATIONS = (3, 4)
-# Of how many standard deviations of its range a point still lies on a trunk.
+# A point lies on a trunk if the error of its range is at most so many standard deviations.
 _GATE = 4.0
 # The distance from the axis, as a share of r, up to which the range of a ray that hits a trunk is predicted as it is.
 _GRAZING = 0.98
-# How much farther it may be beyond, as a share of r.
+# The gate of a range is that of its noise and of an error with this standard deviation, as a share of r.
 _DEPTH = 0.2
 # The share of the most hits of any column of rays that a column must have: branches beside a trunk are hit in few rows.
 _PERSISTENCE = 0.35
-# Of how many standard deviations an edge is taken as it is; what is more counts less and less: it may be a branch.
+# An edge that is off by more standard deviations than this counts less and less: it may be a branch.
 _DOUBT = 4.0
 # Information in 1/m^2 that says nothing, but makes matrices regular where no point is left.
 _NEGLIGIBLE = 1e-3
@@ -64,10 +64,10 @@ class TrunkDetector(ScanDetector):
         heights: The lower and the upper end of the slice over the ground in m.
         reference_height: Height over the ground in m of the point of the axis that is the position of the landmark.
         least_diameter: The least diameter of a trunk in m.
-        largest_diameter: Its largest diameter in m.
+        largest_diameter: The largest diameter of a trunk in m.
         upright_share: The share of the rows passing a place that must be returned from there.
         typical_diameter: Mean in m of the diameters to be expected before anything is measured.
-        diameter_spread: Their standard deviation in m.
+        diameter_spread: Standard deviation in m of these diameters.
         lean: Standard deviation of the lean in rad, per axis, before anything is measured.
         largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
         position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight, and the foot

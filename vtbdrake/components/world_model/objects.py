@@ -95,8 +95,8 @@ class WorldObject:
         source: Where the knowledge comes from, such as the name of a survey or of a sensor.
         status: ``"tentative"``, ``"confirmed"``, ``"revised"`` or ``"retired"``, see `observe`.
         hits: How many observations have confirmed it.
-        misses: In how many observations, since the last hit, it was expected and not seen.
-        conflicts: How many observations, since the last hit, have seen it displaced.
+        misses: How many observations since the last hit expected and did not see it.
+        conflicts: How many observations since the last hit saw it displaced.
 
     Raises:
         ValueError: The identity, the class or an attribute's name is not one, the covariance is none, or the status is
