@@ -198,6 +198,14 @@ class Wheels(LeafSystem):
     __slots__ = NO_DICT
 
     def __init__(self, plant: MultibodyPlant, body: RigidBody, carrier: Carrier, ground: Ground) -> None:
+        """Declare the system.
+
+        Args:
+            plant: The finalized plant: discrete, as the wheels are stepped with it.
+            body: The carrier's body B, see `add_carrier`.
+            carrier: Dimensions and tyres.
+            ground: What the wheels stand on.
+        """
         super().__init__()
         self._ground, self._step = ground, float(plant.time_step())
         self._body = body.index()
@@ -357,6 +365,14 @@ class WheelOdometer(SampledSensor):
     __slots__ = NO_DICT
 
     def __init__(self, *, period: float, scale: float = 1.0, stream: int = 5, errors: ErrorModel | None = None) -> None:
+        """Declare the sensor.
+
+        Args:
+            period: Sample period in s.
+            scale: The factor by which the measured speed is wrong.
+            stream: The number of the stream of noise.
+            errors: The errors of the sensor in m/s; none by default.
+        """
         noise = {"noise": (1, "m/s")}
         super().__init__(
             "odometry", default=[0.0], period=period, unit="m/s", noise=noise, stream=stream, errors=errors

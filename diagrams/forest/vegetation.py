@@ -77,6 +77,11 @@ def trunks(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surface
 
     A cone has the diameter of its tree at `BREAST_HEIGHT` over the ground, and its axis is at the place of the tree
     where it leaves the ground. Real trunks are also crooked, and wider at their feet; these are not.
+
+    Args:
+        trees: The trees, with the attributes ``trunk_diameter`` and ``height`` in m.
+        ground: What they stand on.
+        vegetation: How far they lean.
     """
     diameters, heights = _sizes(trees)
     length = heights + _ROOTED

@@ -1,7 +1,8 @@
 """Dead reckoning of a carrier on wheels by gyros, accelerometers and wheel speed, and how it corrects scans.
 
 Frames: B is the body of the carrier, with x forward, where the IMU measures. H is its level frame: its origin is Bo, z
-is up by gravity, x points in the heading of B. O is where H was at the start. L is the frame of the scanner.
+is up by gravity, x points in the heading of B. O, the odometry frame, is where H was at the
+start. L is the frame of the scanner.
 """
 
 from __future__ import annotations

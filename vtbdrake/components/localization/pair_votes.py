@@ -137,7 +137,12 @@ class PairTable:
         )
 
     def favourites(self, local: LocalPairs, *, count: int) -> Array:
-        """Return the poses X_MC for which most pairs vote, (k, 3), k at most ``count``."""
+        """Return the poses X_MC for which most pairs vote, (k, 3) in m and rad.
+
+        Args:
+            local: The pairs of local landmarks, in C.
+            count: The largest number of poses.
+        """
         reach = _GATE * local.deviations
         ends = np.array([local.distances - reach, local.distances + reach], dtype=np.float32)
         begin, end = np.asarray(np.searchsorted(self.distances, ends))

@@ -120,7 +120,13 @@ class Cells:
 
     @classmethod
     def of(cls, points: Array, *, size: float, reach: float) -> Cells:
-        """Return points (n, 3), of which none is farther from the origin than ``reach``, in cells of a size in m."""
+        """Return the cells of points.
+
+        Args:
+            points: The points, (n, 3) in m.
+            size: Edge length of the cells in m.
+            reach: The largest horizontal distance of a point from the origin in m.
+        """
         index = ((points[:, :2] + reach) / size).astype(np.intp) + 1
         side = int(2.0 * reach / size) + 3
         return cls(index[:, 0] * side + index[:, 1], side)

@@ -63,6 +63,13 @@ def mahalanobis(one: WorldObject, sighting: Sighting) -> tuple[float, int]:
 
     With the innovation ν in all that both know (components of the pose, measured attributes) and its covariance S,
     d² = νᵀ S⁻¹ ν. If the sighting is of the object, d² is chi-square distributed, to first order in the rotation.
+
+    Args:
+        one: The object as the model has it.
+        sighting: What was seen, in the world frame of the model.
+
+    Raises:
+        ValueError: An attribute was seen in another unit.
     """
     part = finite_part(one.pose.covariance) & finite_part(sighting.pose.covariance)
     delta = one.pose.error_to(sighting.pose.X)[part]
