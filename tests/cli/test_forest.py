@@ -23,7 +23,7 @@ from vtbdrake_diagrams.forest.display import main
 
 SCENARIO = "tests.cli.test_forest:PatientScenario"
 SEED = 4
-TIMEOUT = 60.0  # s; for a computer that is busy with other things
+TIMEOUT = 120.0  # s; for a computer that is busy with other things
 
 
 @dataclass
