@@ -44,8 +44,10 @@ demo: $(STAMP)
 demo-control: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
+# In the order of the folders: by default, files of few tests come last, and the longest of them keep one worker busy in the
+# end.
 test: $(STAMP)
-	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS)
+	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .

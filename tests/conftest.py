@@ -1,6 +1,7 @@
 """Settings and fixtures of all tests."""
 
 import importlib
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +10,10 @@ from types import ModuleType
 
 import pytest
 from hypothesis import settings
+
+# Linear algebra on one thread, here and in child processes: the matrices are small, and threads that wait for each
+# other take several times as long. Set before numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # How long an example takes depends on what else the computer does.
 settings.register_profile("patient", deadline=None)

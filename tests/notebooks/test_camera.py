@@ -12,9 +12,11 @@ def test_is_stored_with_text_and_plots() -> None:
 @pytest.mark.slow
 def test_runs_in_a_shorter_version() -> None:
     shorter = {
+        "np.geomspace(0.1, 100.0, 13)": "np.geomspace(0.1, 10.0, 3)",
         "horizon=24.0": "horizon=4.0",
         "problem.sweep(5, ": "problem.sweep(2, ",
         "tried = lights": 'tried = {"beside, 70 deg": lights["beside, 70 deg"]}',
-        "assert worst[2] < worst[1] < worst[0]": "assert max(worst[1:]) < worst[0]",
+        ', "faster": (0.25, 0.09, 1.0)': "",
+        "assert worst[2] < worst[1] < worst[0]": "assert worst[1] < worst[0]",
     }
     check_runs("camera", shorter=shorter)

@@ -11,4 +11,8 @@ def test_is_stored_with_text_and_plots() -> None:
 
 @pytest.mark.slow
 def test_runs_in_a_shorter_version() -> None:
-    check_runs("crater", shorter={"heading_reasoner(scenario)": "heading_reasoner(scenario, candidates=3)"})
+    shorter = {
+        "heading_reasoner(scenario)": "heading_reasoner(scenario, candidates=3)",
+        "most=2, count=20": "most=1, count=4",
+    }
+    check_runs("crater", shorter=shorter)

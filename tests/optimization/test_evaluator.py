@@ -16,6 +16,8 @@ from vtbdrake.optimization.solvers import CATALOGUE
 from vtbdrake.optimization.solvers.blocking import BlockingSolver
 from vtbdrake.rollout import Constraint, Quality
 
+pytestmark = pytest.mark.one_python
+
 risks = st.one_of(
     st.sampled_from([Mean(), Worst()]),
     st.floats(0.01, 1.0).map(Quantile),

@@ -173,6 +173,7 @@ def _without_times(study, whole):
     return {row: replace(o, wall_time=study.rollouts[row].wall_time) for row, o in whole.rollouts.items()}
 
 
+@pytest.mark.one_python
 def test_a_larger_budget_loses_no_point(tmp_path):
     study = pendulum_problem().study(tmp_path / "a.db", seed=3)
     seen = {}
@@ -213,6 +214,7 @@ def test_a_study_that_is_complete_runs_nothing_more(tmp_path):
         assert sqlite3.connect(path).execute("SELECT point, finished FROM rollouts").fetchall() == before
 
 
+@pytest.mark.one_python
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", ["serial", "threads"])
 def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
