@@ -246,7 +246,7 @@ def _state_costs(x: np.ndarray) -> np.ndarray:
 
 def _difference(a: Planner, b: Planner) -> float:
     """Return the largest relative difference between the costs of two planners."""
-    z = SPREAD * np.random.default_rng(0).standard_normal((CANDIDATES, PLAN.knots))
+    z = np.clip(SPREAD * np.random.default_rng(0).standard_normal((CANDIDATES, PLAN.knots)), -LIMIT, LIMIT)
     ours, theirs = a(HANGING, z), b(HANGING, z)
     return float(np.max(np.abs(ours - theirs) / np.abs(theirs)))
 
