@@ -67,17 +67,27 @@ def test_cycles_behind_a_gap_count_as_not_compared(path: Path, tmp_path: Path) -
     assert "the rest of the log was not compared: the replay ends where the log lacks" in program.stderr
 
 
-def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
-    (tmp_path / "foreign.py").write_text(f"open({str(tmp_path / 'has_run')!r}, 'w')\n")
-    header = read_log(path).header
+def of_scenario(name: str, path: Path, folder: Path) -> Path:
+    """Return a copy of the log ``path`` whose header names another scenario."""
     events = LogEvents(path)
     message = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
-    message.header = header.to_json().replace("tests.control.scripted:ServoScenario", "foreign:Scenario")
+    message.header = read_log(path).header.to_json().replace("tests.control.scripted:ServoScenario", name)
     crc = zlib.crc32(message.header.encode())
     message.crc = crc - (1 << 32) if crc >> 31 else crc
-    first_end = events.on(LOG)[0][3]
-    log = tmp_path / "foreign.lcm"
-    log.write_bytes(event(0, 0, LOG.encode(), message.encode()) + path.read_bytes()[first_end:])
+    log = folder / "foreign.lcm"
+    log.write_bytes(event(0, 0, LOG.encode(), message.encode()) + path.read_bytes()[events.on(LOG)[0][3] :])
+    return log
+
+
+@pytest.mark.parametrize("named", [(), SCENARIO])
+def test_log_of_a_script_is_replayed_there_only(path: Path, tmp_path: Path, named: tuple[str, ...]) -> None:
+    log = of_scenario("__main__:ServoScenario", path, tmp_path)
+    assert "a class of a script or a notebook: only there can it be replayed" in error_of("replay", log, *named)
+
+
+def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "foreign.py").write_text(f"open({str(tmp_path / 'has_run')!r}, 'w')\n")
+    log = of_scenario("foreign:Scenario", path, tmp_path)
     assert read_log(log).header.scenario_name == "foreign:Scenario"
     with pytest.raises(LogError, match="runs its code: if you trust it, import it first"):
         replay(log)

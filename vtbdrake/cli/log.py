@@ -51,6 +51,8 @@ def replay(
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
     found = read_log(log)
     recorded = found.header.scenario_name
+    if found.header.of_main_module:
+        found.header.make_scenario()  # It raises: the class is in a script or a notebook.
     if scenario is None and recorded:
         raise click.UsageError(
             f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "

@@ -6,6 +6,7 @@ import json
 import platform
 import re
 import struct
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -229,6 +230,11 @@ class LogHeader:
         """Return ``package.module:Class`` of the scenario; empty if the log does not say how to build one."""
         return str(self.record.get("scenario", "")) if self.scenario else ""
 
+    @property
+    def of_main_module(self) -> bool:
+        """Return whether the class of the scenario is one of a script or a notebook, which others cannot import."""
+        return self.scenario_name.startswith("__main__:")
+
     def make_scenario(self) -> Scenario:
         """Return the scenario that was recorded. Its module must be imported already.
 
@@ -238,6 +244,11 @@ class LogHeader:
         if not self.scenario:
             raise LogError("the log does not say how to build its scenario: pass the target to replay it with")
         name = self.scenario_name
+        if self.of_main_module and not hasattr(sys.modules["__main__"], name.partition(":")[2]):
+            raise LogError(
+                f"the log is of the scenario {name}, a class of a script or a notebook: only there can it be replayed. "
+                "Define scenarios that are recorded in modules"
+            )
         if not is_imported(name):
             raise LogError(
                 f"the log is of the scenario {name}, and importing its module runs its code: if you trust it, import "

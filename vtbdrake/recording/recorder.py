@@ -96,6 +96,12 @@ class Recorder:
         self._digest = StateDigest(runtime.target, runtime.context)
         self._digest_every = round(digest_period / runtime.period)
         header = _header(runtime)
+        if header.of_main_module:
+            _log.warning(
+                "%s can be replayed by this script or notebook only, because it defines %s: put it into a module",
+                self.path,
+                header.scenario_name,
+            )
         self._cycle = CycleWriter(CycleLayout(header.sense, header.act), runtime)
         self._events: list[bytes] = []
         self._count = 0
