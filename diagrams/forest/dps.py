@@ -28,25 +28,25 @@ AXLE = -0.8
 """The place of the rear axle, which is not steered, on x_B, in m."""
 
 
-def make_deployment(eyes: LcmMap, *, period: float) -> Deployment:
+def make_deployment(scans: LcmMap, *, period: float) -> Deployment:
     """Return how the localization unit runs on its carrier: after a fault, the advised route stays.
 
     Signals of numbers travel as ``lcmt_scope``; scans or images leave before them in the cycle of the carrier.
 
     Args:
-        eyes: How scans or images travel.
+        scans: How scans or images travel.
         period: Time from scan to scan, or from image to image, in s.
     """
     return Deployment(
         protocol=Protocol(
             sense=[
-                eyes,
+                scans,
                 vector_map("ODOMETRY", lcmt_scope, {"odometry": "value"}),
                 vector_map("IMU", lcmt_scope, {"imu": "value"}),
             ],
             act=[vector_map("ROUTE_COMMAND", lcmt_scope, {"route": "value"})],
             commands=[vector_map("ROUTE", lcmt_scope, {"route": "value"})],
-            periods={eyes.channel: period},
+            periods={scans.channel: period},
         ),
         period=PERIOD,
         guards={"fallback": {"route": Hold()}},
@@ -54,12 +54,12 @@ def make_deployment(eyes: LcmMap, *, period: float) -> Deployment:
 
 
 def make_dps(
-    world_map: WorldModel, localizer: Localizer, eyes: Mapping[str, Any], *, latency: float, drift: DriftModel
+    world_map: WorldModel, localizer: Localizer, signals: Mapping[str, Any], *, latency: float, drift: DriftModel
 ) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` localizes, ``impl`` advises the driver.
 
-    Input ports: one for each of the eyes (``scan``, a `Scan`), ``imu`` (6), ``odometry`` (1), and the command ``route``
-    (1: the number of the route that is advised). Output port: ``route`` (1).
+    Input ports: one for each of the signals (``scan``, a `Scan`), ``imu`` (6), ``odometry`` (1), and the command
+    ``route`` (1: the number of the route that is advised). Output port: ``route`` (1).
 
     ``env`` has the map as a constant, ``map``: it is part of the DPS, and stays when the simulated world is left out.
     Every part is sampled and shows its own state: no input feeds through.
@@ -67,19 +67,19 @@ def make_dps(
     Args:
         world_map: What the carrier knows of the world, as the localizer uses it.
         localizer: How scans are evaluated.
-        eyes: A value of each of the signals that the localizer sees with.
+        signals: A value of each of the signals in which the localizer detects landmarks, by name.
         latency: The time from the sample of a scan to its pose, in s.
         drift: How the dead reckoning drifts.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", make_calibration({"imu": 6, "odometry": 1}))
-    env = builder.AddNamedSystem("env", _make_env(world_map, localizer, eyes, latency=latency, drift=drift))
+    env = builder.AddNamedSystem("env", _make_env(world_map, localizer, signals, latency=latency, drift=drift))
     impl = builder.AddNamedSystem("impl", _make_impl())
     for signal in ("imu", "odometry"):
         builder.ExportInput(sense.GetInputPort(signal), signal)
         builder.Connect(sense.GetOutputPort(signal), env.GetInputPort(signal))
-    for eye in eyes:
-        builder.ExportInput(env.GetInputPort(eye), eye)
+    for signal in signals:
+        builder.ExportInput(env.GetInputPort(signal), signal)
     builder.ExportInput(impl.GetInputPort("route"), "route")
     builder.ExportOutput(impl.GetOutputPort("route"), "route")
     dps = builder.Build()
@@ -88,13 +88,13 @@ def make_dps(
 
 
 def _make_env(
-    world_map: WorldModel, localizer: Localizer, eyes: Mapping[str, Any], *, latency: float, drift: DriftModel
+    world_map: WorldModel, localizer: Localizer, signals: Mapping[str, Any], *, latency: float, drift: DriftModel
 ) -> Diagram:
     """Return the perceived environment: the map, and where the carrier is on it."""
     builder = DiagramBuilder()
     builder.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
     reckoning = builder.AddNamedSystem("dead_reckoning", DeadReckoning(period=PERIOD, axle=AXLE))
-    part = add_localizer(builder, reckoning, localizer, eyes, period=PERIOD, latency=latency)
+    part = add_localizer(builder, reckoning, localizer, signals, period=PERIOD, latency=latency)
     pose = builder.AddNamedSystem("pose", PresentPose(period=PERIOD, drift=drift, axle=AXLE))
     builder.Connect(reckoning.GetOutputPort("motion"), pose.GetInputPort("motion"))
     for port in ("pose", "covariance", "status", "odometry", "time"):

@@ -50,7 +50,7 @@ STANDING = 2.0
 """How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
 _POSE = "sim.sys.carrier.base.pose"
-_ARRIVAL = "dps.env.{eye}_arrival"
+_ARRIVAL = "dps.env.{signal}_arrival"
 _HISTORY = "dps.env.dead_reckoning.history"
 
 SCANS = 5.0
@@ -195,8 +195,8 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     Raises:
         RuntimeError: The carrier does not get there in twice the time that it should take.
     """
-    testbed, see = scenario.build(), scenario.sight()
-    arrivals = [_ARRIVAL.format(eye=signal.name) for signal in scenario.eyes()]
+    testbed, detect = scenario.build(), scenario.detector()
+    arrivals = [_ARRIVAL.format(signal=signal.name) for signal in scenario.perception_signals()]
     pose, time, history = (testbed.reader(address) for address in (_POSE, f"{arrivals[-1]}.time", _HISTORY))
     samples = [testbed.reader(f"{arrival}.sample") for arrival in arrivals]
     simulator = testbed.simulator()
@@ -221,7 +221,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         taken, past = float(time(context)), history(context)
         rows.append((taken, truth, carrier_pose_at(past, taken)[3:]))
         seen = [sample(context) for sample in samples]
-        landmarks.append(see(*seen, past, taken) if taken >= SETTLED else Landmarks.empty())
+        landmarks.append(detect(*seen, past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:
             travelled += float(np.hypot(*(truth - rows[-2][1])[:2]))
     times, truths, reckoned = (np.array(column) for column in zip(*rows, strict=True))
@@ -462,9 +462,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--bias", type=float, default=0.0, help="of the scanner's ranges, in m")
     parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
-    eyes = parser.add_mutually_exclusive_group()
-    eyes.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
-    eyes.add_argument("--stereo", action="store_true", help="a pair of cameras instead of a scanner")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
+    source.add_argument("--stereo", action="store_true", help="a pair of cameras instead of a scanner")
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     if chosen.stereo and chosen.bias:

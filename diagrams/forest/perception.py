@@ -88,32 +88,33 @@ class Localizer:
     """The localization from landmarks to the pose: the function of the slow part ``localizer``.
 
     Attributes:
-        see: Returns the landmarks in what the eyes show, such as `ScanLandmarks`.
+        detect: Returns the landmarks in a scan or in images, such as `ScanLandmarks`.
         unit: The localization on the map.
-        eyes: The signals that ``see`` takes, before the history and the time.
+        signals: The signals that ``detect`` takes, before the history and the time.
     """
 
-    see: Callable[..., Landmarks]
+    detect: Callable[..., Landmarks]
     unit: LocalizationUnit
-    eyes: tuple[str, ...] = ("scan",)
+    signals: tuple[str, ...] = ("scan",)
 
     def prepare(self) -> None:
-        """Look for the libraries of linear algebra, and load what ``see`` needs."""
+        """Look for the libraries of linear algebra, and load what ``detect`` needs."""
         _blas()
-        getattr(self.see, "prepare", lambda: None)()
+        getattr(self.detect, "prepare", lambda: None)()
 
     def __call__(
         self, *, request: Array, history: Array, memory: UnitState, **seen: Any
     ) -> tuple[dict[str, Any], UnitState]:
         """Return the outputs of the slow part, and the memory of the unit.
 
-        ``seen`` holds the samples of the eyes and their times, such as ``scan`` and ``scan_time``. Samples of different
-        times do not fit together: then nothing is seen, nor before `SETTLED`.
+        ``seen`` holds the samples of the signals and their times, such as ``scan`` and ``scan_time``. Samples of
+        different times do not fit together: then nothing is detected, nor before `SETTLED`.
         """
-        times = [float(seen[f"{eye}_time"][0]) for eye in self.eyes]
+        times = [float(seen[f"{name}_time"][0]) for name in self.signals]
         taken, sees = times[0], min(times) == max(times) >= SETTLED
         with _blas().limit(limits=1, user_api="blas"):
-            landmarks = self.see(*(seen[eye] for eye in self.eyes), history, taken) if sees else Landmarks.empty()
+            samples = [seen[name] for name in self.signals]
+            landmarks = self.detect(*samples, history, taken) if sees else Landmarks.empty()
             found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
         outputs = {
             "pose": found.pose,
@@ -242,18 +243,18 @@ def add_localizer(
     builder: DiagramBuilder,
     reckoning: DeadReckoning,
     localizer: Localizer,
-    eyes: Mapping[str, Any],
+    signals: Mapping[str, Any],
     *,
     period: float,
     latency: float,
 ) -> SlowPart:
-    """Add the slow part ``localizer``, and for each eye, such as ``scan``, its ``scan_arrival`` and the input port.
+    """Add the slow part ``localizer``, and for each signal, such as ``scan``, its ``scan_arrival`` and the input port.
 
     Args:
         builder: The builder of the Diagram ``env`` of the DPS.
         reckoning: Remembers the poses of the carrier.
         localizer: What is computed.
-        eyes: A value of each of its signals.
+        signals: A value of each of the signals that the localizer takes, by name.
         period: The period of the DPS, in s.
         latency: The time from the sample of a scan to its pose, in s.
 
@@ -263,7 +264,7 @@ def add_localizer(
     first = Localization.unknown()
     part = SlowPart(
         localizer,
-        inputs={**eyes, **{f"{eye}_time": 1 for eye in eyes}, "history": history_size(period)},
+        inputs={**signals, **{f"{name}_time": 1 for name in signals}, "history": history_size(period)},
         outputs={
             "pose": 3,
             "covariance": 9,
@@ -291,11 +292,11 @@ def add_localizer(
         on_request=True,
     )
     builder.AddNamedSystem("localizer", part)
-    for eye, value in eyes.items():
-        arrival = builder.AddNamedSystem(f"{eye}_arrival", Arrival(value, period=period, age=period))
-        builder.Connect(arrival.GetOutputPort("sample"), part.GetInputPort(eye))
-        builder.Connect(arrival.GetOutputPort("time"), part.GetInputPort(f"{eye}_time"))
-        builder.ExportInput(arrival.GetInputPort("signal"), eye)
+    for name, value in signals.items():
+        arrival = builder.AddNamedSystem(f"{name}_arrival", Arrival(value, period=period, age=period))
+        builder.Connect(arrival.GetOutputPort("sample"), part.GetInputPort(name))
+        builder.Connect(arrival.GetOutputPort("time"), part.GetInputPort(f"{name}_time"))
+        builder.ExportInput(arrival.GetInputPort("signal"), name)
     # The last one, as all of them arrive together or in this order.
     builder.Connect(arrival.GetOutputPort("number"), part.GetInputPort("request"))
     builder.Connect(reckoning.GetOutputPort("history"), part.GetInputPort("history"))

@@ -148,7 +148,7 @@ class CarrierScenario(Scenario):
             localizer_latency=(self.localizer_latency >= PERIOD, f"at least {PERIOD:g} s, the period of the DPS"),
         )
         try:
-            self.check_eyes()
+            self.check_perception()
             self.ground()
             for name in ("scanner_errors", "imu_errors", "odometry_errors"):
                 getattr(self, name).check(f"{type(self).__name__}.{name}")
@@ -191,7 +191,7 @@ class CarrierScenario(Scenario):
         """
         return load_geojson(self.map_file) if self.map_file else self.surveyed_map()
 
-    def check_eyes(self) -> None:
+    def check_perception(self) -> None:
         """Raise a ValueError if the DPS cannot see landmarks with its scanner.
 
         Raises:
@@ -211,7 +211,7 @@ class CarrierScenario(Scenario):
         """The time from one sample of what the DPS sees landmarks with to the next, in s."""
         return 1.0 / self.scanner.frequency
 
-    def eyes(self) -> list[Signal]:
+    def perception_signals(self) -> list[Signal]:
         """Return the signals of what the DPS sees landmarks with."""
         return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.eye_period)]
 
@@ -219,7 +219,7 @@ class CarrierScenario(Scenario):
         last = len(self.routes()) - 1.0
         return Interface(
             sense=[
-                *self.eyes(),
+                *self.perception_signals(),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-50.0, upper=50.0, max_age=5 * PERIOD),
                 Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD),
             ],
@@ -228,8 +228,8 @@ class CarrierScenario(Scenario):
         )
 
     @abstractmethod
-    def sight(self) -> Callable[..., Landmarks]:
-        """Return how the DPS finds landmarks in what its eyes show, see `Localizer`."""
+    def detector(self) -> Callable[..., Landmarks]:
+        """Return how the DPS finds landmarks in scans or images, see `Localizer`."""
 
     def scanner_accuracy(self) -> dict[str, float]:
         """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
@@ -255,9 +255,9 @@ class CarrierScenario(Scenario):
 
     def make_dps(self) -> Diagram:
         world_map = self.global_map()
-        eyes = {signal.name: signal.model_value for signal in self.eyes()}
-        localizer = Localizer(self.sight(), self.unit(world_map), tuple(eyes))
-        return make_dps(world_map, localizer, eyes, latency=self.localizer_latency, drift=DriftModel())
+        signals = {signal.name: signal.model_value for signal in self.perception_signals()}
+        localizer = Localizer(self.detector(), self.unit(world_map), tuple(signals))
+        return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
         return make_deployment(scan_map("SCAN", "scan"), period=self.eye_period)
@@ -303,11 +303,11 @@ class CarrierScenario(Scenario):
         builder.add("sense", "odometry", odometer)
         builder.connect(wheels.GetOutputPort("speed"), odometer.GetInputPort("speed"))
         builder.sim_sensor("odometry", odometer.get_output_port())
-        self.add_eyes(builder)
+        self.add_perception(builder)
         # So old are the samples of IMU and odometry.
         declare_belief(builder, carrier, ground, routes, age=PERIOD)
 
-    def add_eyes(self, builder: VirtualTestbedBuilder) -> None:
+    def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         """Add what the DPS sees landmarks with to the simulated world: the scanner."""
         from vtbdrake.components.ray_casting import RayCaster
         from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
@@ -389,9 +389,9 @@ class ForestScenario(CarrierScenario):
         textured = self.perception == "stereo"
         add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
 
-    def check_eyes(self) -> None:
+    def check_perception(self) -> None:
         if self.perception == "scanner":
-            super().check_eyes()
+            super().check_perception()
         else:
             self.stereo.check()
 
@@ -399,15 +399,15 @@ class ForestScenario(CarrierScenario):
     def eye_period(self) -> float:
         return super().eye_period if self.perception == "scanner" else 1.0 / self.stereo.rate
 
-    def eyes(self) -> list[Signal]:
+    def perception_signals(self) -> list[Signal]:
         if self.perception == "scanner":
-            return super().eyes()
+            return super().perception_signals()
         from pydrake.systems.sensors import ImageRgba8U
 
         image = ImageRgba8U(self.stereo.width, self.stereo.height)
         return [Signal(name, model_value=image, max_age=5.0 * self.eye_period) for name in IMAGES]
 
-    def sight(self) -> Callable[..., Landmarks]:
+    def detector(self) -> Callable[..., Landmarks]:
         if self.perception == "scanner":
             return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
         X_BC = self.X_BL @ self.stereo.poses()[IMAGES[0]]
@@ -426,9 +426,9 @@ class ForestScenario(CarrierScenario):
         images = image_array_map("IMAGES", {name: name for name in IMAGES})
         return make_deployment(images, period=self.eye_period)
 
-    def add_eyes(self, builder: VirtualTestbedBuilder) -> None:
+    def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         if self.perception == "scanner":
-            super().add_eyes(builder)
+            super().add_perception(builder)
         else:
             add_stereo(builder, builder.plant.GetFrameByName("scanner"), self.stereo)
 
@@ -475,7 +475,7 @@ class PlainScenario(CarrierScenario):
     def surveyed_map(self) -> WorldModel:
         return self.rock_field().map(MAPS[self.map], seed=self.map_seed)
 
-    def sight(self) -> ScanLandmarks:
+    def detector(self) -> ScanLandmarks:
         return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:

@@ -146,7 +146,7 @@ class RidingScenario(ForestScenario):
     def X_BL(self) -> RigidTransform:
         return X_BL
 
-    def sight(self) -> SpotLandmarks:
+    def detector(self) -> SpotLandmarks:
         return SpotLandmarks()
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:

@@ -189,7 +189,7 @@ def anything() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("kind", [ForestScenario, PlainScenario])
 def test_scans_of_anything_are_no_place_and_no_error(kind: type[CarrierScenario]) -> None:
     scenario = kind(**SMALL, map="poor")
-    localizer = Localizer(scenario.sight(), scenario.unit(scenario.global_map()))
+    localizer = Localizer(scenario.detector(), scenario.unit(scenario.global_map()))
     reckoning = DeadReckoning(period=PERIOD)
     history = reckoning.GetOutputPort("history").Eval(reckoning.CreateDefaultContext())
     for name, points in anything().items():
