@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from math import atan2, ceil, cos, hypot, inf, isfinite, sin, sqrt
+from math import atan2, ceil, cos, hypot, inf, sin, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,8 @@ HISTORY_LENGTH = 1.0
 
 # Once the carrier has stood still for so long, its gyros show their bias, in s.
 _SETTLING_TIME = 0.5
+# No carrier turns, accelerates or drives as fast, in rad/s, m/s^2 and m/s: such a number is a fault.
+_LARGEST = 1e3
 # The standard deviation of the gyros' bias at the start, in rad/s.
 _BIAS_DEVIATION = 0.005
 
@@ -134,7 +136,8 @@ class DeadReckoning(LeafSystem):
     speed, with a time constant of half a second, below ``still_speed``, and no speed was above four times that: wheel
     sensors are noisy at rest, too.
 
-    A sample with a number that is not finite is left out and counted in ``ignored``: speed and turn rate go on.
+    A sample with a number that is not finite, or with one of 1,000 or more, is left out and counted in ``ignored``:
+    speed and turn rate go on.
     """
 
     __slots__ = NO_DICT
@@ -201,7 +204,7 @@ class DeadReckoning(LeafSystem):
         # The sample before the first interval is about no motion.
         begun = now > -T / 2.0
         v = v_before
-        if not all(map(isfinite, sample)):
+        if not all(abs(number) < _LARGEST for number in sample):
             inner[9] += 1.0
         elif begun:
             v = sample[6]
