@@ -424,8 +424,9 @@ def test_loop_that_overslept_sends_no_dps_command():
     assert runtime.guards.latched[0].kind == "missed" and runtime.statistics.misses == 50
 
 
-def test_loop_that_overslept_reads_all_that_has_waited():
-    used = []
+@pytest.mark.parametrize(("asleep", "pace"), [(True, None), (False, None), (False, "position")])
+def test_loop_that_was_held_up_reads_all_that_has_waited(asleep, pace):
+    used, waiting = [], [0.05, 0.06, 0.07, 0.08]  # One poll does not read them all.
 
     def fall_back(last_sent, sensed, known, dt):
         used.append(sensed["position"][0])
@@ -433,12 +434,21 @@ def test_loop_that_overslept_reads_all_that_has_waited():
 
     fallback = {"velocity": FallbackController(fall_back, otherwise=Zero())}
     guards = Guards(ServoScenario(rate=0.0).interface(), PERIOD, fallback=fallback)
-    waiting = [0.05, 0.06, 0.07, 0.08]  # One poll does not read them all.
-    runtime, bridge, _ = switched(rate=0.0, lateness=[0.0] * 4 + [50.4 * PERIOD], guards=guards)
-    runtime.run(cycles=4)
-    bridge.sensors = lambda t: {"position": [waiting.pop(0), 0.0], "speed": [0.0, 0.0]} if waiting else {}
-    runtime.run(cycles=1)
-    assert used == [0.08]
+    held_up = 50.4 * PERIOD
+    lateness = [0.0] * 4 + [held_up] if asleep else ()
+    runtime, bridge, clock = switched(rate=0.0, guards=guards, pace=pace, lateness=lateness)
+    runtime.run(cycles=3)
+    publish = bridge.publish
+
+    def late(commands):
+        bridge.publish = publish
+        bridge.sensors = lambda t: {"position": [waiting.pop(0), 0.0], "speed": [0.0, 0.0]} if waiting else {}
+        clock.advance(0.0 if asleep else held_up)
+        return publish(commands)
+
+    bridge.publish = late
+    runtime.run(cycles=2)
+    assert runtime.guards.latched[0].kind == "missed" and used == [0.08]
 
 
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])

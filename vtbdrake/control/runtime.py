@@ -229,7 +229,7 @@ class Runtime(Stepped):
         begin = self.clock.now()
         if poll:
             self.bridge.poll()
-        if lateness > self.period:
+        if lateness > self.period or self.statistics.run:
             self._read_backlog()
         now = self.clock.now()
         self._serve()
