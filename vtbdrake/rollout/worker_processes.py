@@ -167,9 +167,11 @@ class ProcessExecutor(Executor):
         waiting, cutoff = call.waiting, call.cutoff
         index = waiting[0]
         limited = self._time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
-        message = (b"L" if limited else b"R") + pickle.dumps((index, pack(call.points[index]), cutoff))
+        announced = limited and not worker.has_testbed(call, index)
         start = call.starts[index]
-        if worker.jobs and len(message) + (0 if worker.has(start) else len(start)) > _SMALL:
+        sent = None if worker.has(start) else start
+        message = b"R" + pickle.dumps((index, pack(call.points[index]), sent, cutoff, announced))
+        if worker.jobs and len(message) > _SMALL:
             return True
         waiting.popleft()
         try:
@@ -190,7 +192,7 @@ class ProcessExecutor(Executor):
 
     def _expect(self, worker: _Worker, call: _Call) -> None:
         """Limit the time until a worker begins its next rollout, if it has the testbed of that already."""
-        if worker.warm and not split(call.points[worker.jobs[0]])[0]:
+        if worker.has_testbed(call, worker.jobs[0]):
             worker.begin(self._time_limit, call.cutoff)
 
     def _replies(self, call: _Call) -> list[tuple[_Worker, int, Any]]:
@@ -271,7 +273,12 @@ class _Worker:
         """Return whether the worker begins at ``start`` already."""
         return self._start is start or self._start == start
 
+    def has_testbed(self, call: _Call, index: int) -> bool:
+        """Return whether the worker need not build a testbed for a rollout."""
+        return self.warm and self._task == call.task and not split(call.points[index])[0]
+
     def give(self, task: bytes, start: bytes, index: int, message: bytes) -> None:
+        """Send a rollout; ``message`` holds the start if the worker does not have it."""
         # Before anything is sent: a worker that was interrupted here must not count as idle.
         self.jobs.append(index)
         if self.connection is None:
@@ -281,10 +288,8 @@ class _Worker:
             self.warm = self.brief = False
             self.connection.send_bytes(b"T" + task)
             self._task = task
-        if not self.has(start):
-            self.connection.send_bytes(b"S" + start)
-            self._start = start
         self.connection.send_bytes(message)
+        self._start = start
 
     def begin(self, time_limit: float, cutoff: Cutoff | None) -> None:
         """Start the time limit: the worker has its testbed, and begins its rollout or is about to."""
@@ -326,9 +331,8 @@ def checked_time_limit(time_limit: float) -> float:
 def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
     """Run rollouts on request until the connection closes.
 
-    A task (T) and the start of the rollouts that follow (S) have no answer. A rollout (R) has one, from `answer`. A
-    rollout with a time limit (L) has `_BEGUN` before it, unless its testbed cannot be built. Once, `_GROWN` comes
-    before an answer.
+    A task (T) has no answer. A rollout (R) has one, from `answer`; it is announced by `_BEGUN` on request, unless its
+    testbed cannot be built. Once, `_GROWN` comes before an answer.
 
     Args:
         parent: The connection to the executor.
@@ -349,12 +353,10 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
                 # The same object each time, as its runner is known by it. One that cannot be read raises each time.
                 load = cache(partial(unpack, content))
                 continue
-            if kind == b"S":
-                start = content
-                continue
-            index, point, cutoff = pickle.loads(content)
+            index, point, new_start, cutoff, announced = pickle.loads(content)
+            start = start if new_start is None else new_start
             assert load is not None, "a worker got a rollout before its task"
-            begin = partial(connection.send_bytes, _BEGUN) if kind == b"L" else None
+            begin = partial(connection.send_bytes, _BEGUN) if announced else None
             reply = answer(index, partial(_rollout, runners, load, point, start, cutoff, begin))
             if limit == inf:
                 limit = _memory() + growth
