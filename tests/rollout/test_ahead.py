@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from dataclasses import dataclass
 from math import inf
 
 import numpy as np
@@ -123,3 +124,21 @@ def test_a_worker_that_is_stopped_between_rollouts_is_replaced(seconds, caplog):
         assert not any(result.failed for result in results.values())
         assert ("longer than its time limit" in caplog.text) == (seconds == inf)
         assert len(dict(executor.run(TASK, _points(2)))) == 2
+
+
+@dataclass
+class _SlowToBuild(PendulumScenario):
+    seconds: float = 0.0
+
+    def make_dps(self):
+        time.sleep(self.seconds)
+        return super().make_dps()
+
+
+def test_a_warm_worker_has_time_to_build_another_testbed(caplog):
+    task = RolloutTask(_SlowToBuild(), 0.1, Quality(abs, THETA))
+    with ProcessExecutor(1, time_limit=1.0) as executor:
+        list(executor.run(task, _points(1)))
+        ((_, result),) = executor.run(task, [{"scenario.seconds": 1.2}])
+    assert not result.failed
+    assert caplog.text == ""
