@@ -85,6 +85,8 @@ class Thinking:
         self._results: dict[RolloutKey, RolloutResult] = {}
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
+        # What each candidate sets, address -> value.
+        self._planned: dict[Point, dict[str, Any]] = {KEEP: {}}
         # The plan in use as a point of the search, if it is one.
         self._same: Point | None = None
         # The candidates in the order in which they were proposed; the plan in use is the first.
@@ -129,7 +131,9 @@ class Thinking:
 
     def _values(self, point: Point) -> dict[str, Any]:
         """Return what a candidate sets, address -> value."""
-        return {} if point == KEEP else self._reasoner.space.values(point, self._held, self._time)
+        if point not in self._planned:
+            self._planned[point] = self._reasoner.space.values(point, self._held, self._time)
+        return self._planned[point]
 
     def _iterate(self, solver: Solver, first: Sequence[Point], known: Sequence[Evaluation]) -> str:
         """Try what a method asks for; return how it ended.
