@@ -97,9 +97,11 @@ class Source(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, until: float = np.inf, offset: float = 0.0, flipped: float = np.inf) -> None:
+    def __init__(
+        self, *, until: float = np.inf, offset: float = 0.0, flipped: float = np.inf, ahead: float = np.inf
+    ) -> None:
         super().__init__()
-        self._until, self._offset, self._flipped = until, offset, flipped
+        self._until, self._offset, self._flipped, self._ahead = until, offset, flipped, ahead
         self.DeclareAbstractOutputPort("estimate", lambda: Value(PoseEstimate.missing()), self._calc)
 
     def _calc(self, context: Context, output: Value) -> None:
@@ -107,6 +109,8 @@ class Source(LeafSystem):
         X = truth(time)
         if time >= self._flipped:
             X = RigidTransform(X.rotation() @ RotationMatrix.MakeXRotation(2.0), X.translation())
+        if 0.0 <= time - self._ahead < 0.1:  # The clock of one estimate is wrong.
+            time += 1e3
         told = PoseEstimate.of(X, COVARIANCE, time=time) if 0.0 <= time < self._until else PoseEstimate.missing()
         output.set_value(told)
 
@@ -167,6 +171,14 @@ def test_pose_that_is_far_off_is_left_out_until_it_persists() -> None:
     simulator.AdvanceTo(4.0)
     flipped = truth(4.0) @ RigidTransform(RotationMatrix.MakeXRotation(2.0), [0.0, 0.0, 0.0])
     assert angle_between(pose_of_state(tracker.GetOutputPort("state").Eval(context)), flipped) < 0.05
+
+
+def test_estimate_from_the_future_is_ignored() -> None:
+    simulator, tracker, context = tracking(markers=Source(ahead=1.0))
+    simulator.AdvanceTo(2.3)
+    status = tracker.GetOutputPort("status").Eval(context)
+    assert status[0] == 1.0 and 0.0 <= status[1] < 1.0
+    assert angle_between(pose_of_state(tracker.GetOutputPort("state").Eval(context)), truth(2.3)) < 0.01
 
 
 def test_source_to_begin_with_must_exist() -> None:

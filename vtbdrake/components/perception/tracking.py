@@ -210,7 +210,8 @@ class TargetTracker(LeafSystem):
     Every period it fuses what is new at its sources: each estimate once, at the time at which it held, which may be
     earlier than what was fused before. Estimates that are too far from the expected pose (``gate``, on the normalized
     innovation squared) are left out; after ``patience`` of them in succession, the track begins anew with the next
-    estimate of a source that needs no prediction.
+    estimate of a source that needs no prediction. An estimate with a time that is later than the present by more than
+    ``lost_after`` is ignored.
 
     ``state`` is the target at the present, as `body_state` orders it: (13,). Before the first estimate it is the
     identity at rest. ``status`` is [valid, age, attitude, position]: valid is 1 if the track has had ``fewest``
@@ -288,7 +289,8 @@ class TargetTracker(LeafSystem):
         fresh: list[tuple[float, int, PoseEstimate]] = []
         for k, port in enumerate(self._inputs):
             estimate: PoseEstimate = port.Eval(context)
-            if estimate.valid and estimate.time > times[k]:
+            # A time in the future is a fault, after which every other estimate would be old.
+            if estimate.valid and times[k] < estimate.time <= context.get_time() + lost_after:
                 times[k] = estimate.time
                 fresh.append((estimate.time, k, estimate))
         for _, k, estimate in sorted(fresh, key=lambda entry: entry[:2]):
