@@ -79,7 +79,7 @@ class DecisionSpace:
         for element in self.elements:
             value = plan[element.address]
             if isinstance(element, Trajectory):
-                begin, knots = float(value[0]), np.asarray(value[1:], dtype=float)
+                begin, *knots = element.check(value)
                 point += element.shifted(knots, time - begin).tolist()
             else:
                 point.append(element.check(value))

@@ -131,6 +131,18 @@ class Trajectory:
         for parameter in self.parameters:
             parameter.find(variables)
 
+    def check(self, plan: ArrayLike) -> list[float]:
+        """Return a plan [t_begin, knots] as numbers.
+
+        Raises:
+            ValueError: it has another size, or is not finite.
+        """
+        count = 1 + self.spline.knots * self.size
+        numbers = np.asarray(plan, dtype=float)
+        if numbers.shape != (count,) or not np.isfinite(numbers).all():
+            raise ValueError(f"a plan of {self.address} is [t_begin, knots], {count} finite numbers, not {plan!r}")
+        return numbers.tolist()
+
     def plan(self, knots: ArrayLike, begin: float) -> Array:
         """Return the whole plan [t_begin, knots].
 
