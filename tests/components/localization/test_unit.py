@@ -130,6 +130,7 @@ def test_bad_times_and_poses_are_ignored_and_counted():
     answers, state = run(unit, one.scans[:15], one.reckoned[:15])
     bad = [
         ([np.nan, 0.0, 0.0], 9.0),
+        ([1e200, 0.0, 0.0], 9.0),
         (one.reckoned[15], 15 * PERIOD - 2.0),
         (one.reckoned[15], answers[-1].time),
         (one.reckoned[15], np.nan),

@@ -29,6 +29,9 @@ SEARCHING, TRACKING, LOST = range(3)
 
 STATUS_NAMES = ("searching", "tracking", "lost")
 
+# A pose by odometry with a larger number, in m or rad, is a fault.
+_LARGEST = 1e9
+
 # The fewest matched detections with which a track begins.
 _FEWEST = 4
 
@@ -143,8 +146,8 @@ class LocalizationUnit:
     ) -> tuple[Localization, UnitState]:
         """Return the answer to a scan, and the memory after it.
 
-        A call with a pose or a time that is not finite, or with a time that is not after the last one, is ignored and
-        counted. The answer is then the last one, which says for which time it holds.
+        A call with a pose or a time that is not finite, a pose of 1e9 m or more, or a time that is not after the last
+        one, is ignored and counted. The answer is then the last one, which says for which time it holds.
 
         Args:
             state: The memory before.
@@ -159,7 +162,7 @@ class LocalizationUnit:
         if pose.shape != (3,):
             raise ValueError(f"X_OH is a planar pose [x, y, heading], shape (3,), not of shape {pose.shape}")
         last = state.answer
-        if not (np.isfinite(pose).all() and isfinite(time) and time > last.time):
+        if not ((np.abs(pose) < _LARGEST).all() and isfinite(time) and time > last.time):
             return last, replace(state, ignored=state.ignored + 1)
         begins = not isfinite(last.time)
         motion = np.zeros(3) if begins else compose(inverse(last.X_OH), pose)
