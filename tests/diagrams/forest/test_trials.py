@@ -57,6 +57,12 @@ def test_places_inside_are_found_and_others_are_not_claimed() -> None:
         assert not any(run(case, seed=seed).is_sure for seed in range(2))
 
 
+def test_a_drive_tells_more_of_a_plantation_than_one_place() -> None:
+    rows = Case("plantation", 1000.0, "remote", "inside")
+    assert not run(rows, seed=0).is_sure
+    assert run(replace(rows, is_driven=True), seed=0).is_right
+
+
 def test_a_drive_ends_where_it_is_judged() -> None:
     trial = run(replace(INSIDE, map="poor"), seed=1)
     assert trial.is_right and trial.position < 2.0
