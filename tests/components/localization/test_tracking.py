@@ -285,6 +285,35 @@ def test_landmarks_without_a_place_do_not_take_part():
         Tracker(one.map, largest_deviation=0.05)
 
 
+def test_the_map_is_used_once_on_a_closed_route():
+    """No estimate by a map of n trees is better than s^2 / n, however often the carrier comes by."""
+    rng = np.random.default_rng(4)
+    angles = np.arange(48) * 2.0 * np.pi / 48
+    ring = 25.0 * np.column_stack([np.cos(angles), np.sin(angles)])
+    deviation, count = 0.1, len(ring)
+    shown = ring + deviation * rng.standard_normal(ring.shape)
+    tree_map = Landmarks(
+        shown, np.tile(deviation**2 * np.eye(2), (count, 1, 1)), np.full(count, 0.3), np.full(count, 0.01)
+    )
+    tracker = Tracker(tree_map)
+    motion, drift = np.array([2.0, 0.0, 2.0 / 20.0]), np.diag([0.005, 0.005, 0.0005]) ** 2
+    truth = np.array([20.0, 0.0, np.pi / 2.0])
+    state = tracker.start(truth, START)[0]
+    seen = set()
+    for _ in range(5 * 63):
+        truth = compose(truth, motion)
+        near = ring[np.hypot(*(ring - truth[:2]).T) < 25.0]
+        places = transform(inverse(truth), near) + 0.01 * rng.standard_normal(near.shape)
+        n = len(near)
+        scan = Landmarks(places, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01))
+        slip = rng.multivariate_normal(np.zeros(3), drift)
+        state, matches = tracker.update(tracker.predict(state, motion + slip, drift), scan)
+        seen |= set(matches.pairs[:, 1])
+    assert matches.is_fused and len(seen) > 40
+    assert (np.diagonal(state.pose_covariance)[:2] > deviation**2 / count).all()
+    assert nees(state.pose, state.pose_covariance, truth) < chi2.ppf(0.999, 3)
+
+
 def test_the_state_stays_small_and_is_a_value():
     one = drive(1, ACCURATE, scans=60, step=0.8)
     tracker, states = tracked(one, horizon=15.0, most=30)

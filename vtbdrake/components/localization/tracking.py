@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import inf, pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,8 +92,10 @@ class TrackState:
 
     def __post_init__(self) -> None:
         for name in ("mean", "covariance", "indices", "is_recent"):
-            array = np.array(getattr(self, name))
-            array.flags.writeable = False
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.flags.writeable:
+                array = np.array(array)
+                array.flags.writeable = False
             object.__setattr__(self, name, array)
 
     @classmethod
@@ -103,6 +105,12 @@ class TrackState:
 
     def __deepcopy__(self, memo: object) -> TrackState:
         return self
+
+    def with_arrays(self, **arrays: Any) -> TrackState:
+        """Return the state with other arrays, which are not copied and are read-only from now on."""
+        for array in arrays.values():
+            array.flags.writeable = False
+        return replace(self, **arrays)
 
     @property
     def is_tracking(self) -> bool:
@@ -176,8 +184,9 @@ class Tracker:
     (of 0.95 for first matches). The logarithm of this ratio is summed up to at most ``credit``; below 0, the track is
     lost (the cumulative sum of Page, Biometrika 41, 1954).
 
-    Landmarks that were marginalized enter anew if the carrier comes back. Their map error is then used twice. Those of
-    which the map is less certain than ``largest_deviation`` are left out.
+    Landmarks that were marginalized enter anew if the carrier comes back, and their map error is then used twice:
+    ``horizon`` and ``most`` must be so large that a closed route is in the state as a whole. Landmarks of which the map
+    is less certain than ``largest_deviation`` are left out.
 
     Attributes:
         landmarks: The map, in W.
@@ -191,7 +200,7 @@ class Tracker:
         correlated_share: c, of the variance; assumed.
         gate: The share of right pairs that the gate lets pass.
         horizon: Distance from the carrier in m beyond which landmarks are marginalized.
-        most: The largest number of landmarks in the state.
+        most: The largest number of landmarks in the state; the farthest are marginalized.
         patience: Failures in succession until the track is lost.
         credit: The largest evidence.
         first_credit: The evidence at the start: a wrong start ends sooner.
@@ -210,8 +219,8 @@ class Tracker:
     correlation: float = 0.0
     correlated_share: float = 0.98
     gate: float = 0.997
-    horizon: float = 30.0
-    most: int = 90
+    horizon: float = 100.0
+    most: int = 400
     patience: int = 3
     credit: float = 12.0
     first_credit: float = 6.0
@@ -290,7 +299,7 @@ class Tracker:
         P[:3] = F @ P[:3]
         P[:, :3] = P[:, :3] @ F.T
         P[:3, :3] += G @ np.asarray(covariance, dtype=float) @ G.T
-        return replace(state, mean=mean, covariance=P)
+        return state.with_arrays(mean=mean, covariance=P)
 
     def update(self, state: TrackState, landmarks: Landmarks) -> tuple[TrackState, Matches]:
         """Return the state after a scan, and its matches.
@@ -308,7 +317,7 @@ class Tracker:
         if len(found.pairs) < 2:
             return state, Matches(found.pairs)
         is_known = np.isin(found.pairs[:, 1], state.indices)
-        new = found.select(~is_known).first(self.most - len(state.indices))
+        new = found.select(~is_known)
         extended = self._extended(state, new.pairs[:, 1], new.probability)
         fused, matches = self._fused(extended, landmarks, np.vstack([found.pairs[is_known], new.pairs]))
         # What is left of the pairs may be too few.
@@ -353,8 +362,7 @@ class Tracker:
             prior, J = np.kron(rest, np.eye(2)), np.kron(weights.T, np.eye(2))
             added = places[indices] + weights.T @ (mean[_FIXED:].reshape(-1, 2) - places[state.indices])
         cross = J @ P[_FIXED:]
-        return replace(
-            state,
+        return state.with_arrays(
             mean=np.concatenate([mean, added.ravel()]),
             covariance=np.block([[P, cross.T], [cross, cross[:, _FIXED:] @ J.T + prior]]),
             indices=np.concatenate([state.indices, indices]),
@@ -393,8 +401,10 @@ class Tracker:
             return state, _NO_MATCHES
         mean = state.mean + PHt @ weighted
         P = state.covariance - PHt @ cho_solve(factor, PHt.T)
-        fused = replace(state, mean=mean, covariance=0.5 * (P + P.T), is_recent=np.isin(state.indices, pairs[:, 1]))
-        far = np.hypot(*(mean[_FIXED:].reshape(-1, 2) - mean[:2]).T) > self.horizon
+        fused = state.with_arrays(mean=mean, covariance=0.5 * (P + P.T), is_recent=np.isin(state.indices, pairs[:, 1]))
+        distance = np.hypot(*(mean[_FIXED:].reshape(-1, 2) - mean[:2]).T)
+        far = distance > self.horizon
+        far[np.argsort(distance)[self.most :]] = True
         return _without(fused, far), Matches(pairs, float(parts.sum()), is_fused=True)
 
     def _noise(self, landmarks: Landmarks) -> Array:
@@ -534,9 +544,10 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
 
 def _without(state: TrackState, dropped: NDArray[np.bool_]) -> TrackState:
     """Return the state without the landmarks for which the mask (n,) is true."""
+    if not dropped.any():
+        return state
     kept = np.concatenate([np.ones(_FIXED, dtype=bool), np.repeat(~dropped, 2)])
-    return replace(
-        state,
+    return state.with_arrays(
         mean=state.mean[kept],
         covariance=state.covariance[np.ix_(kept, kept)],
         indices=state.indices[~dropped],
