@@ -41,7 +41,7 @@ _SEEN, _POSE = "#0072b2", "#d55e00"
 
 @dataclass(frozen=True, eq=False)
 class DriveRecord:
-    """What the localization unit says along a drive, at n instants.
+    """Poses and covariances that the localization unit tells along a drive, at n instants, beside the true poses.
 
     Attributes:
         truth: The true poses of the carrier, (n, 6), as ``sim.sys.carrier.base.pose`` gives them.

@@ -97,7 +97,7 @@ class Guidance:
 
 @dataclass
 class _Step:
-    """What an update changes: the mode, the guidance, for how long the gripper is steady (s), and the attempts."""
+    """A step holds what an update changes: mode, guidance, how long the gripper is steady (s), and attempts."""
 
     mode: float
     reason: float

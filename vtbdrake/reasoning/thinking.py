@@ -39,7 +39,6 @@ _ROUND = 8
 # A method that asks so often in a row for known candidates only has nothing more to try.
 _KNOWN_BATCHES = 50
 
-
 # A decision is late if it took so many times its wall time.
 _LATE = 1.5
 

@@ -1,8 +1,8 @@
 """Dead reckoning of a carrier on wheels by gyros, accelerometers and wheel speed, and how it corrects scans.
 
 Frames: B is the body of the carrier, with x forward, where the IMU measures. H is its level frame: its origin is Bo, z
-is up by gravity, x points in the heading of B. O, the odometry frame, is where H was at the
-start. L is the frame of the scanner.
+is up by gravity, x points in the heading of B. O, the odometry frame, is where H was at the start. L is the frame of
+the scanner.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BIAS_DEVIATION = 0.005
 
 @dataclass(frozen=True)
 class DriftModel:
-    """How dead reckoning drifts: by random walks, and by errors that last. All are standard deviations.
+    """Dead reckoning drifts by random walks, and by errors that last. All values are standard deviations.
 
     The walks grow with the roots of distance, time and turn. Those along and across are calibrated with the simulated
     carrier of `vtbdrake_diagrams.forest`, which slips on slopes; all others are assumed. What lasts, of the radius of a

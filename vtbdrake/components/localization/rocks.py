@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RockDetector(ScanDetector):
-    """How rocks are found. The other attributes are those of `ScanDetector`: the angles must be those of the scanner.
+    """A detector of rocks has these settings, and those of `ScanDetector`: the angles must be those of the scanner.
 
     Attributes:
         least_height: How far a point must be over the ground to belong to a rock, in m; more than waves of the ground

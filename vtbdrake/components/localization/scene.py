@@ -1,4 +1,4 @@
-"""What detectors of landmarks see in a scan: its points by direction and distance, and clusters of them."""
+"""Detectors of landmarks see a scan as points by direction and distance, and as clusters of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HIDDEN = 0.25
 
 @dataclass(frozen=True)
 class ScanDetector:
-    """What detectors of landmarks in scans have in common.
+    """All detectors of landmarks in scans have these settings.
 
     Attributes:
         azimuth_step: Angle between neighbouring rays of a row of the scanner in rad.

@@ -55,7 +55,7 @@ _NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True)
 class TrunkDetector(ScanDetector):
-    """How trunks are found. The other attributes are those of `ScanDetector`: the angles must be those of the scanner.
+    """A detector of trunks has these settings, and those of `ScanDetector`: the angles must be those of the scanner.
 
     Trunks whose bark is less than two cells apart are one object, which is mostly refused.
 
