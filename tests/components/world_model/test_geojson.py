@@ -105,6 +105,22 @@ def test_file_gives_the_same_model(tmp_path: Path) -> None:
     assert_same(load_geojson(path, frame=FRAME), model())
 
 
+def test_places_are_converted_all_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, convert, calls = tmp_path / "map.geojson", LocalFrame.from_geographic, []
+
+    def counted(frame: LocalFrame, points: np.ndarray) -> np.ndarray:
+        calls.append(np.shape(points))
+        return convert(frame, points)
+
+    monkeypatch.setattr(LocalFrame, "from_geographic", counted)
+    points = np.random.default_rng(3).uniform(-500.0, 500.0, (40, 3))
+    trees = WorldModel(WorldObject(f"t{k}", "tree", position_estimate(points[k])) for k in range(40))
+    for saved in (trees, WorldModel()):
+        save_geojson(saved, path, frame=FRAME)
+        assert np.allclose(load_geojson(path).positions(), saved.positions(), rtol=0.0, atol=1e-6)
+    assert calls == [(40, 3), (0, 3)]
+
+
 def test_file_keeps_the_rules_of_rfc_7946(tmp_path: Path) -> None:
     path = tmp_path / "map.geojson"
     save_geojson(model(), path, frame=FRAME)
