@@ -322,7 +322,7 @@ def _warnings(
         yield "the plan in use has not finished: the decision may be worse than none"
     if budget.seconds is not None and elapsed > _LATE * budget.seconds:
         yield (
-            f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a worker was lost, or the time from one "
+            f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a worker hangs, or the time from one "
             "sample to the next is too long"
         )
     if len(ranked) > 1 and ranked[0].quality == ranked[-1].quality:

@@ -47,6 +47,9 @@ class ProcessExecutor(Executor):
     ``growth`` is replaced between two rollouts, because every testbed that is built, for another value of a scenario's
     field, leaves memory behind.
 
+    Rollouts with a `Cutoff` are urgent: while a lost worker's replacement starts and builds its testbed, the others do
+    its work. It is waited for only if no other is left, and at most until the deadline.
+
     Args:
         workers: The number of processes; by default the number of cores.
         time_limit: The wall time for one rollout, in seconds.
@@ -123,7 +126,7 @@ class ProcessExecutor(Executor):
                     elif isinstance(reply, str):
                         # The rollout that it had not begun is not at fault.
                         waiting.extendleft(job for job in worker.jobs if job != index)
-                        self._replace(worker)
+                        self._replace(worker, call)
                         if cutoff is not None and cutoff.is_over:
                             left -= 1
                         elif index in losses:
@@ -154,9 +157,9 @@ class ProcessExecutor(Executor):
         """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
         waiting = call.waiting
         for idle in [worker for worker in self._workers if not worker.jobs]:
-            worker = self._replace(idle) if waiting and idle.grown else idle
-            while waiting and not self._give(worker, call):
-                worker = self._replace(worker)  # It died while it was idle or starting.
+            worker = self._replace(idle, call) if waiting and idle.grown else idle
+            while waiting and not worker.is_preparing and not self._give(worker, call):
+                worker = self._replace(worker, call)  # It died while it was idle or starting.
         for worker in self._workers:
             if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
                 # `_replies` notices a worker that has died.
@@ -199,12 +202,15 @@ class ProcessExecutor(Executor):
         """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
         cutoff = call.cutoff
         busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
-        if not busy:
+        preparing = [worker for worker in self._workers if call.waiting and worker.is_preparing]
+        if not busy and not preparing:
             return []
-        first = min(worker.deadline for worker in busy.values())
+        first = min(worker.deadline for worker in busy.values()) if busy else cutoff.deadline if cutoff else inf
         poll = select.poll()
         for connection in busy:
             poll.register(connection, select.POLLIN)
+        for worker in preparing:
+            poll.register(worker.child.connection, select.POLLIN)
         timeout = None if first == inf else ceil(1e3 * max(0.0, first - time.monotonic()))  # In milliseconds.
         ready = {descriptor for descriptor, _ in poll.poll(timeout)}
         replies: list[tuple[_Worker, int, Any]] = []
@@ -232,9 +238,10 @@ class ProcessExecutor(Executor):
                 replies.append((worker, index, reason))
         return replies
 
-    def _replace(self, worker: _Worker) -> _Worker:
+    def _replace(self, worker: _Worker, call: _Call) -> _Worker:
         worker.kill()
-        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth)
+        task = None if call.cutoff is None else call.task
+        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth, task)
         return new
 
     def close(self) -> None:
@@ -255,19 +262,30 @@ class _Call(NamedTuple):
 
 
 class _Worker:
-    """A worker process and the rollouts that it was given."""
+    """A worker process and the rollouts that it was given.
 
-    def __init__(self, kept: int, growth: float) -> None:
+    Args:
+        kept: The number of testbeds that it keeps.
+        growth: The number of bytes by which its memory may grow after its first rollout.
+        task: A task whose testbed it builds before it is ready; None: it is ready without one.
+    """
+
+    def __init__(self, kept: int, growth: float, task: bytes | None = None) -> None:
         # Without grace: its rollout may hang.
-        self.child = ChildProcess(_run_worker, kept, growth, name="a worker process", grace=0.0)
-        self.connection: Connection | None = None  # None until the worker is ready.
-        self._task: bytes | None = None
+        self.child = ChildProcess(_run_worker, kept, growth, task, name="a worker process", grace=0.0)
+        self.connection: Connection | None = None  # None until the worker is known to be ready.
+        self._task = task
         self._start = b""  # Of the rollouts that it is given; empty if they begin at the task's own s0.
         self.jobs: deque[int] = deque()  # The rollout that it runs, and one that was given ahead.
         self.deadline = inf
-        self.warm = False  # True after the first rollout of a task: it has the testbed.
+        self.warm = task is not None  # True after the first rollout of a task, too: it has the testbed.
         self.brief = False  # True after a short rollout.
         self.grown = False  # True when its memory has grown so much that it must be replaced.
+
+    @property
+    def is_preparing(self) -> bool:
+        """Return whether the worker still builds its testbed, while others work; false if it has died."""
+        return self.connection is None and self._task is not None and not _readable(self.child.connection)
 
     def has(self, start: bytes) -> bool:
         """Return whether the worker begins at ``start`` already."""
@@ -313,6 +331,12 @@ class _Worker:
             self.connection.close()
 
 
+def _readable(connection: socket.socket) -> bool:
+    poll = select.poll()
+    poll.register(connection, select.POLLIN)
+    return bool(poll.poll(0))
+
+
 def checked_time_limit(time_limit: float) -> float:
     """Return a time limit in seconds as a float.
 
@@ -328,7 +352,7 @@ def checked_time_limit(time_limit: float) -> float:
 # -- in the worker process
 
 
-def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
+def _run_worker(parent: socket.socket, kept: int, growth: float, task: bytes | None) -> None:
     """Run rollouts on request until the connection closes.
 
     A task (T) has no answer. A rollout (R) has one, from `answer`; it is announced by `_BEGUN` on request, unless its
@@ -338,12 +362,17 @@ def _run_worker(parent: socket.socket, kept: int, growth: float) -> None:
         parent: The connection to the executor.
         kept: The number of testbeds to keep.
         growth: The number of bytes by which the memory may grow after the first rollout.
+        task: The first task, whose testbed is built before this process is ready; None: there is none yet.
     """
-    report_ready(parent)
-    connection = Connection(parent.detach())
     runners = Runners(Testbeds(kept=kept))
     load: Callable[[], RolloutTask] | None = None
     start = b""
+    if task is not None:
+        load = cache(partial(unpack, task))
+        # A rollout that is cancelled at its first sample. Any other error will be the answer to the next one, too.
+        answer(0, partial(_rollout, runners, load, pack({}), start, Cutoff(deadline=-inf), None))
+    report_ready(parent)
+    connection = Connection(parent.detach())
     limit = inf
     while True:
         try:

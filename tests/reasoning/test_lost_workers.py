@@ -1,0 +1,85 @@
+"""Decisions after a worker process was lost: its replacement prepares itself while the others decide."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.reasoning.scenarios import MassScenario
+from tests.reasoning.test_reasoner import make
+from tests.rollout.scenarios import child_pids
+from vtbdrake.reasoning import Belief, Budget
+
+# So long a worker waits at the gate, at most, in s; so that a test that fails ends.
+PATIENCE = 20.0
+
+
+@dataclass
+class GatedScenario(MassScenario):
+    """A testbed whose workers cannot finish building it while the file ``gate`` exists; one that gives up tells."""
+
+    gate: str = ""
+
+    def add_world(self, builder):
+        super().add_world(builder)
+        end = time.monotonic() + PATIENCE
+        while os.path.exists(self.gate) and time.monotonic() < end:
+            time.sleep(0.01)
+        if os.path.exists(self.gate):
+            Path(f"{self.gate}.ignored").touch()
+
+
+@pytest.fixture
+def gated(tmp_path):
+    """A belief, a reasoner with two warm workers, their process ids, and the gate for those to come, which is open."""
+    scenario = GatedScenario(gate=str(tmp_path / "gate"))
+    testbed = scenario.build()
+    others = set(child_pids())
+    with make(scenario, executor="processes", workers=2, budget=Budget(rollouts=6)) as reasoner:
+        reasoner.warm_up()
+        belief = Belief.perfect(testbed, testbed.default_context())
+        yield belief, reasoner, lambda: set(child_pids()) - others, Path(scenario.gate)
+    assert not Path(f"{scenario.gate}.ignored").exists(), "a decision has waited for a worker that was building"
+
+
+def test_after_a_killed_worker_the_other_one_decides(gated):
+    belief, reasoner, workers, gate = gated
+    expected = reasoner.decide(belief)
+    first, second = workers()
+    gate.touch()
+    os.kill(first, signal.SIGKILL)
+    decision = reasoner.decide(belief)
+    assert (decision.values, decision.health.rollouts, decision.warnings) == (expected.values, 6, ())
+    # Its replacement is under way, and there is one only.
+    (replacement,) = workers() - {first, second}
+    assert reasoner.decide(belief).values == expected.values
+    assert workers() == {second, replacement}
+    gate.unlink()
+    # If none is left, the decision waits for the one that comes.
+    os.kill(second, signal.SIGKILL)
+    decision = reasoner.decide(belief)
+    assert (decision.values, decision.warnings) == (expected.values, ())
+    assert replacement in workers() and len(workers()) == 2
+    # With a budget of wall time, no longer than that.
+    gate.touch()
+    for worker in workers():
+        os.kill(worker, signal.SIGKILL)
+    decision = reasoner.decide(belief, budget=Budget(seconds=0.1))
+    assert not decision
+    assert "not even that of the plan in use" in decision.warnings[0]
+
+
+def test_after_a_hung_worker_the_other_one_decides(gated):
+    belief, reasoner, workers, gate = gated
+    first, second = workers()
+    gate.touch()
+    os.kill(first, signal.SIGSTOP)
+    # Half a second after the end of its budget the worker is given up.
+    assert reasoner.decide(belief, budget=Budget(seconds=0.1)).end == "time"
+    assert first not in workers()
+    decision = reasoner.decide(belief)
+    assert (decision.health.rollouts, decision.warnings) == (6, ())
+    assert second in workers()
