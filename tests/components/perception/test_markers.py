@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -139,6 +140,52 @@ def test_single_marker_needs_a_prediction() -> None:
     nearby = OBLIQUE @ RigidTransform(RollPitchYaw(0.05, 0.05, 0.0), [0.02, 0.0, 0.1])
     estimate = pose_from_markers(one, board(), INTRINSICS, time=0.0, prediction=nearby)
     assert estimate.error_to(OBLIQUE) == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+def flat_poses(distance: float, tilts: tuple[float, float], *, helped: bool = False) -> list[float]:
+    """Return the squared Mahalanobis distances of the errors of 300 poses from three noisy markers in one plane.
+
+    Args:
+        distance: From the camera in m.
+        tilts: The least and the largest angle between the plane's normal and the z axis of the camera, in rad.
+        helped: Whether there is a prediction, 5 deg beside the truth.
+    """
+    away = RotationMatrix.MakeXRotation(np.pi)
+    places = {3: (-0.15, -0.1, 0.0), 7: (0.15, -0.1, 0.0), 11: (0.02, 0.15, 0.0)}
+    flat = MarkerBoard.of({k: RigidTransform(away, p) for k, p in places.items()}, size=0.1)
+    generator, noise, found = np.random.default_rng(2), 0.15, []
+    for _ in range(300):
+        tilt, towards, turn = generator.uniform([tilts[0], -np.pi, -np.pi], [tilts[1], np.pi, np.pi])
+        axis = AngleAxis(tilt, [np.cos(towards), np.sin(towards), 0.0])
+        X_CT = RigidTransform(RotationMatrix(axis) @ RotationMatrix.MakeZRotation(turn), [0.0, 0.1, distance])
+        exact = project(flat.corners.reshape(-1, 3), X_CT, INTRINSICS).reshape(-1, 4, 2)
+        seen = Detections(flat.ids, exact + noise * generator.standard_normal(exact.shape))
+        prediction = X_CT @ RigidTransform(RollPitchYaw(0.06, 0.06, 0.0), [0.0, 0.0, 0.0]) if helped else None
+        estimate = pose_from_markers(seen, flat, INTRINSICS, time=0.0, prediction=prediction, corner_noise=noise)
+        error = estimate.error_to(X_CT)
+        found += [error @ np.linalg.solve(estimate.covariance, error)] if estimate.valid else []
+    return found
+
+
+def test_two_poses_that_fit_alike_are_no_estimate() -> None:
+    found = flat_poses(5.0, (0.2, 0.8))
+    # With either of the two, 5 % of all are wrong.
+    assert 150 < len(found) < 290
+    assert sum(distance > 40.0 for distance in found) <= 1
+    assert np.mean(found) == pytest.approx(6.0, abs=1.0)
+
+
+def test_prediction_tells_two_poses_apart() -> None:
+    found = flat_poses(5.0, (0.2, 0.8), helped=True)
+    assert len(found) == 300
+    assert sum(distance > 40.0 for distance in found) <= 1
+
+
+def test_covariance_covers_both_tilts_of_a_front_view() -> None:
+    found = flat_poses(5.0, (0.0, 0.2))
+    assert len(found) > 200
+    assert sum(distance > 40.0 for distance in found) <= 1
+    assert np.mean(found) == pytest.approx(6.0, abs=1.0)
 
 
 def test_corners_that_do_not_fit_the_board_are_no_estimate() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import log
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -337,6 +338,14 @@ def project(points: Array, X_CT: RigidTransform, intrinsics: ArrayLike) -> Array
     return np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
 
 
+# A pose is clear if another one is less likely by a factor of a thousand: twice the logarithm of that.
+_CLEAR = 2.0 * log(1000.0)
+# Two poses are apart if one is outside of what the covariance of the other allows: chi-squared, 6 degrees, 99 %.
+_APART = 16.8
+# Up to this angle in rad between two poses, a covariance covers both.
+_NEAR = 0.4
+
+
 def pose_from_markers(
     detections: Detections,
     board: MarkerBoard,
@@ -354,8 +363,12 @@ def pose_from_markers(
     covariance is σ² (JᵀJ)⁻¹ with the Jacobian J of the projection and σ the larger one of ``corner_noise`` and the
     root mean square of the residuals. The steps start at the result of OpenCV's SQPNP.
 
-    A few small markers in one plane have two poses that fit almost equally well. So with fewer than ``fewest`` markers
-    the steps start at the prediction, and without one there is no estimate.
+    Small markers in one plane have two poses that fit almost equally well, the plane tilted to one side or to the other
+    (Oberkampf, DeMenthon and Davis, "Iterative pose estimation using coplanar feature points", CVIU 63, 1996). Both are
+    determined. If neither is a thousand times likelier than the other, the one next to the prediction is taken, and
+    without a prediction there is no estimate. If they are near each other, as in a view from the front, the covariance
+    is enlarged by their difference δ, by δ δᵀ. With fewer than ``fewest`` markers the steps start at the prediction,
+    and without one there is no estimate.
 
     Args:
         detections: The markers in the image.
@@ -368,7 +381,7 @@ def pose_from_markers(
         fewest: How many markers suffice without a prediction.
 
     Returns:
-        An estimate of X_CT; a missing one if there are too few markers, or if they do not fit.
+        An estimate of X_CT; a missing one if there are too few markers, if they do not fit, or if two poses do.
     """
     found = detections.on(board)
     if not len(found.ids) or (prediction is None and len(found.ids) < fewest):
@@ -380,11 +393,32 @@ def pose_from_markers(
     fit = None if start is None else _refine(points, pixels, intrinsics, start)
     if fit is None:
         return PoseEstimate.missing(time=time)
-    X_CT, J, rms = fit
-    if not rms <= residual_limit:
+    back = _fit_at(points, pixels, intrinsics, _tilted_back(points, fit.X_CT))
+    other = None if back is None else _refine(points, pixels, intrinsics, back.X_CT)
+    if other is not None and other.rms < fit.rms:
+        fit, other = other, fit
+    if not fit.rms <= residual_limit:
         return PoseEstimate.missing(time=time)
-    covariance = max(corner_noise, rms) ** 2 * np.linalg.inv(J.T @ J)
-    return PoseEstimate.of(X_CT, 0.5 * (covariance + covariance.T), time=time)
+    sigma = max(corner_noise, fit.rms)
+    estimate = fit.estimate(sigma, time=time)
+    # Of a front view, both may be one minimum.
+    rival = next((one for one in (other, back) if one is not None and _is_rival(one, fit, sigma)), None)
+    if rival is None:
+        return estimate
+    apart = estimate.error_to(rival.X_CT)
+    if np.linalg.norm(apart[:3]) < _NEAR or rival is back:
+        return PoseEstimate.of(estimate.X, estimate.covariance + np.outer(apart, apart), time=time)
+    if prediction is None:
+        return PoseEstimate.missing(time=time)
+    both = (estimate, rival.estimate(sigma, time=time))
+    return min(both, key=lambda one: float(np.linalg.norm(one.error_to(prediction)[:3])))
+
+
+def _is_rival(one: _Fit, best: _Fit, sigma: float) -> bool:
+    """Return whether a pose is nearly as likely as the best one, but outside of what its covariance allows."""
+    apart = best.J @ best.estimate(sigma, time=0.0).error_to(one.X_CT)
+    excess = len(best.J) * (one.rms**2 - best.rms**2)
+    return bool(excess < _CLEAR * sigma**2 and apart @ apart > _APART * sigma**2)
 
 
 def _start(points: Array, pixels: Array, intrinsics: Array) -> RigidTransform | None:
@@ -398,29 +432,76 @@ def _start(points: Array, pixels: Array, intrinsics: Array) -> RigidTransform | 
     return RigidTransform(RotationMatrix(rotation_matrix(rotation.ravel())), translation.ravel())
 
 
+def _tilted_back(points: Array, X_CT: RigidTransform) -> RigidTransform:
+    """Return the pose from which points in a plane look the same from afar: their depths are exchanged.
+
+    With the line of sight d, a unit vector in C, and the plane's normal n in T, R' = (1 - 2 d dᵀ) R (1 - 2 n nᵀ).
+    Points that are in no plane have that of least squares.
+    """
+    middle = points.mean(axis=0)
+    n, sight = np.linalg.svd(points - middle)[2][-1], X_CT @ middle
+    R = _mirror(sight / np.linalg.norm(sight)) @ X_CT.rotation().matrix() @ _mirror(n)
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), sight - R @ middle)
+
+
+def _mirror(n: Array) -> Array:
+    matrix: Array = np.eye(3) - 2.0 * np.outer(n, n)
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """How well the corners fit to a pose.
+
+    Attributes:
+        X_CT: The pose.
+        residual: Measured less projected pixels, (2 n,).
+        J: The Jacobian of the projected pixels, (2 n, 6).
+    """
+
+    X_CT: RigidTransform
+    residual: Array
+    J: Array
+
+    @property
+    def rms(self) -> float:
+        """The root mean square of the residuals, in pixels."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    def estimate(self, sigma: float, *, time: float) -> PoseEstimate:
+        """Return the estimate at a time (s) from coordinates with the standard deviation sigma, in pixels."""
+        covariance = sigma**2 * np.linalg.inv(self.J.T @ self.J)
+        return PoseEstimate.of(self.X_CT, 0.5 * (covariance + covariance.T), time=time)
+
+
+def _fit_at(points: Array, pixels: Array, intrinsics: Array, X_CT: RigidTransform) -> _Fit | None:
+    """Return how well the corners fit to a pose; None if it has a corner behind the camera."""
+    fx, fy, cx, cy = intrinsics
+    turned = points @ X_CT.rotation().matrix().T
+    x, y, z = (turned + X_CT.translation()).T
+    if z.min() < 1e-3:
+        return None
+    residual = pixels - np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
+    J_p = np.zeros((len(points), 2, 3))
+    J_p[:, 0, 0], J_p[:, 0, 2] = fx / z, -fx * x / z**2
+    J_p[:, 1, 1], J_p[:, 1, 2] = fy / z, -fy * y / z**2
+    return _Fit(X_CT, residual.ravel(), np.concatenate([-J_p @ cross_matrix(turned), J_p], axis=2).reshape(-1, 6))
+
+
 _MOST_STEPS = 15
 
 
-def _refine(
-    points: Array, pixels: Array, intrinsics: Array, start: RigidTransform
-) -> tuple[RigidTransform, Array, float] | None:
-    """Return the best pose near ``start``, the Jacobian (2 n, 6) of the pixels, and the residuals' root mean square."""
-    fx, fy, cx, cy = intrinsics
-    R, p = start.rotation().matrix(), start.translation()
+def _refine(points: Array, pixels: Array, intrinsics: Array, start: RigidTransform) -> _Fit | None:
+    """Return the fit to the best pose near ``start``, or None if the steps lead to none."""
+    X_CT = start
     for _ in range(_MOST_STEPS):
-        turned = points @ R.T
-        x, y, z = (turned + p).T
-        if z.min() < 1e-3:
-            return None  # Behind the camera.
-        residual = pixels - np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
-        J_p = np.zeros((len(points), 2, 3))
-        J_p[:, 0, 0], J_p[:, 0, 2] = fx / z, -fx * x / z**2
-        J_p[:, 1, 1], J_p[:, 1, 2] = fy / z, -fy * y / z**2
-        J = np.concatenate([-J_p @ cross_matrix(turned), J_p], axis=2).reshape(-1, 6)
-        step, *_ = np.linalg.lstsq(J, residual.ravel(), rcond=None)
-        step *= min(1.0, 0.5 / max(float(np.linalg.norm(step[:3])), 1e-12))
-        R, p = rotation_matrix(step[:3]) @ R, p + step[3:]
+        fit = _fit_at(points, pixels, intrinsics, X_CT)
+        if fit is None:
+            return None
+        step, *_ = np.linalg.lstsq(fit.J, fit.residual, rcond=None)
         if np.abs(step).max() < 1e-8:
-            X_CT = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-            return X_CT, J, float(np.sqrt(np.mean(residual**2)))
+            return fit
+        step *= min(1.0, 0.5 / max(float(np.linalg.norm(step[:3])), 1e-12))
+        R = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(step[:3]) @ X_CT.rotation().matrix())
+        X_CT = RigidTransform(R, X_CT.translation() + step[3:])
     return None
