@@ -90,6 +90,15 @@ def test_bezier_points_enclose_the_curve(order: str, derivative: int) -> None:
     assert (points.max(axis=0) >= most - 1e-12 * scale).all()
 
 
+@pytest.mark.parametrize("order", ORDERS)
+def test_only_a_cubic_leaves_the_range_of_its_knots(order: str) -> None:
+    spline = Spline(order, KNOTS, DURATION)
+    w = np.random.default_rng(0).normal(size=(KNOTS, 100))
+    curve = spline.matrix(np.linspace(0.0, DURATION, 501)) @ w
+    stays = (curve.min(axis=0) >= w.min(axis=0) - 1e-12) & (curve.max(axis=0) <= w.max(axis=0) + 1e-12)
+    assert spline.stays_within_knots == stays.all()
+
+
 def test_linear_extremes_of_a_cubic_are_its_bezier_points() -> None:
     spline = Spline("cubic", KNOTS, DURATION)
     bends = CubicSpline(GRID, W, bc_type="natural")(GRID, nu=2)

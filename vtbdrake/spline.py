@@ -77,6 +77,11 @@ class Spline:
         """Return the number of derivatives that are finite everywhere: 0 for steps, 1 for lines, 3 for cubics."""
         return _SMOOTHNESS[self.order]
 
+    @property
+    def stays_within_knots(self) -> bool:
+        """Return whether the curve never leaves the range of its knots; only a cubic spline may."""
+        return self.order != "cubic"
+
     @cached_property
     def pieces(self) -> Array:
         """Return c of y(t_i + s) = sum_k s^k c[i, k] w for each piece i, shape (pieces, 4, n)."""

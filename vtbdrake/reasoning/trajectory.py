@@ -110,7 +110,12 @@ class Trajectory:
         """Return the address of t_begin."""
         return f"{self.address}[0]"
 
-    @property
+    @cached_property
+    def _has_only_range(self) -> bool:
+        """Return whether neither rate nor acceleration is limited."""
+        return not (self._limits[2:] < inf).any()
+
+    @cached_property
     def is_continued(self) -> bool:
         """Return whether a plan begins at the value of the plan in use, as a limited rate requires."""
         return bool((self._limits[2] < inf).any())
@@ -199,9 +204,10 @@ class Trajectory:
         w = np.clip(self._matrix(knots), lower, upper)
         if start is not None:
             w[0] = np.clip(start, lower, upper)
-        exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
-        for j in np.flatnonzero(exceeded).tolist():
-            w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+        if not (self.spline.stays_within_knots and self._has_only_range):
+            exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
+            for j in np.flatnonzero(exceeded).tolist():
+                w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
         return w.reshape(np.shape(knots))
 
     def _projected(self, w: Array, j: int, *, fixed: int) -> Array:
