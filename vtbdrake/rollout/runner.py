@@ -69,6 +69,7 @@ class RolloutRunner:
         self._timings = self.testbed.event_timings()
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
+        self._world_state = _world_state(self.testbed, self._context)
         self._copier = self.testbed.copier_from(self.testbed)
         self._beginning = Beginning(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
@@ -113,14 +114,14 @@ class RolloutRunner:
             try:
                 recording = self._recording(parameters, check)
                 self._reset(parameters)
-                for index, (t, instant) in enumerate(zip(self._times, self._instants, strict=True)):
+                for index, (t, instant) in enumerate(zip(self._times.tolist(), self._instants.tolist(), strict=True)):
                     check()
                     self._jump(recording, index)
                     status = self._advance(t, instant)
                     if self._player is not None and index < len(recording.worlds):
                         self._player.check(self._context, recording.worlds[index])
                     terminated = _terminated(status)
-                    reached = self._context.get_time() - self._t0 if terminated else float(t)
+                    reached = self._context.get_time() - self._t0 if terminated else t
                     if samples.take(reached) and not self.task.run_on:
                         break
                     if terminated and status is not None:
@@ -158,8 +159,8 @@ class RolloutRunner:
 
     def measured(self, t: float) -> list[float]:
         """Return f and the other measures in the present state, at the sample time ``t``."""
-        with _FailuresAsOutcomes():
-            values = {address: read(self.context) for address, read in self._readers.items()}
+        with _failures_as_outcomes:
+            values = {address: read(self._context) for address, read in self._readers.items()}
         return [_sample(measure, [values[a] for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float, *, start: Start | None = None) -> Any:
@@ -244,7 +245,7 @@ class RolloutRunner:
         apply_simulator_config(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         self._player.put(self._context, window, start)
-        with _FailuresAsOutcomes():
+        with _failures_as_outcomes:
             self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
@@ -255,7 +256,7 @@ class RolloutRunner:
         self._copier.copy(self._beginning.context, self._context, hidden=changed)
         self._changed = {self._variables[a].carried_by for a in parameters} - {""}
         restored = self.task.start is not None or self._beginning.start is not None
-        with _FailuresAsOutcomes():
+        with _failures_as_outcomes:
             self._variables.write(self._context, parameters)
             before = self._variables.read(self._context, list(parameters))
             # Initialization events are part of a default s0; in a restored s0 they have happened already.
@@ -271,18 +272,14 @@ class RolloutRunner:
     def _advance(self, t: float, instant: float) -> SimulatorStatus | None:
         if t == 0.0:
             return None
-        with _FailuresAsOutcomes():
+        with _failures_as_outcomes:
             status = self._simulator.AdvanceTo(instant)
         self._refuse_nonfinite(t)
         return status
 
     def _refuse_nonfinite(self, t: float) -> None:
         # NaN is allowed in a DPS, for unknown values, but not in the simulated world.
-        x = self._context.get_continuous_state_vector().CopyToVector()
-        plant = self.testbed.plant
-        if plant is not None and plant.time_step() > 0.0:
-            x = plant.GetPositionsAndVelocities(plant.GetMyContextFromRoot(self._context))
-        if not np.isfinite(x).all():
+        if not np.isfinite(self._world_state()).all():
             raise SimulationError(f"the state is not finite at t = {t:g} s: the simulation diverged")
 
     @property
@@ -301,8 +298,17 @@ def same_scenario(testbed: VirtualTestbed, task: RolloutTask) -> bool:
     return testbed.scenario is not None and testbed.scenario.record() == task.scenario.record()
 
 
+def _world_state(testbed: VirtualTestbed, context: Context) -> Callable[[], np.ndarray]:
+    """Return a function that returns what moves in the simulated world of this context."""
+    plant = testbed.plant
+    if plant is None or plant.time_step() == 0.0:
+        return lambda: context.get_continuous_state_vector().CopyToVector()
+    own = plant.GetMyContextFromRoot(context)
+    return lambda: plant.GetPositionsAndVelocities(own)
+
+
 def _terminated(status: SimulatorStatus | None) -> bool:
-    return status is not None and status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition
+    return status is not None and not status.succeeded()
 
 
 class _FailuresAsOutcomes:
@@ -318,6 +324,9 @@ class _FailuresAsOutcomes:
         if isinstance(error, Exception | SystemExit):
             text = " ".join(str(error).split()) or type(error).__name__
             raise SimulationError(f"{type(error).__name__}: {text}") from error
+
+
+_failures_as_outcomes = _FailuresAsOutcomes()
 
 
 class _Samples:
@@ -339,20 +348,22 @@ class _Samples:
     def take(self, t: float) -> bool:
         """Sample f, the measures and the records; return whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
-        with _FailuresAsOutcomes():
-            recorded = {address: read(runner.context) for address, read in runner._recorders.items()}
+        with _failures_as_outcomes:
+            recorded = {address: read(runner._context) for address, read in runner._recorders.items()}
         new = runner.measured(t)
         self._times.append(t)
-        self._clock = runner.context.get_time()
+        self._clock = runner._context.get_time()
         for address, value in recorded.items():
             self._record[address].append(value)
         for samples, sample in zip(self._samples, new, strict=True):
             samples.append(sample)
         if self._prospect is not None:
-            with _FailuresAsOutcomes():
-                values = [read(runner.context) for read in runner._bound_readers]
+            with _failures_as_outcomes:
+                values = [read(runner._context) for read in runner._bound_readers]
             self.ending = self._prospect.take(t, new, values)
-        return task.quality is not None and bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
+        if task.quality is None or task.threshold is None:
+            return False
+        return bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
 
     def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
         task, f = self._runner.task, self._runner.task.quality
