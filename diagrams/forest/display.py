@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from vtbdrake.cli import BadInputError, one_line
 from vtbdrake.cli.options import option, scenario_argument, timeout_option, url_option
 from vtbdrake.components.localization.planar import transform
-from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
+from vtbdrake.components.localization.unit import DOUBTFUL, LOST, SEARCHING, TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.monitoring.live.client import watch
@@ -42,6 +42,7 @@ DEVIATIONS = 3.0
 _LOOKS = {
     SEARCHING: ("searching", Rgba(0.94, 0.89, 0.26, 1.0)),
     TRACKING: ("tracking", Rgba(0.0, 0.62, 0.45, 1.0)),
+    DOUBTFUL: ("doubtful", Rgba(0.9, 0.62, 0.0, 1.0)),
     LOST: ("lost", Rgba(0.84, 0.37, 0.0, 1.0)),
 }
 _TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.4)

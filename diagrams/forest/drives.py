@@ -95,7 +95,7 @@ class Track:
         drive: The drive.
         poses: X_WH, shape (n, 3); NaN without a pose.
         covariances: Their covariances, shape (n, 3, 3).
-        status: `SEARCHING`, `TRACKING` or `LOST`, shape (n,).
+        status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`, shape (n,).
     """
 
     drive: Drive
@@ -141,7 +141,7 @@ class Track:
     @property
     def losses(self) -> int:
         """How often the unit lost its pose."""
-        return int(((self.status[:-1] == TRACKING) & (self.status[1:] == LOST)).sum())
+        return int(((self.status[:-1] != LOST) & (self.status[1:] == LOST)).sum())
 
 
 def localize(drive: Drive, unit: LocalizationUnit) -> Track:

@@ -10,6 +10,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import (
+    DOUBTFUL,
     LOST,
     SEARCHING,
     TRACKING,
@@ -59,10 +60,21 @@ def test_a_kidnapped_carrier_is_lost_and_found_again(errors):
     statuses = [answer.status for answer in after]
     lost = statuses.index(LOST)
     assert lost <= 5 and state.losses == 1
-    assert not any(answer.matched for answer in after[:lost])
+    # From the first scan on, there is no pose.
+    assert set(statuses[:lost]) == {DOUBTFUL}
+    assert all(np.isnan(answer.pose).all() and np.isinf(answer.covariance[0, 0]) for answer in after[:lost])
     found = statuses.index(TRACKING, lost)
     assert set(statuses[found:]) == {TRACKING}
     assert nees(after[-1].pose, after[-1].covariance, other.poses[-1]) < 25.0
+
+
+def test_a_doubtful_pose_is_back_with_the_next_good_scan():
+    one, other = drive(3, ACCURATE, reach=18.0), drive(3, ACCURATE, reach=18.0, step=0.5, start=(20.0, 40.0))
+    scans = [*one.scans[:20], *other.scans[:2], *one.scans[22:]]
+    answers, state = run(unit_for(one.map), scans, one.reckoned)
+    assert [answer.status for answer in answers[19:23]] == [TRACKING, DOUBTFUL, DOUBTFUL, TRACKING]
+    assert state.losses == 0
+    assert nees(answers[22].pose, answers[22].covariance, one.poses[22]) < 25.0
 
 
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])

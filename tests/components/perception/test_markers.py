@@ -169,7 +169,7 @@ def flat_poses(distance: float, tilts: tuple[float, float], *, helped: bool = Fa
 
 def test_two_poses_that_fit_alike_are_no_estimate() -> None:
     found = flat_poses(5.0, (0.2, 0.8))
-    # With either of the two, 5 % of all are wrong.
+    # The better fit alone is wrong in 8 of 300.
     assert 150 < len(found) < 290
     assert sum(distance > 40.0 for distance in found) <= 1
     assert np.mean(found) == pytest.approx(6.0, abs=1.0)

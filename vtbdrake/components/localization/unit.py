@@ -24,10 +24,11 @@ from vtbdrake.state.codecs import codec_of
 
 Array = NDArray[np.float64]
 
-SEARCHING, TRACKING, LOST = range(3)
-"""What a `Localization` says: no pose yet; a pose; no pose any more. Searching goes on after a loss, too."""
+SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
+"""What a `Localization` says: no pose yet; a pose; no pose any more; the last scan does not show the place where the
+carrier should be. Searching goes on after a loss, too, and tracking while the pose is doubtful."""
 
-STATUS_NAMES = ("searching", "tracking", "lost")
+STATUS_NAMES = ("searching", "tracking", "lost", "doubtful")
 
 # A pose by odometry with a larger number, in m or rad, is a fault.
 _LARGEST = 1e9
@@ -45,7 +46,7 @@ class Localization:
         X_OH: The pose of the odometry for which the answer holds, shape (3,).
         pose: X_WH, shape (3,) in m and rad; NaN without a pose.
         covariance: Its covariance in the order x, y, heading, shape (3, 3); infinite variances without a pose.
-        status: `SEARCHING`, `TRACKING` or `LOST`. Only while tracking is there a pose.
+        status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`. Only with `TRACKING` is there a pose.
         detected: The number of detections.
         matched: How many of them were fused. If none, the scan has not confirmed the pose: it is dead reckoning since.
         nis: Normalized innovation squared of the scan, of 2 ``matched`` degrees of freedom.
@@ -175,6 +176,8 @@ class LocalizationUnit:
             track, matches = self.tracker.update(self.tracker.predict(state.track, motion, C), landmarks)
             if not self.tracker.is_lost(track):
                 answer = _answer(track, matches, len(landmarks), pose, time)
+                if track.failures:
+                    answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
                 step = np.array([np.hypot(*motion[:2]), duration])
                 unseen = np.zeros(2) if answer.matched else state.unseen + step
                 return answer, replace(state, answer=answer, track=track, unseen=unseen)
