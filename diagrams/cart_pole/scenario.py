@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -169,21 +168,22 @@ class CartPoleScenario(Scenario):
     def add_beliefs(self, builder: VirtualTestbedBuilder) -> None:
         """Declare that what the DPS perceives sets the joints of the simulated world.
 
-        What it perceives when it decides was measured two periods before: sensors and ``env`` take one each. A mental
-        copy begins at the present, which follows from the force that acts.
+        What it perceives was measured up to two periods before: sensors and ``env`` take one each. The present follows
+        from it and from the force that acts.
         """
         T, model = self.period, CartPole()
         for k, name in enumerate(JOINT_NAMES):
             for i, (value, errors) in enumerate(
                 (("position", self.position_errors), ("velocity", self.velocity_errors))
             ):
-                target, entry = f"sim.sys.cart_pole.{name}.{value}", JOINTS * i + k
-                if self.is_mental:
-                    by = partial(_predicted, model, dt=(2 + errors.latency) * T, entry=entry)
-                    builder.believe(target, of=[PERCEIVED, FORCE], by=by)
-                else:
-                    builder.believe(target, of=[PERCEIVED], by=itemgetter(entry), age=(1 + errors.latency) * T)
+                builder.believe(
+                    f"sim.sys.cart_pole.{name}.{value}",
+                    of=[PERCEIVED, FORCE],
+                    by=partial(_present, model, entry=JOINTS * i + k),
+                    age=(1 + errors.latency) * T,
+                    period=T,
+                )
 
 
-def _predicted(model: CartPole, state: np.ndarray, force: float, *, dt: float, entry: int) -> float:
-    return float(model.advanced(state, float(force), dt)[entry])
+def _present(model: CartPole, state: np.ndarray, force: float, *, entry: int, late: float) -> float:
+    return float(model.advanced(state, float(force), late)[entry])

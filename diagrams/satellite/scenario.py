@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from drake import lcmt_scope
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
 
 from vtbdrake.components.environment.light import LightConfig
-from vtbdrake.components.perception.estimate import rotation_matrix
 from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
@@ -24,7 +23,7 @@ from vtbdrake.lcm.drake_messages import image_map, scan_map
 from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.scan import Scan
-from vtbdrake.state.systems import pose_from_array, pose_to_array
+from vtbdrake.state.systems import pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, Eyes, make_dps
@@ -289,21 +288,25 @@ class SatelliteScenario(Scenario):
     def _declare_belief(builder: VirtualTestbedBuilder) -> None:
         """Declare what the servicer believes: both bodies move in its own inertial frame as it estimates.
 
-        All of it is one period old: so old are the samples of encoders and IMU. The fingers rest.
+        All of it is about the last instant but one: encoders, IMU and DPS take a period each. Until the present, all
+        moves on with the velocities that it is believed to have. The fingers rest.
         """
+        measured, rate = "dps.impl.controller.measured_position", "dps.impl.controller.joint_rate_command"
         for k, name in enumerate(JOINT_NAMES):
             address = f"sim.sys.servicer.{name}"
-            of = ["dps.impl.controller.measured_position"]
-            builder.believe(f"{address}.position", of=of, by=itemgetter(k), age=PERIOD)
             if k < ARM_JOINTS:
-                of = ["dps.impl.controller.joint_rate_command"]
-                builder.believe(f"{address}.velocity", of=of, by=itemgetter(k), age=PERIOD)
+                by = partial(_joint_later, joint=k)
+                builder.believe(f"{address}.position", of=[measured, rate], by=by, age=PERIOD, period=PERIOD)
+                builder.believe(f"{address}.velocity", of=[rate], by=itemgetter(k), age=PERIOD)
+            else:
+                builder.believe(f"{address}.position", of=[measured], by=itemgetter(k), age=PERIOD)
         base, target = "dps.env.base", "dps.env.target"
         builder.believe(
             "sim.sys.servicer.base.pose",
-            of=[f"{base}.orientation", f"{base}.position"],
-            by=lambda q, p: pose_to_array(pose_of_state(np.concatenate((q, p)))),
+            of=[f"{base}.{name}" for name in ("orientation", "position", "angular_velocity", "velocity")],
+            by=_base_later,
             age=PERIOD,
+            period=PERIOD,
         )
         builder.believe(
             "sim.sys.servicer.base.velocity",
@@ -312,7 +315,7 @@ class SatelliteScenario(Scenario):
             age=PERIOD,
         )
         of = [f"{target}.pose", f"{target}.velocity"]
-        builder.believe("sim.sys.target.body.pose", of=of, by=_one_period_before, age=PERIOD)
+        builder.believe("sim.sys.target.body.pose", of=of, by=_target_later, age=PERIOD, period=PERIOD)
         builder.believe("sim.sys.target.body.velocity", of=of[1:], age=PERIOD)
 
 
@@ -326,8 +329,14 @@ def _lcm_map(signal: Signal, channel: str) -> LcmMap:
     return vector_map(channel, lcmt_scope, {signal.name: "value"})
 
 
-def _one_period_before(pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return the pose (6,) that a body with a velocity (6,) had one period ago."""
-    X_IT = pose_from_array(pose)
-    turned = RotationMatrix(rotation_matrix(-PERIOD * velocity[:3])) @ X_IT.rotation()
-    return pose_to_array(RigidTransform(turned, X_IT.translation() - PERIOD * velocity[3:]))
+def _joint_later(position: np.ndarray, rate: np.ndarray, *, joint: int, late: float) -> float:
+    return position.item(joint) + late * rate.item(joint)
+
+
+def _base_later(q: np.ndarray, p: np.ndarray, w: np.ndarray, v: np.ndarray, *, late: float) -> np.ndarray:
+    return pose_later(pose_to_array(pose_of_state(np.concatenate((q, p)))), np.concatenate((w, v)), late)
+
+
+def _target_later(pose: np.ndarray, velocity: np.ndarray, *, late: float) -> np.ndarray:
+    # The estimate is about the instant at which the DPS gets the samples.
+    return pose_later(pose, velocity, late - PERIOD)

@@ -131,12 +131,8 @@ class CraterScenario(SpaceClimberScenario):
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
         """Declare what the robot believes; the elevation is that of its map plus its height over the ground."""
         ground = self.crater.height
-        builder.believe(
-            "sim.sys.climber.base.pose",
-            of=["dps.impl.navigator.position", "dps.env.position[2]", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
-            by=lambda p, height, roll, pitch, yaw: [*p, height + float(ground(*p)), roll, pitch, yaw],
-        )
-        self._believe_motion(builder)
+        place = ["dps.impl.navigator.position", "dps.env.position[2]"]
+        self._believe_base(builder, place, lambda p, height: [*p, height + float(ground(*p))])
         self._believe_joints(builder)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import Box, DefaultProximityProperties, SceneGraphConfig
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -14,6 +17,7 @@ from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
+from vtbdrake.state.systems import pose_later
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.gait import GAITS
@@ -148,44 +152,77 @@ class SpaceClimberScenario(Scenario):
         return X_WG
 
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare how the estimates set the state of the simulated robot."""
-        builder.believe(
-            "sim.sys.climber.base.pose",
-            of=["dps.env.position", "dps.env.roll", "dps.env.pitch", "dps.env.yaw"],
-            by=lambda position, roll, pitch, yaw: [*position, roll, pitch, yaw],
-        )
-        self._believe_motion(builder)
+        """Declare how the estimates set the state of the simulated robot.
+
+        They are about the last instant but one: sensors and DPS take a period each. Until the present, the base moves
+        on with the velocity that it is believed to have, and the joints follow their command.
+        """
+        self._believe_base(builder, ["dps.env.position"], lambda position: position)
         self._believe_joints(builder)
 
-    def _believe_motion(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare that the base turns as the gyro says, and advances as the gait does."""
+    def _believe_base(
+        self, builder: VirtualTestbedBuilder, place: Sequence[str], position: Callable[..., ArrayLike]
+    ) -> None:
+        """Declare that the base is where it is perceived, turns as the gyro says, and advances as the gait does.
+
+        Args:
+            builder: Of the testbed.
+            place: Addresses of the estimates of its place.
+            position: Function of them that returns the position in m, shape (3,).
+        """
         gait = GAITS[self.gait]
 
-        def velocity(
-            roll: float, pitch: float, yaw: float, imu: np.ndarray, level: float, stroke: float, period: float
-        ) -> np.ndarray:
-            R_WB = RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix()
+        def velocity(rpy: Sequence[float], imu: np.ndarray, level: float, stroke: float, period: float) -> np.ndarray:
+            R_WB = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
             v_WB = R_WB @ [level * gait.speed(stroke=stroke, period=period), 0.0, 0.0]
             return np.concatenate([R_WB @ imu[:3], v_WB])
 
-        of = ["dps.env.roll", "dps.env.pitch", "dps.env.yaw", "dps.sense.calibration.imu"]
-        of += [f"dps.impl.gait.{name}" for name in ("level", "stroke", "period")]
-        builder.believe("sim.sys.climber.base.velocity", of=of, by=velocity)
+        def pose(*of: Any, late: float) -> np.ndarray:
+            motion, where = of[: len(turning)], of[len(turning) :]
+            return pose_later(np.concatenate([position(*where), motion[:3]]), velocity(motion[:3], *motion[3:]), late)
+
+        T = self.period
+        turning = ["dps.env.roll", "dps.env.pitch", "dps.env.yaw", "dps.sense.calibration.imu"]
+        turning += [f"dps.impl.gait.{name}" for name in ("level", "stroke", "period")]
+        builder.believe("sim.sys.climber.base.pose", of=[*turning, *place], by=pose, age=T, period=T)
+        builder.believe("sim.sys.climber.base.velocity", of=turning, by=lambda *of: velocity(of[:3], *of[3:]), age=T)
 
     def _believe_joints(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare that the joints are where they were measured, and move as they are commanded."""
+        """Declare that the joints were where they were measured, and move as they are commanded."""
         encoders, next_command, command = (
             "dps.sense.calibration.joint_encoders",
             "dps.impl.gait.joint_position",
             "dps.act.joint_position",
         )
         for i, name in enumerate(JOINT_NAMES):
-            builder.believe(f"sim.sys.climber.{name}.position", of=[f"{encoders}[{i}]"])
+            motion, T = [next_command, command, "dps.act.rate"], self.period
             builder.believe(
-                f"sim.sys.climber.{name}.velocity",
-                of=[next_command, command, "dps.act.rate"],
-                by=partial(_joint_velocity, joint=i, period=self.period),
+                f"sim.sys.climber.{name}.position",
+                of=[f"{encoders}[{i}]", *motion],
+                by=partial(_joint_position, joint=i, period=T),
+                age=T,
+                period=T,
             )
+            by = partial(_joint_velocity, joint=i, period=T)
+            builder.believe(f"sim.sys.climber.{name}.velocity", of=motion, by=by, age=T)
+
+
+def _joint_position(
+    measured: float,
+    next_command: np.ndarray,
+    command: np.ndarray,
+    rate: float,
+    *,
+    joint: int,
+    period: float,
+    late: float,
+) -> float:
+    """Return the position (rad) of a joint ``late`` seconds after it was measured.
+
+    It has moved towards its command, as fast as that moves, and no further.
+    """
+    reach = late * abs(_joint_velocity(next_command, command, rate, joint=joint, period=period))
+    return measured + min(max(command.item(joint) - measured, -reach), reach)
 
 
 def _joint_velocity(next_command: np.ndarray, command: np.ndarray, rate: float, *, joint: int, period: float) -> float:

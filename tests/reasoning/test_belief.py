@@ -59,6 +59,7 @@ class TrackedScenario(Scenario):
     latency: int = 3
     time_step: float = 0.001
     gain_of_rate: float = 1.0
+    present: bool = False
 
     def interface(self):
         return Interface(sense=[Signal("angle", size=1)], act=[Signal("torque", size=1, idle=0.0)])
@@ -74,7 +75,11 @@ class TrackedScenario(Scenario):
         plant.Finalize()
         builder.add_sensor("angle", JointEncoders(plant, [joint], period=T, errors=ErrorModel(latency=self.latency)))
         builder.sim_actuator("torque", plant.get_actuation_input_port())
-        builder.believe(THETA, of=["dps.angle"])
+        if self.present:
+            of, age = ["dps.angle", "dps.rate"], (1 + self.latency) * T
+            builder.believe(THETA, of=of, by=lambda angle, rate, *, late: angle + late * rate, age=age, period=T)
+        else:
+            builder.believe(THETA, of=["dps.angle"])
         builder.believe(OMEGA, of=["dps.rate"], by=lambda rate: self.gain_of_rate * rate)
 
 
@@ -161,6 +166,21 @@ def test_the_mental_world_is_what_the_dps_believes(tracked):
     )
     assert abs(record[THETA][0] - testbed.read(context, THETA)) > 0.01, "the estimate is late"
     assert (record["dps.angle"][0], record["time"][0]) == (testbed.read(context, "dps.angle"), 0.63)
+
+
+@pytest.mark.parametrize("latency", [0, 3])
+@pytest.mark.parametrize("instant", [0.62, 0.631])
+def test_a_rule_leads_its_estimates_to_the_present(latency, instant):
+    scenario = TrackedScenario(latency=latency, present=True)
+    testbed, context = _swinging(scenario, instant)
+    mental, true, rate = scenario.build(), testbed.read(context, THETA), testbed.read(context, "dps.rate")
+    start = Belief.of(testbed, context).start(mental)
+    (believed,) = start.contents.numbers[mental.start_layout.slice_of(mental.variables()[THETA])]
+    # Measured 1 + latency periods before the DPS sampled it, which was at 0.6 or at 0.62 s.
+    late = (1 + latency) * T + instant - (0.6 if instant == 0.62 else 0.62)
+    assert believed == pytest.approx(testbed.read(context, "dps.angle") + late * rate, abs=1e-9)
+    # It falls at up to g / l = 19.62 rad/s^2; the rate is that of half a period before.
+    assert abs(believed - true) < 19.62 * (late**2 + late * T) / 2.0 < abs(late * rate)
 
 
 def test_the_mental_dps_gets_the_values_that_the_dps_received_last(tracked):

@@ -209,11 +209,11 @@ class Estimator(LeafSystem):
         self.variables = (discrete_state("estimate", 0, shape=(2,)),)
 
 
-def _believing(target="sim.sense.y.value", of=("dps.estimate",), by=None):
+def _believing(target="sim.sense.y.value", of=("dps.estimate",), by=None, **options):
     builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
     builder.set_dps(Estimator())
     _world(builder)
-    builder.believe(target, of=of, by=by)
+    builder.believe(target, of=of, by=by, **options)
     return builder
 
 
@@ -222,6 +222,30 @@ def test_belief_sets_the_simulated_world():
     context = testbed.default_context()
     testbed.start_from_belief(context)
     assert testbed.read(context, "sim.sense.y.value").tolist() == [4.0, 6.0]
+
+
+def test_a_rule_with_a_period_is_told_how_late_its_estimates_are():
+    testbed = _believing(by=lambda estimate, *, late: late * np.ones(2), age=0.5, period=0.2).build()
+    context = testbed.default_context()
+    # What is sampled at an instant itself comes later; events come some nanoseconds early.
+    for time, late in ((0.0, 0.7), (0.3, 0.6), (0.4, 0.7), (3 * 0.2, 0.7), (0.4 - 1e-8, 0.7 - 1e-8), (0.4001, 0.5001)):
+        context.SetTime(time)
+        testbed.start_from_belief(context)
+        assert testbed.read(context, "sim.sense.y.value") == pytest.approx(late, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"period": -0.1}, "at least 0 s, not -0.1"),
+        ({"period": np.inf}, "at least 0 s, not inf"),
+        ({"period": 0.1}, "no function that uses it"),
+        ({"age": np.nan}, "at least 0 s, not nan"),
+    ],
+)
+def test_a_belief_of_impossible_times_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        _believing(**options)
 
 
 def test_a_belief_goes_from_dps_to_sim():

@@ -114,7 +114,8 @@ class Starter:
        present command for some time. Sensors and actuators without a method ``resume``, such as cameras, begin as in
        the mental scenario.
 
-    A rule says how old its estimates are (``age``). They are not extrapolated: the mental world is late by that much.
+    A rule may lead its estimates from the instant that they are about to the present (``period``). The others are not
+    extrapolated: what they set is late, by the age of the estimates and by up to a sample period.
 
     Args:
         mental: The testbed of the rollouts.
@@ -263,7 +264,7 @@ class Starter:
                 estimates[address] = numbers[place].reshape(variable.shape)
             else:
                 estimates[address] = numbers.item(place.start)
-        return self._prior | {target.rule.target: target.value(estimates) for target in self._computed}
+        return self._prior | {t.rule.target: t.value(estimates, t.rule.late(dps.time)) for t in self._computed}
 
     def _check_dps(self, dps: DpsState) -> None:
         try:
@@ -352,14 +353,18 @@ class _Target:
         """Return the bounds of a scalar; an infinite value is within none."""
         return self._interval
 
-    def value(self, estimates: Mapping[str, Any]) -> ArrayLike:
+    def value(self, estimates: Mapping[str, Any], late: float = 0.0) -> ArrayLike:
         """Return what is believed of the variable, within its bounds.
+
+        Args:
+            estimates: By address.
+            late: The time in seconds since the instant that they are about.
 
         Raises:
             BeliefError: It is missing, or lies beyond the bounds.
         """
         of = [estimates[address] for address in self.rule.of]
-        value = self.rule.value_of(of)
+        value = self.rule.value_of(of, late=late)
         if isinstance(value, float) and self._interval[0] <= value <= self._interval[1]:
             return value  # Most are of joints: numpy would take ten times as long.
         variable, told = self.variable, dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, System
 from pydrake.systems.primitives import ConstantVectorSource
@@ -69,6 +70,20 @@ def pose_to_array(X_PF: RigidTransform) -> np.ndarray:
 def pose_from_array(value: np.ndarray) -> RigidTransform:
     """Return the pose ``[x, y, z, roll, pitch, yaw]``, in metres and radians."""
     return RigidTransform(RollPitchYaw(value[3:]), value[:3])
+
+
+def pose_later(pose: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
+    """Return where a body is after ``dt`` seconds if its spatial velocity stays.
+
+    Args:
+        pose: Its pose X_WB, [x, y, z, roll, pitch, yaw] in m and rad, shape (6,).
+        velocity: Its spatial velocity V_WB, [angular in rad/s, that of Bo in m/s], shape (6,).
+        dt: Negative for where it was before.
+    """
+    X_WB, turn = pose_from_array(pose), dt * np.asarray(velocity[:3])
+    angle = float(np.linalg.norm(turn))
+    R = RotationMatrix(AngleAxis(angle, turn / angle)) if angle else RotationMatrix()
+    return pose_to_array(RigidTransform(R @ X_WB.rotation(), X_WB.translation() + dt * np.asarray(velocity[3:])))
 
 
 def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | None = None) -> Iterator[Variable]:

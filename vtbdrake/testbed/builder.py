@@ -192,7 +192,13 @@ class VirtualTestbedBuilder:
             raise SignalError(f"the interface has no signal for the DPS's input port {', '.join(inputs)}")
 
     def believe(
-        self, target: str, *, of: Sequence[str], by: Callable[..., ArrayLike] | None = None, age: float = 0.0
+        self,
+        target: str,
+        *,
+        of: Sequence[str],
+        by: Callable[..., ArrayLike] | None = None,
+        age: float = 0.0,
+        period: float | None = None,
     ) -> None:
         """Declare which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
 
@@ -202,8 +208,12 @@ class VirtualTestbedBuilder:
             by: Function of the estimates that returns the target's value; by default the value of the one estimate.
             age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
                 sensor, which shows its state, is one period late. Predictions from the belief need the age.
+            period: Sample period of the estimates in seconds; 0 if the DPS computes them at any time. If it is given,
+                ``by`` gets the keyword ``late``, the time in seconds since the instant that the estimates are about,
+                and returns what the target is then: ``lambda q, v, *, late: q + late * v``, say. So a mental world
+                begins at the present, and not at an instant that lies ``age`` and up to a period before it.
         """
-        self.belief_rules.append(BeliefRule(target, tuple(of), by, age))
+        self.belief_rules.append(BeliefRule(target, tuple(of), by, age, period))
 
     def add_variable(self, variable: Variable) -> None:
         """List a further variable, for example one that is derived from others."""

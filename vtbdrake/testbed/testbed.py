@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import ceil, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,20 +32,34 @@ class BeliefRule:
     ``age`` is the time in seconds from the instant of the world that the estimates are about to that of the sensor
     values from which they are made: that of sampling, say. What lies between machine and DPS does not count.
 
+    ``period`` is the sample period of the estimates in seconds, 0 if they are computed at any time. If it is given,
+    ``by`` gets the keyword ``late``, see `late`, so that it can return what the target is then.
+
     Raises:
-        ValueError: Several estimates and no ``by``, or an age that is negative or infinite.
+        ValueError: Several estimates and no ``by``, an age that is negative or infinite, or such a period, or one
+            without ``by``.
     """
 
     target: str
     of: tuple[str, ...]
     by: Callable[..., ArrayLike] | None = None
     age: float = 0.0
+    period: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.age < inf:
             raise ValueError(f"the age of the belief about {self.target} is a time of at least 0 s, not {self.age!r}")
         if self.by is None and len(self.of) != 1:
             raise ValueError(f"the belief about {self.target} is of {len(self.of)} estimates: say with by= how")
+        if self.period is not None and not 0.0 <= self.period < inf:
+            raise ValueError(
+                f"the sample period of the belief about {self.target} is a time of at least 0 s, not {self.period!r}"
+            )
+        if self.period is not None and self.by is None:
+            raise ValueError(
+                f"the belief about {self.target} has a sample period, but no function that uses it: say with "
+                "by=f(estimates..., late=seconds) what the target is at the present"
+            )
 
     def check(self, variables: Variables) -> None:
         """Check the addresses of the belief.
@@ -62,12 +76,31 @@ class BeliefRule:
             raise ValueError(f"a belief sets a variable of the simulated world, not {self.target}")
 
     def value(self, variables: Variables, context: Context) -> ArrayLike:
-        """Return what the DPS in ``context`` believes the target to be."""
-        return self.value_of([variables[address].get(context) for address in self.of])
+        """Return what the DPS in ``context`` believes the target to be at the present."""
+        estimates = [variables[address].get(context) for address in self.of]
+        return self.value_of(estimates, late=self.late(context.get_time()))
 
-    def value_of(self, estimates: Sequence[ArrayLike]) -> ArrayLike:
-        """Return the target's value for estimates in the order of `of`."""
-        return self.by(*estimates) if self.by is not None else estimates[0]
+    def late(self, time: float) -> float:
+        """Return the time in seconds since the instant that the estimates are about.
+
+        That is their age, and the time since the DPS has sampled last. What it samples at ``time`` itself comes later.
+        """
+        if not self.period:
+            return self.age
+        # Drake's events come some nanoseconds early.
+        last = self.period * (ceil(time / self.period - 1e-6) - 1)
+        return self.age + time - last
+
+    def value_of(self, estimates: Sequence[ArrayLike], *, late: float = 0.0) -> ArrayLike:
+        """Return the target's value.
+
+        Args:
+            estimates: In the order of `of`.
+            late: The time in seconds since the instant that they are about. 0: the value is that of this instant.
+        """
+        if self.by is None:
+            return estimates[0]
+        return self.by(*estimates) if self.period is None else self.by(*estimates, late=late)
 
 
 # Mode -> positions of (T_sense, T_act).

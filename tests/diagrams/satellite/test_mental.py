@@ -15,7 +15,7 @@ WORLD = {
     "sim.sys.target.body.velocity": 0.01,
     "sim.sys.servicer.base.pose": 0.005,
     "sim.sys.servicer.base.velocity": 0.005,
-    "sim.sys.servicer.joint_2.position": 0.01,
+    "sim.sys.servicer.joint_2.position": 0.003,
     "sim.sys.servicer.joint_2.velocity": 0.05,
 }
 
@@ -32,6 +32,10 @@ def test_mental_capture_begins_with_the_estimates() -> None:
         believed, true = record[address][0], testbed.read(context, address)
         assert np.abs(believed - true).max() < tolerance, address
         assert np.abs(believed - true).max() > 0.0, f"{address} is known exactly"
+    # The arm has moved since it was measured.
+    name = "sim.sys.servicer.joint_2.position"
+    measured, true = testbed.read(context, "dps.impl.controller.measured_position")[1], testbed.read(context, name)
+    assert abs(record[name][0] - true) < 0.2 * abs(measured - true)
     assert record[MODE][0] == testbed.read(context, MODE)
     assert record[MODE][-1] == HOLD
 
