@@ -186,10 +186,14 @@ class CarrierScenario(Scenario):
     def global_map(self) -> WorldModel:
         """Return the map that the DPS has: that of ``map_file``, which has errors as ``map`` says, or a survey.
 
+        Features of a file without a covariance get the deviation of ``map``.
+
         Raises:
             GeoJsonError: The file is no map.
         """
-        return load_geojson(self.map_file) if self.map_file else self.surveyed_map()
+        if not self.map_file:
+            return self.surveyed_map()
+        return load_geojson(self.map_file, deviation=MAPS[self.map].position)
 
     def check_perception(self) -> None:
         """Raise a ValueError if the DPS cannot see landmarks with its scanner.

@@ -6,9 +6,12 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform, wrap
+from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.stand import REMOTE, Stand
+
+DIAMETER = Quantity(0.3, "m", 0.02)
 
 
 def some(n=5, seed=0):
@@ -93,3 +96,27 @@ def test_bad_landmarks_are_rejected():
         tree = WorldObject("t", "tree", position_estimate(np.zeros(3)), {"trunk_diameter": Quantity(diameter, "m")})
         with pytest.raises(ValueError, match=f"of the tree t is {diameter:g} m, but must be .* at most 20 m: are its"):
             map_landmarks(WorldModel([tree]))
+
+
+@pytest.mark.parametrize(("deviation", "bounds"), [(0.0, (8.0, np.inf)), (1.3 * 0.05, (2.0, 4.2))])
+def test_leaning_trunks_need_their_deviation(deviation, bounds):
+    """The map has the feet of 30 trees to 3 cm; they lean by 0.05 rad, and are seen at breast height to 1 cm."""
+    rng, squares = np.random.default_rng(5), []
+    for _ in range(30):
+        places = rng.uniform(-12.0, 12.0, (30, 2))
+        feet = WorldModel(
+            WorldObject(f"t{k}", "tree", position_estimate([*foot, 0.0], deviation=0.03), {"trunk_diameter": DIAMETER})
+            for k, foot in enumerate(places + rng.normal(0.0, 0.03, (30, 2)))
+        )
+        trunks = places + 1.3 * rng.normal(0.0, 0.05, (30, 2))
+        seen = Landmarks(
+            trunks + rng.normal(0.0, 0.01, (30, 2)),
+            np.tile(1e-4 * np.eye(2), (30, 1, 1)),
+            np.full(30, 0.3),
+            np.ones(30),
+        )
+        tracker = Tracker(map_landmarks(feet, deviation=deviation), least_deviation=0.0, bias_deviation=1e-3)
+        state, matches = tracker.start(np.zeros(3), np.diag([0.04, 0.04, 1e-4]), seen)
+        assert len(matches.pairs) >= 8
+        squares.append(state.pose @ np.linalg.solve(state.pose_covariance, state.pose))
+    assert bounds[0] < np.mean(squares) < bounds[1]

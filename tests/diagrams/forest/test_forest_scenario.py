@@ -1,6 +1,7 @@
 """Tests of the simulated forest: what the scanner sees against analytic geometry, what the sensors tell, bad fields."""
 
 import gc
+import json
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -277,6 +278,16 @@ def test_map_comes_from_a_survey_or_a_file(tmp_path: Path) -> None:
     save_geojson(WorldModel([tree(3.0, 4.0)]), path, frame=LocalFrame(61.19, 25.11, 130.0))
     loaded = ForestScenario(map_file=str(path)).global_map()
     assert loaded.positions() == pytest.approx(np.array([[3.0, 4.0, 0.0]]), abs=1e-6)
+
+
+def test_positions_in_a_file_are_not_taken_as_exact(tmp_path: Path) -> None:
+    path = tmp_path / "map.geojson"
+    save_geojson(WorldModel([tree(3.0, 4.0)]), path, frame=LocalFrame(61.19, 25.11, 130.0))
+    data = json.loads(path.read_text())
+    del data["features"][0]["properties"]["covariance"]
+    path.write_text(json.dumps(data))
+    (loaded,) = ForestScenario(map="remote", map_file=str(path)).global_map()
+    assert np.diag(loaded.pose.covariance)[3:] == pytest.approx(np.full(3, 0.35**2))
 
 
 @pytest.mark.parametrize(

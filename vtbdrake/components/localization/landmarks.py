@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,17 +89,22 @@ class Landmarks:
         )
 
 
-def map_landmarks(model: WorldModel, kind: str = "tree") -> Landmarks:
+def map_landmarks(model: WorldModel, kind: str = "tree", *, deviation: float = 0.0) -> Landmarks:
     """Return the objects of a class that are believed to be there, as landmarks in the world frame of the model.
 
     Args:
         model: The map.
         kind: The class: ``"tree"``, with the attribute ``trunk_diameter``, or ``"rock"``, with ``width``.
+        deviation: Standard deviation in m, per axis, of what the covariances of the map leave out; its square is added
+            to their variances. Of a map of the feet of leaning trunks, it is the deviation of the lean in rad times
+            1.3 m, as trunks are detected at breast height.
 
     Raises:
-        ValueError: The class is unknown, there is no such object, or one has no diameter in m between 0 and 20 m, or
-            no variance in the plane.
+        ValueError: The class is unknown, there is no such object, one has no diameter in m between 0 and 20 m, or
+            no variance in the plane, or the deviation is none.
     """
+    if not 0.0 <= deviation < inf:
+        raise ValueError(f"deviation is a standard deviation in m, finite and at least 0, not {deviation!r}")
     if kind not in DIAMETERS:
         raise ValueError(f"landmarks are of the class {' or '.join(DIAMETERS)}, not {kind!r}")
     objects = [one for one in model.find(kind) if one.is_known]
@@ -114,7 +120,7 @@ def map_landmarks(model: WorldModel, kind: str = "tree") -> Landmarks:
     deviations = [one.attributes[DIAMETERS[kind]].deviation for one in objects]
     return Landmarks(
         np.array([one.p_WoOo_W[:2] for one in objects]),
-        np.array([one.pose.covariance[3:5, 3:5] for one in objects]),
+        np.array([one.pose.covariance[3:5, 3:5] for one in objects]) + deviation**2 * np.eye(2),
         np.array(diameters),
         np.array(deviations),
     )
