@@ -451,6 +451,26 @@ def test_loop_that_was_held_up_reads_all_that_has_waited(asleep, pace):
     assert runtime.guards.latched[0].kind == "missed" and used == [0.08]
 
 
+def test_received_and_written_values_are_read_by_address():
+    runtime, _, _ = make(alone=True, sensors=lambda t: {"position": [0.3, 0.0], "speed": [0.0, 0.0]})
+    runtime.write({"u.target": [0.1, 0.2]})
+    runtime.cycle()
+    assert runtime.read("real.sense.position").tolist() == [0.3, 0.0]
+    assert runtime.read("u.target").tolist() == [0.1, 0.2]
+
+
+@pytest.mark.parametrize("pace", [None, "position"])
+def test_run_begins_with_the_newest_of_what_has_waited(pace):
+    runtime, bridge, clock = switched(rate=0.0, pace=pace)
+    runtime.run(cycles=3)
+    waiting = [0.05, 0.06, 0.07, 0.08]  # Since the run before; one poll does not read them all.
+    bridge.sensors = lambda t: {"position": [waiting.pop(0), 0.0], "speed": [0.0, 0.0]} if waiting else {}
+    begin = clock.now()
+    runtime.run(cycles=1)
+    assert bridge.sensed["position"].value[0] == 0.08
+    assert clock.now() - begin < 1.5 * PERIOD  # A paced loop has its message, and does not wait for another one.
+
+
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])
 @pytest.mark.parametrize("asleep", [False, True])
 def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, asleep):
@@ -459,7 +479,7 @@ def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, a
     held = "poll" if asleep else "publish"
     call = getattr(bridge, held)
 
-    def stopped(argument):
+    def stopped(argument=0.0):
         if runtime.cycles == 5:
             clock.advance(held_up * PERIOD)
             setattr(bridge, held, call)

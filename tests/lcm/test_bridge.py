@@ -119,6 +119,14 @@ def test_sender_may_be_ahead_by_the_time_that_passed(monkeypatch: pytest.MonkeyP
     assert arm.take(status(3_601_000_000)).position.count == 2
 
 
+def test_message_after_one_that_waited_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = Arm().take(status(1_000_000))
+    later = time.monotonic() + 3600.0
+    monkeypatch.setattr("vtbdrake.lcm.bridge.time.monotonic", lambda: later)
+    arm.take(status(1_001_000), status(3_601_000_000))  # The first one has waited for an hour.
+    assert (arm.position.count, arm.position.rejected, arm.reader.clock_jumps) == (3, {}, 0)
+
+
 def test_late_messages_are_no_clock_jump() -> None:
     arm = Arm(reorder_window=0.0)
     for utime in range(100, 200):

@@ -157,6 +157,7 @@ class Runtime(Stepped):
             raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
         self._stop.clear()
         self.read_switches()
+        begins = self._read_waiting()
         begin = self.clock.now()
         deadline, done = begin, 0
         try:
@@ -164,7 +165,8 @@ class Runtime(Stepped):
                 while not self._stop.is_set():
                     if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                         return
-                    due, lateness = self._await(deadline)
+                    due, lateness = (deadline, 0.0) if begins else self._await(deadline)
+                    begins = False
                     # A loop that is paced by messages has just received them.
                     self.cycle(lateness=lateness, poll=self.pace is None)
                     interruptible.check()
@@ -266,8 +268,18 @@ class Runtime(Stepped):
                 self._watchers.remove(watcher)
         return done
 
+    def _read_waiting(self) -> bool:
+        """Receive all that has waited since the last run, and return whether it begins a cycle of a paced loop."""
+        if self.pace is None:
+            self._read_backlog()
+            return False
+        paced = self.bridge.sensed[self.pace]
+        count = paced.count
+        self._read_backlog()
+        return paced.count != count
+
     def _read_backlog(self) -> None:
-        """Receive all that has waited while the loop was held up: a fallback takes what has just arrived for new."""
+        """Receive all that has waited while the loop did not run: what has just arrived is taken for new."""
         for _ in range(_MOST_POLLS):
             if not self.bridge.poll():
                 return

@@ -38,9 +38,9 @@ class LcmBridge(Bridge):
     checked one by one: one that is out of its limits does not invalidate the others.
 
     A message is rejected as ``out of order`` if its time is before the last accepted one's, as a ``duplicate`` if it is
-    the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` further on than the time that has passed here. A
-    sender that was restarted, or whose clock was set, is accepted after ``reorder_window`` seconds in which no message
-    has continued its old time.
+    the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` ahead of what the quickest message so far and the
+    time that has passed here let expect. A sender that was restarted, or whose clock was set, is accepted after
+    ``reorder_window`` seconds in which no message has continued its old time.
 
     Limiting actuator commands is the guards' business, but one that is not finite or not within its signal's limits is
     never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
@@ -234,7 +234,7 @@ class ChannelReader:
             received_signal.bounds = bounds
         self._reorder_window = reorder_window
         self._last = -inf  # time of the sender in the last accepted message
-        self._ahead = inf  # by how much it was ahead of ours
+        self._ahead = inf  # by how much it was ahead of ours, at most: a message that has waited does not count
         self._unfit_since = inf  # when the first message since then came that does not continue the sender's time
 
     def take(self, channel: str, data: bytes) -> None:
@@ -260,8 +260,11 @@ class ChannelReader:
                 received.accept(values[name], now, sent)
                 accepted = True
         if accepted and isfinite(sent):
+            ahead = sent - now
+            if fits and isfinite(self._last):
+                ahead = max(ahead, self._ahead)
             self.clock_jumps += not fits
-            self._last, self._ahead, self._unfit_since = sent, sent - now, inf
+            self._last, self._ahead, self._unfit_since = sent, ahead, inf
 
     def _order(self, sent: float, now: float) -> str:
         """Return why a message that does not continue the sender's time is rejected; empty if it is accepted."""
