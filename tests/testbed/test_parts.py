@@ -16,6 +16,21 @@ from vtbdrake.testbed.signal import Feed
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 
+class PoseScenario(Scenario):
+    def interface(self) -> Interface:
+        pose = RigidTransform()
+        return Interface([Signal("seen", model_value=pose)], [Signal("commanded", model_value=pose, idle=pose)])
+
+    def make_dps(self) -> PoseRelay:
+        return PoseRelay()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        relay = PoseRelay()
+        builder.add("sys", "mirror", relay)
+        builder.sim_actuator("commanded", relay.get_input_port())
+        builder.sim_sensor("seen", relay.get_output_port())
+
+
 def closed_loop_then_alone(scenario, start, *, until, more, period):
     """Outputs of the DPS in its testbed, and alone with the same sensor values, from ``until`` periods on."""
     testbed, alone = scenario.build(), DpsAlone(scenario)
@@ -63,6 +78,24 @@ def test_it_has_the_boundary_of_the_testbed_and_nothing_of_its_world():
     ours = {a for a in testbed.variables() if a.startswith(("dps.", "u.")) or a == "time"}
     assert set(alone.variables()) == ours
     assert np.array_equal(alone.read(alone.default_context(), "real.act.active"), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "address", "nothing", "value"),
+    [
+        (AcrobotScenario(), "real.sense.joint_state", [np.nan] * 4, [1.0, 2.0, 3.0, 4.0]),
+        (PoseScenario(), "real.sense.seen", None, RigidTransform([1.0, 2.0, 3.0])),
+    ],
+)
+def test_received_values_are_read_by_address(scenario, address, nothing, value):
+    target = DpsAlone(scenario)
+    context = target.default_context()
+    before = target.read(context, address)
+    assert before is None if nothing is None else np.array_equal(before, nothing, equal_nan=True)
+    target.diagram.GetInputPort(address).FixValue(context, value if nothing is not None else Value(value))
+    after = target.read(context, address)
+    assert np.array_equal(after, value) if nothing is not None else after.IsExactlyEqualTo(value)
+    assert address in target.addresses()
 
 
 def test_commands_go_with_it():
@@ -187,21 +220,6 @@ def test_actuators_begin_with_their_idle_commands() -> None:
     world = WorldAlone(Idle(time_step=STEP))
     port = world.diagram.GetInputPort("act.torque")
     np.testing.assert_array_equal(port.Eval(world.default_context()), [3.0])
-
-
-class PoseScenario(Scenario):
-    def interface(self) -> Interface:
-        pose = RigidTransform()
-        return Interface([Signal("seen", model_value=pose)], [Signal("commanded", model_value=pose, idle=pose)])
-
-    def make_dps(self) -> PoseRelay:
-        return PoseRelay()
-
-    def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        relay = PoseRelay()
-        builder.add("sys", "mirror", relay)
-        builder.sim_actuator("commanded", relay.get_input_port())
-        builder.sim_sensor("seen", relay.get_output_port())
 
 
 def test_abstract_commands_can_be_fed() -> None:

@@ -204,7 +204,7 @@ def test_ports_and_variables_are_read_by_address():
     assert testbed.read(context, "dps.torque") == pytest.approx([0.5])
     assert testbed.read(context, "plant.state").tolist() == [0.0, 0.0]
     assert testbed.read(context, "time") == 0.0
-    with pytest.raises(AddressError, match="no variable and no output port 'dps.torqe'; did you mean dps.torque"):
+    with pytest.raises(AddressError, match="no variable and no port 'dps.torqe'; did you mean dps.torque"):
         testbed.read(context, "dps.torqe")
 
 

@@ -65,7 +65,10 @@ class Fallback(ABC):
 
 
 class Hold(Fallback):
-    """Repeats the last command within the limits: a commanded position comes to rest as quickly as they allow."""
+    """Repeats the last command within the limits: a commanded position comes to rest as quickly as they allow.
+
+    Only for positions: a torque or a force that is held accelerates, and a velocity that is held goes on.
+    """
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return last_sent

@@ -224,6 +224,13 @@ class Stepped:
                 except ValueError:
                     received.reject("refused")
 
+    def read(self, address: str) -> Any:
+        """Return the present value of a variable or a port of the target, for example ``real.sense.<signal>``.
+
+        Call it in the thread that runs the cycles, or between them; see `AddressedDiagram.reader`.
+        """
+        return self.target.read(self._context, address)
+
     def write(self, values: Mapping[str, Any]) -> None:
         """Set variables by address.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
-from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
@@ -208,7 +208,7 @@ class AddressedDiagram:
         return self._variables
 
     def read(self, context: Context, address: str) -> Any:
-        """Return the value of a variable, or of an output port (``path.port``), in ``context``."""
+        """Return the value of a variable, or of a port, in ``context``; see `reader`."""
         self.check_context(context)
         return self.reader(address)(context)
 
@@ -222,22 +222,27 @@ class AddressedDiagram:
         self._variables.write(context, values)
 
     def reader(self, address: str) -> Callable[[Context], Any]:
-        """Return a function that reads a variable, or an output port by ``path.port``, from any context.
+        """Return a function that reads a variable or a port from any context.
+
+        Args:
+            address: The address of a variable, or of an output port (``path.port``), or ``real.sense.<signal>``, whose
+                value is NaN (or None, if it is abstract) while nothing has been received there.
 
         Raises:
-            AddressError: There is neither.
+            AddressError: There is no such variable and no such port.
         """
         check_address(address)
         if address in self._variables:
             return self._variables[address].get
         if address in self._ports:
             return _port_reader(*self._ports[address])
-        hint = suggestion(address, [*self._variables, *self._ports])
-        raise AddressError(f"there is no variable and no output port {address!r}{hint}")
+        if address in self._inputs:
+            return _input_reader(self.diagram, self._inputs[address])
+        raise AddressError(f"there is no variable and no port {address!r}{suggestion(address, self.addresses())}")
 
     def addresses(self) -> list[str]:
-        """Return the addresses of every variable and every output port."""
-        return [*self._variables, *self._ports]
+        """Return the addresses of everything that can be read: variables, output ports, and what the machine sends."""
+        return [*self._variables, *self._ports, *self._inputs]
 
     @cached_property
     def _ports(self) -> dict[str, tuple[System, OutputPort]]:
@@ -247,6 +252,11 @@ class AddressedDiagram:
                 port = system.get_output_port(i)
                 ports[f"{path}.{port.get_name()}".lstrip(".")] = (system, port)
         return ports
+
+    @cached_property
+    def _inputs(self) -> dict[str, InputPort]:
+        ports = [self.diagram.get_input_port(i) for i in range(self.diagram.num_input_ports())]
+        return {port.get_name(): port for port in ports if port.get_name().startswith("real.sense.")}
 
     # -- s(t) as a whole
 
@@ -341,3 +351,14 @@ def _port_reader(system: System, port: OutputPort) -> Callable[[Context], Any]:
     if port.get_data_type() == PortDataType.kVectorValued:
         return lambda context: np.array(port.Eval(system.GetMyContextFromRoot(context)))
     return lambda context: port.EvalAbstract(system.GetMyContextFromRoot(context)).Clone().get_value()
+
+
+def _input_reader(diagram: Diagram, port: InputPort) -> Callable[[Context], Any]:
+    if port.get_data_type() == PortDataType.kVectorValued:
+        return lambda context: np.array(port.Eval(context)) if port.HasValue(context) else np.full(port.size(), np.nan)
+
+    def read(context: Context) -> Any:
+        value = diagram.EvalAbstractInput(context, port.get_index())
+        return None if value is None else value.Clone().get_value()
+
+    return read

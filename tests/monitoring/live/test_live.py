@@ -203,14 +203,14 @@ def test_get_returns_present_values(shared: Rig) -> None:
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({"dps.gian": 1.0}, "no variable and no output port 'dps.gian'; did you mean dps.gain or"),
+        ({"dps.gian": 1.0}, "no variable and no port 'dps.gian'; did you mean dps.gain or"),
         ({"dps.gain": 1.0, "dps.nothing[3]": 1.0}, "'dps.nothing[3]'"),
         ({"dps.gain": -1.0}, "must lie in"),
         ({"dps.gain": [1.0, 2.0]}, "shape"),
         ({"u.target": [[1.0], [2.0, 3.0]]}, ""),
         ({"dps.velocity": 1.0, "dps.gain": float("nan")}, "the value of dps.gain must be a finite number"),
         ({"time": 1.0}, "time is not written"),
-        ({"real.act.velocity": [1.0, 1.0]}, "real.act.velocity is an output port"),
+        ({"real.act.velocity": [1.0, 1.0]}, "real.act.velocity is a port"),
     ],
 )
 def test_impossible_set_is_rejected(shared: Rig, values: dict[str, Any], reason: str) -> None:

@@ -221,11 +221,11 @@ class LiveServer:
 
     def _unknown(self, address: str) -> str:
         if address in self._addresses:
-            return f"{address} is an output port: it can be read, not set"
+            return f"{address} is a port: it can be read, not set"
         # Imports Drake, for a misspelt address only.
         from vtbdrake.state.variables import suggestion
 
-        return f"there is no variable and no output port {address!r}{suggestion(address, self._addresses)}"
+        return f"there is no variable and no port {address!r}{suggestion(address, self._addresses)}"
 
     def _publish_values(self, frame: bytes, start: int) -> int:
         """Publish the record that begins at ``start`` and return where the next one begins."""
