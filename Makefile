@@ -45,9 +45,9 @@ demo-control: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
 # In the order of the folders: by default, files of few tests come last, and the longest of them keep one worker busy in the
-# end.
+# end. One worker more than processors: some tests wait for other processes, for sockets and for the clock.
 test: $(STAMP)
-	$(RUN) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .

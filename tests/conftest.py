@@ -1,10 +1,12 @@
 """Settings and fixtures of all tests."""
 
+import gc
 import importlib
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Generator
 from pathlib import Path
 from types import ModuleType
 
@@ -22,6 +24,18 @@ settings.load_profile("patient")
 # What a shell starts in the background ignores Ctrl-C, and so would all that the tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without the garbage collector. Later it leaves out what is there now, half a million objects."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
 
 # Folders (and the modules in them, all of a kind) that need one Python only. A single module says so by
 # `pytestmark = pytest.mark.one_python`, a single test by the marker itself.

@@ -60,8 +60,9 @@ need_packages() {
     fi
     say "installing system packages: $*"
     export DEBIAN_FRONTEND=noninteractive
-    apt-get update -qq
-    $command -qq >/dev/null
+    # One at a time: another environment may be set up in parallel.
+    flock tools/setup.sh apt-get update -qq
+    flock tools/setup.sh $command -qq >/dev/null
 }
 
 command -v "$python" >/dev/null || {
