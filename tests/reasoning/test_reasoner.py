@@ -477,6 +477,14 @@ def test_a_quality_that_fails_fails_its_candidates_only(mass):
     assert decision.health.failed == sum(c.status == "failed" for c in decision.candidates) > 0
 
 
+def test_an_integral_that_overflows_fails_its_rollout(mass):
+    quality = Quality(lambda state: 1e308, of=STATE, reading="integral", minimize=True)
+    decision = decide(make(quality=quality, budget=Budget(rollouts=3)), mass)
+    assert not decision
+    assert decision.health.failed == 3
+    assert "the integral of f over 3 s is too large for a number; the largest sample is 1e+308" in decision.warnings[0]
+
+
 def test_if_all_rollouts_fail_there_is_no_decision(mass):
     decision = decide(make(quality=Quality(lambda state: -1.0, of=STATE), budget=Budget(rollouts=3)), mass)
     assert not decision
@@ -511,6 +519,13 @@ def test_a_candidate_that_there_is_not_has_no_motion(mass):
     reasoner = make(budget=Budget(rollouts=2))
     with pytest.raises(ValueError, match="the candidates 0 to 1, and no 2"):
         reasoner.motion(decide(reasoner, mass), 2)
+
+
+def test_a_world_without_a_plant_has_no_motion(mass):
+    reasoner = make(budget=Budget(rollouts=2))
+    decision = decide(reasoner, mass)
+    with pytest.raises(ValueError, match="MassScenario has no MultibodyPlant; plot the quality"):
+        reasoner.motion(decision, 1)
 
 
 def test_a_method_of_random_numbers_from_the_clock_says_so():
@@ -578,6 +593,8 @@ def test_a_senseless_budget_is_refused(arguments, message):
         ({"budget": 70}, "a budget is Budget.*not 70"),
         ({"samples": 0}, "at least one sample, not 0"),
         ({"samples": 8, "budget": Budget(rollouts=7)}, "7 rollouts does not suffice for one candidate, which takes 8"),
+        ({"uncertainty": {"sim.sys.mass.discrete_state_0": 0.1}}, "samples=1 with .*one is a world by chance"),
+        ({"samples": 3}, "samples=3 with uncertainty=None.*of a certain one all are the same"),
         ({"decision": []}, "a reasoner decides something"),
         ({"decision": SWITCH}, "give decision as"),
         ({"decision": [Parameter("sim.sys.mass.discrete_state_0[0]", 0.0, 1.0)]}, "is neither"),

@@ -55,6 +55,20 @@ class Motion:
     states: np.ndarray
 
 
+def recording_motion(task: RolloutTask, testbed: VirtualTestbed) -> RolloutTask:
+    """Return a task whose rollouts record all that a `Motion` needs, to the end.
+
+    Raises:
+        ValueError: The testbed has no plant.
+    """
+    if testbed.plant is None:
+        raise ValueError(
+            f"there is no motion to show: {type(task.scenario).__name__} has no MultibodyPlant; plot the quality over "
+            "time instead, with plot()"
+        )
+    return replace(task, record=("plant.state",), pruning=None)
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ProblemRollout(RolloutResult):
     """A rollout with a reference to its problem, so that it can be shown."""
@@ -281,8 +295,12 @@ class Problem:
         return self._runner(self.task, parameters).state(split(parameters)[1], as_number("the time t", t))
 
     def motion(self, parameters: Mapping[str, Any]) -> Motion:
-        """Return the motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0."""
-        runner = self._runner(replace(self.task, record=("plant.state",)), parameters)
+        """Return the motion of the simulated world in the rollout with ``parameters`` (address -> value) set in s0.
+
+        Raises:
+            ValueError: The testbed has no plant.
+        """
+        runner = self._runner(recording_motion(self.task, self.testbed), parameters)
         result = runner.run(split(parameters)[1])
         return Motion(runner.task.scenario, result.times, result.record["plant.state"])
 

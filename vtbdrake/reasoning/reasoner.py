@@ -15,7 +15,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.argument_checks import as_whole
-from vtbdrake.optimization.problem import Motion, Problem
+from vtbdrake.optimization.problem import Motion, Problem, recording_motion
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Point
@@ -60,7 +60,8 @@ class Reasoner:
             ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
         options: of the method.
         constraints: what the rollouts of an eligible candidate keep.
-        samples: how many samples of an uncertain belief each candidate is simulated from.
+        samples: how many samples of an uncertain belief each candidate is simulated from; at least 2. 1: the belief is
+            certain.
         uncertainty: of the belief, see `Starter`; by address of a variable of the simulated world.
         max_age: the largest age of a belief, in seconds.
         risk: how the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
@@ -122,6 +123,11 @@ class Reasoner:
         if self.samples < 1:
             raise ValueError(f"a belief has at least one sample, not {samples}")
         check_budget(budget, self.samples)
+        if (self.samples > 1) != bool(uncertainty):
+            raise ValueError(
+                f"samples={samples} with uncertainty={uncertainty!r}: of an uncertain belief several samples are drawn "
+                "(one is a world by chance), of a certain one all are the same; give both, samples=8 say, or neither"
+            )
         self.budget = budget
         self.space = DecisionSpace(decision)
         mental = scenario.mental()
@@ -260,13 +266,13 @@ class Reasoner:
             candidate: the number of the candidate.
 
         Raises:
-            ValueError: the decision has no such candidate.
+            ValueError: the decision has no such candidate, or the mental testbed has no plant.
         """
         if not 0 <= candidate < len(decision.candidates):
             raise ValueError(
                 f"the decision has the candidates 0 to {len(decision.candidates) - 1}, and no {candidate!r}"
             )
-        task = replace(self.task, record=("plant.state",), pruning=None)
+        task = recording_motion(self.task, self.problem.testbed)
         values = decision.candidates[candidate].values if candidate else {}
         result = RolloutRunner(task, self.problem.testbed).run(values, start=decision.starts[0])
         return Motion(task.scenario, result.times, result.record["plant.state"])

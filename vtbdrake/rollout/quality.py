@@ -30,7 +30,8 @@ def _end(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, f
 
 
 def _integral(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, float]:
-    return float(times[-1]), float(np.trapezoid(samples, times))
+    with np.errstate(over="ignore"):
+        return float(times[-1]), float(np.trapezoid(samples, times))
 
 
 READINGS: dict[str, Reading] = {"best": _best, "worst": _worst, "end": _end, "integral": _integral}

@@ -130,6 +130,7 @@ class RolloutRunner:
                     if samples.ending:
                         end, message = samples.ending
                         break
+                samples.check()
             except SimulationError as failure:
                 end, message = FAILED, str(failure)
             except QualityError as failure:
@@ -364,6 +365,22 @@ class _Samples:
         if task.quality is None or task.threshold is None:
             return False
         return bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
+
+    def check(self) -> None:
+        """Check that integrals are finite, as all their samples are.
+
+        Raises:
+            QualityError: one has overflowed.
+        """
+        times = np.array(self._times)
+        for measure, samples in zip(self._runner._measures, self._samples, strict=True):
+            if measure.reading == "integral" and not np.isfinite(
+                READINGS["integral"](times, np.array(samples), True)[1]
+            ):
+                raise QualityError(
+                    f"the integral of {measure.name} over {times[-1]:g} s is too large for a number; the largest "
+                    f"sample is {max(map(abs, samples)):g}: state it in a larger unit"
+                )
 
     def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
         task, f = self._runner.task, self._runner.task.quality
