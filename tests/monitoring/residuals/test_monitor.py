@@ -118,6 +118,30 @@ def test_skipped_windows_are_reported_while_running() -> None:
             monitor.calibrate()
 
 
+class OwnClock(Line):
+    """A machine whose every seventh sample comes too late for its cycle, and together with the next one."""
+
+    def poll(self, timeout: float = 0.0) -> int:
+        polls = getattr(self, "polls", 0)
+        self.polls = polls + 1
+        if polls % 7 == 5:
+            return 0
+        return super().poll() + (super().poll() if polls % 7 == 6 else 0)
+
+
+def test_machine_with_its_own_clock_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    driver = loop(DpsAlone(SCENARIO), OwnClock(SCENARIO, machine(SCENARIO)), PERIOD)
+    monitor = ResidualMonitor(driver, "twin", config=CONFIG, worker=False)
+    driver.run(cycles=1500)
+    assert monitor.skipped > 50
+    assert caplog.text.count("because samples are missing: the clock begins the cycles") == 1
+    caplog.clear()
+    whole = Together(SCENARIO, machine(SCENARIO))
+    quiet = ResidualMonitor(whole.driver, "twin", config=CONFIG, worker=False)
+    whole.run(1500)
+    assert len(quiet.history) > 100 and not caplog.text
+
+
 def test_simulated_sensors_are_not_compared() -> None:
     together = Together(SCENARIO, machine(SCENARIO), shadowing=SCENARIO)
     assert together.shadow is not None

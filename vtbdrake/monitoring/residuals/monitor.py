@@ -37,6 +37,8 @@ _log = logging.getLogger(__name__)
 
 _START_TIMEOUT = 120.0  # s in which the worker process builds a world
 _MAX_WAITING = 100  # blocks of rows that may wait for the worker process; older ones are skipped
+# So many windows without a result, and this share of all windows, are worth a warning.
+_BLIND_WINDOWS, _BLIND_SHARE = 50, 0.2
 _REPORT_WINDOWS = 10  # windows, with or without a result, after which a report is sent, if there is no alarm before
 
 
@@ -52,6 +54,11 @@ class ResidualMonitor:
     it dies, the loop goes on, `running` becomes False, and an error is logged.
 
     While a sensor signal is not on real, nothing is predicted; the prediction restarts afterwards.
+
+    A window lacks a result if a sample is missing. If the machine has a clock of its own, and the cycles of the loop
+    begin by another one, there are cycles with no new sample, and cycles with two, of which the first is missed. So let
+    the machine's messages begin the cycles (`Deployment.pace`). From 50 windows and a fifth of all on, a warning is
+    logged.
 
     Args:
         runtime: The loop, which does not run yet.
@@ -120,6 +127,13 @@ class ResidualMonitor:
             self._worker.post(pickle.dumps(self._rows))
         else:
             self._comparison = Comparison(predictor, self._rows, config, mode=mode)
+        self._results = 0
+        self._is_warned = False
+        self._remedy = (
+            "the clock begins the cycles of the loop: let the machine's messages do so (Deployment.pace)"
+            if runtime.pace is None
+            else "the loop is late, or messages are lost"
+        )
         self._sampler = Sampler(runtime, self._rows, estimates, mode=mode, horizon=config.horizon)
         self._begin_block()
         self._open = True
@@ -175,6 +189,16 @@ class ResidualMonitor:
     def _take_report(self, report: ResidualReport) -> None:
         self.history.extend(report.windows)
         self.skipped, self.failed, self.error = report.skipped, report.failed, report.error
+        self._results += len(report.windows)
+        share = self.skipped / max(self.skipped + self._results, 1)
+        if not self._is_warned and self.skipped >= _BLIND_WINDOWS and share >= _BLIND_SHARE:
+            self._is_warned = True
+            _log.warning(
+                "%d of %d windows have no residuals, because samples are missing: %s",
+                self.skipped,
+                self.skipped + self._results,
+                self._remedy,
+            )
         for alarm in report.alarms:
             if alarm.ended == inf:
                 self.alarms.append(alarm)
@@ -240,9 +264,8 @@ class ResidualMonitor:
             if not (self.skipped or self.failed):
                 raise
             raise CalibrationError(
-                f"{error}; {self.skipped} windows were skipped, because samples were missing (a loop that begins its "
-                f"cycles with the machine's messages misses none: Deployment.pace), and {self.failed} predictions "
-                f"failed{self.error and f' ({self.error})'}"
+                f"{error}; {self.skipped} windows were skipped, because samples were missing ({self._remedy}), and "
+                f"{self.failed} predictions failed{self.error and f' ({self.error})'}"
             ) from error
 
     def close(self) -> None:
