@@ -156,6 +156,21 @@ def test_the_mental_copy_has_the_same_dps_and_a_coarser_world() -> None:
     assert replace(mental, **kept) == scenario
 
 
+def test_exact_sensors_of_the_mental_copy_show_the_same() -> None:
+    exact = CartPoleScenario().mental()
+    perceived = []
+    # A latency that can be set later needs our own sensors.
+    for scenario in (exact, replace(exact, velocity_errors=ErrorModel(max_latency=1))):
+        testbed = scenario.build()
+        context = testbed.default_context()
+        testbed.write(context, {f"{POLE}.position": 0.5, f"{CART}.velocity": 0.3})
+        simulator = testbed.simulator(context)
+        for k in range(1, 6):
+            simulator.AdvanceTo(k * scenario.period)
+            perceived.append(testbed.read(context, PERCEIVED))
+    np.testing.assert_array_equal(perceived[:5], perceived[5:])
+
+
 def test_scenario_comes_back_from_its_file(tmp_path: Path) -> None:
     scenario = CartPoleScenario(force_limit=40.0, order="cubic", velocity_errors=ErrorModel(noise=0.01, seed=3))
     scenario.save(tmp_path / "cart_pole.yaml")
