@@ -162,5 +162,13 @@ def main(scenario: Scenario, url: str, every: int, timeout: float) -> None:
         raise BadInputError(one_line(error)) from error
 
 
+def program() -> None:
+    """Run `main`; arguments that describe no scenario are one line of text, too."""
+    try:
+        main()
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"Error: {one_line(error)}") from error
+
+
 if __name__ == "__main__":
-    main()
+    program()

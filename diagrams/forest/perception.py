@@ -22,6 +22,7 @@ from threadpoolctl import ThreadpoolController
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.localization.dead_reckoning import (
     MOTION,
+    POSE,
     DeadReckoning,
     DriftModel,
     body_rotation,
@@ -72,11 +73,16 @@ class ScanLandmarks:
     def __call__(self, scan: Scan, history: Array, time: float) -> Landmarks:
         """Return the landmarks in the level frame H at the time of the scan.
 
+        In a scan with rays that were fired before the history begins, nothing is seen: its times are wrong, such as
+        milliseconds for seconds.
+
         Args:
             scan: What was measured.
             history: The port ``history`` of the `DeadReckoning`.
             time: When the scan was complete, by the clock of the DPS, in s.
         """
+        if len(scan.times) and time + scan.times.min() < history[-POSE]:
+            return Landmarks.empty()
         points_H = deskewed(scan, history, self.X_BL, time=time)
         _, roll, pitch, *_ = carrier_pose_at(history, time)
         p_HoLo_H = body_rotation(roll, pitch) @ self.X_BL.translation()

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from click.testing import CliRunner
 from tornado.websocket import websocket_connect
 
@@ -19,7 +20,7 @@ from tests.visualization.meshcat_page import decoded
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.testbed import Interface
-from vtbdrake_diagrams.forest.display import main
+from vtbdrake_diagrams.forest.display import main, program
 
 SCENARIO = "tests.cli.test_forest:PatientScenario"
 SEED = 4
@@ -96,6 +97,13 @@ def test_display_shows_what_another_process_knows() -> None:
     nearest = np.linalg.norm(places["landmarks"][:, None] - trees, axis=2).min(axis=1)
     assert len(nearest) > 10
     assert np.quantile(nearest, 0.9) < 0.4
+
+
+def test_display_without_a_scenario_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for arguments in ([f"{SCENARIO}@none.yaml"], [SCENARIO, "--field", "length=-1"]):
+        monkeypatch.setattr(sys, "argv", ["display", *arguments, "--url", "tcpq://127.0.0.1:1"])
+        with pytest.raises(SystemExit, match=r"^Error: [^\n]+$"):
+            program()
 
 
 def test_display_without_a_loop_is_one_line() -> None:

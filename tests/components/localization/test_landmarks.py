@@ -92,6 +92,11 @@ def test_bad_landmarks_are_rejected():
         map_landmarks(Stand(density=10.0).trees(), "crater")
     with pytest.raises(ValueError, match="no rock"):
         map_landmarks(Stand(density=10.0).trees(), "rock")
+    with pytest.raises(ValueError, match="the map, <WorldModel: 1 Tree>, has no tree"):
+        map_landmarks(WorldModel([WorldObject("t", "Tree", position_estimate(np.zeros(3)))]))
+    nowhere = WorldObject("t7", "tree", position_estimate(np.zeros(3), deviation=np.inf), {"trunk_diameter": DIAMETER})
+    with pytest.raises(ValueError, match="the tree t7 has an infinite variance in the plane"):
+        map_landmarks(WorldModel([nowhere]))
     for diameter in (-0.3, 0.0, 31.0):
         tree = WorldObject("t", "tree", position_estimate(np.zeros(3)), {"trunk_diameter": Quantity(diameter, "m")})
         with pytest.raises(ValueError, match=f"of the tree t is {diameter:g} m, but must be .* at most 20 m: are its"):

@@ -103,6 +103,8 @@ def test_file_gives_the_same_model(tmp_path: Path) -> None:
     save_geojson(model(), path, frame=FRAME)
     assert_same(load_geojson(path), model())
     assert_same(load_geojson(path, frame=FRAME), model())
+    path.write_text(path.read_text("utf-8"), "utf-8-sig")  # with a byte order mark, as some programs write it
+    assert_same(load_geojson(path), model())
 
 
 def test_places_are_converted_all_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

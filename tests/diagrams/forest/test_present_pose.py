@@ -87,6 +87,11 @@ def test_landmarks_are_seen_in_the_level_frame() -> None:
     assert seen["settings"] == "settings"
     np.testing.assert_allclose(seen["points"], points_H, atol=1e-12)
     np.testing.assert_allclose(seen["origin"], (X_HB @ X_BL).translation(), atol=1e-12)
+    # Fired before the poses that are remembered: 20 ms, which were given as 20 s.
+    seen.clear()
+    late = Scan(scan.directions_L, scan.ranges, np.array([-20.0, 0.0]), time)
+    assert len(ScanLandmarks(detect, "settings", X_BL)(late, history, time)) == 0
+    assert not seen
 
 
 def test_nearest_landmarks_are_shown() -> None:

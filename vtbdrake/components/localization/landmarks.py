@@ -109,13 +109,17 @@ def map_landmarks(model: WorldModel, kind: str = "tree", *, deviation: float = 0
         raise ValueError(f"landmarks are of the class {' or '.join(DIAMETERS)}, not {kind!r}")
     objects = [one for one in model.find(kind) if one.is_known]
     if not objects:
-        raise ValueError(f"the map has no {kind} that is believed to be there: localization needs landmarks")
+        raise ValueError(f"the map, {model}, has no {kind} that is believed to be there: localization needs landmarks")
     diameters = [one.number(DIAMETERS[kind], unit="m") for one in objects]
     for one, diameter in zip(objects, diameters, strict=True):
         if not 0.0 < diameter <= _LARGEST_DIAMETER:
             raise ValueError(
                 f"{DIAMETERS[kind]} of the {kind} {one.identity} is {diameter:g} m, but must be positive and at most "
                 f"{_LARGEST_DIAMETER:g} m: are its units those that the map declares?"
+            )
+        if not np.isfinite(one.pose.covariance[3:5, 3:5]).all():
+            raise ValueError(
+                f"the {kind} {one.identity} has an infinite variance in the plane: leave out what has no known place"
             )
     deviations = [one.attributes[DIAMETERS[kind]].deviation for one in objects]
     return Landmarks(

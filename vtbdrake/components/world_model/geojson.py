@@ -128,7 +128,7 @@ def load_geojson(
         GeoJsonError: The file is not such a GeoJSON file.
     """
     try:
-        data = json.loads(Path(path).read_text("utf-8"), parse_constant=_reject, object_pairs_hook=_unique)
+        data = json.loads(Path(path).read_text("utf-8-sig"), parse_constant=_reject, object_pairs_hook=_unique)
         return _Reader(data, frame, units or {}, deviation).model()
     except (ValueError, RecursionError) as error:
         raise GeoJsonError(f"{path}: {error}") from error
