@@ -311,7 +311,7 @@ def test_a_study_can_be_read_while_it_runs(tmp_path):
 def test_a_study_shows_itself_in_one_line_and_as_html(tmp_path):
     study = pendulum_problem().study(tmp_path / "a.db", solver="sobol")
     assert repr(study) == f"Study({tmp_path / 'a.db'}: 0 rollouts, solver sobol)"
-    assert "no point has a quality" in study._repr_html_() and "<img" not in study._repr_html_()
+    assert "no rollout is finished yet" in study._repr_html_() and "<img" not in study._repr_html_()
     study.run(rollouts=4, executor="serial", progress=False)
     html = study._repr_html_()
     assert "4 points, 4 rollouts" in html and f"{study.best.value:g}" in html

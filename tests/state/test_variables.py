@@ -245,6 +245,14 @@ def test_a_declaration_beyond_the_group_is_refused():
         collect(builder.Build())
 
 
+def test_a_vector_that_is_declared_as_one_number_is_refused():
+    builder = DiagramBuilder()
+    system = builder.AddNamedSystem("filter", Filter())
+    system.variables = (parameter("gain", 0),)
+    with pytest.raises(ValueError, match=r"filter.gain is declared as one number, .* give shape=\(3,\)"):
+        collect(builder.Build())
+
+
 def test_camera_pose_is_written_to_the_camera():
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)

@@ -373,6 +373,8 @@ class Study:
             raise ValueError("several qualities have no single best point: use pareto()")
         found = [trial for trial in self.trials if trial.counts]
         if not found:
+            if not len(self):
+                raise ValueError("no rollout is finished yet: call run()")
             kept = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
             raise ValueError(f"no point has a quality{kept}{self._failures()}")
         (sign,) = self.signs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -93,9 +94,11 @@ def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | N
     """
     if is_camera(system):
         yield from _camera_pose(path, system)
-    for element in _elements(system) if declared is None else declared:
+    elements = list(_elements(system) if declared is None else declared)
+    names = Counter((element.group, element.index) for element in elements)
+    for element in elements:
         address = f"{path}.{element.name}" if element.name else path
-        yield _numeric(address, system, element)
+        yield _numeric(address, system, element, alone=names[element.group, element.index] == 1)
 
 
 def _elements(system: System) -> Iterator[Element]:
@@ -144,13 +147,18 @@ def write_group(context: Context, group: str, index: int, value: np.ndarray) -> 
         context.get_mutable_numeric_parameter(index).SetFromVector(value)
 
 
-def _numeric(address: str, system: System, element: Element) -> Variable:
+def _numeric(address: str, system: System, element: Element, *, alone: bool) -> Variable:
     size = int(np.prod(element.shape, dtype=int))
     available = group_size(system.CreateDefaultContext(), element.group, element.index)
     if element.start + size > available:
         raise ValueError(
             f"{address} is declared as entries {element.start} to {element.start + size - 1} of {element.group} "
             f"group {element.index} of {system.get_name()}, which has {available} entries"
+        )
+    if alone and element.shape == () and element.start == 0 and available > 1:
+        raise ValueError(
+            f"{address} is declared as one number, but {element.group} group {element.index} of {system.get_name()} "
+            f"has {available} entries, and no other name: give shape=({available},), or name the others, too"
         )
     entries = slice(element.start, element.start + size)
     whole = size == available
