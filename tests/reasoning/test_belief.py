@@ -281,6 +281,7 @@ def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
 @pytest.mark.parametrize(
     ("uncertainty", "why"),
     [
+        (0.1, "uncertainty is given by address"),
         ({"dps.rate": 0.1}, "unlike dps.rate"),
         ({THETA: -1.0}, "is a standard deviation"),
         ({THETA: [0.1, 0.2]}, "of shape"),
@@ -325,6 +326,10 @@ def test_an_old_belief_is_refused(tracked):
         starter.start(belief, now=0.75)
     with pytest.raises(BeliefError, match="nan s old"):
         starter.start(belief, now=float("nan"))
+    with pytest.raises(BeliefError, match="of t = 0.63 s, which lies after now = 0.5 s"):
+        starter.start(belief, now=0.5)
+    with pytest.raises(BeliefError, match=r"older than max_age = 0.1 s depends on now: give now="):
+        starter.start(belief)
 
 
 def test_a_world_without_rules_is_refused():

@@ -591,6 +591,7 @@ def test_a_senseless_budget_is_refused(arguments, message):
     ("changes", "message"),
     [
         ({"budget": 70}, "a budget is Budget.*not 70"),
+        ({"scenario": "MassScenario"}, "the scenario of the running testbed, .*not 'MassScenario'"),
         ({"samples": 0}, "at least one sample, not 0"),
         ({"samples": 8, "budget": Budget(rollouts=7)}, "7 rollouts does not suffice for one candidate, which takes 8"),
         ({"uncertainty": {"sim.sys.mass.discrete_state_0": 0.1}}, "samples=1 with .*one is a world by chance"),
@@ -629,6 +630,23 @@ def test_a_mental_scenario_with_other_commands_is_refused():
     Strange.mental = lambda self: Stranger()
     with pytest.raises(ValueError, match=r"Stranger has other commands than Strange \(switch\)"):
         make(Strange())
+
+
+def test_a_mental_scenario_that_is_none_is_refused():
+    class Thoughtless(MassScenario):
+        def mental(self):
+            return None
+
+    with pytest.raises(ValueError, match=r"Thoughtless.mental\(\) returns a Scenario, not None"):
+        make(Thoughtless())
+
+
+def test_a_fresh_belief_is_not_too_old(mass):
+    with make(max_age=0.1, budget=Budget(rollouts=1)) as reasoner:
+        context = mass.default_context()
+        assert reasoner.decide(mass, context)
+        with pytest.raises(ValueError, match="give now="):
+            reasoner.decide(Belief.of(mass, context))
 
 
 def test_a_plan_that_cannot_be_decided_is_refused(mass):

@@ -22,6 +22,9 @@ from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.testbed.testbed import BeliefRule
 
+# Two ways to compute a time may differ by so much, in s.
+_ROUNDING = 1e-6
+
 # An estimate may lie beyond the bounds of its variable by this share of their distance: a joint a little past its stop.
 _BEYOND = 0.05
 
@@ -139,6 +142,10 @@ class Starter:
     ) -> None:
         if not max_age > 0.0:
             raise ValueError(f"the largest age of a belief is a positive time, not {max_age} s")
+        if not isinstance(uncertainty, Mapping | None):
+            raise BeliefError(
+                f"uncertainty is given by address, {{address: standard deviation}}, not as {uncertainty!r}"
+            )
         self._mental = mental
         self._max_age = max_age
         self._seed = seed
@@ -237,6 +244,12 @@ class Starter:
         if not isinstance(belief, Belief):
             raise BeliefError(f"a rollout begins from a Belief, from Belief.of(testbed, context), say, not {belief!r}")
         age = now - belief.dps.time
+        if age == -inf and self._max_age < inf:
+            raise BeliefError(
+                f"whether the belief is older than max_age = {self._max_age:g} s depends on now: give now="
+            )
+        if -inf < age < -_ROUNDING:
+            raise BeliefError(f"the belief is of t = {belief.dps.time:g} s, which lies after now = {now:g} s")
         if not age <= self._max_age:
             raise BeliefError(
                 f"the belief is of t = {belief.dps.time:g} s and {age:g} s old, but at most {self._max_age:g} s are "

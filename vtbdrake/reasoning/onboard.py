@@ -228,7 +228,7 @@ class _Thinker:
                 self._make(**{**self._arguments, "executor": "serial", "workers": None})
             assert self._reasoner is not None
             try:
-                decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget)
+                decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget, now=dps.time)
                 reason = "" if decision else decision.message
             except BeliefError as error:
                 reason = str(error)

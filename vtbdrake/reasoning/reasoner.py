@@ -130,8 +130,7 @@ class Reasoner:
             )
         self.budget = budget
         self.space = DecisionSpace(decision)
-        mental = scenario.mental()
-        _check_commands(scenario, mental)
+        mental = _mental(scenario)
         self.problem = Problem(
             scenario=mental,
             parameters=self.space.parameters,
@@ -224,7 +223,7 @@ class Reasoner:
             context: of the running testbed or DPS; it stays as it is.
             plan: address -> value of a plan from which the method starts, tried beside the one in use.
             budget: of this decision; None: that of the reasoner.
-            now: the present time of the DPS in seconds, from which the age of a belief follows.
+            now: the present time of the DPS in seconds, from which the age of a belief follows (``max_age``).
 
         Raises:
             ReasonerError: a decision is under way (in another thread), or the reasoner is closed.
@@ -253,7 +252,7 @@ class Reasoner:
         if isinstance(believer, AddressedDiagram):
             if context is None:
                 raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")
-            believer = Belief.of(believer, context)
+            believer, now = Belief.of(believer, context), max(now, context.get_time())
         return self.starter.starts(believer, samples=self.samples, now=now)
 
     def motion(self, decision: Decision, candidate: int) -> Motion:
@@ -329,12 +328,19 @@ def _make_executor(
     )
 
 
-def _check_commands(scenario: Scenario, mental: Scenario) -> None:
-    """Check that a mental scenario has the commands of its scenario.
+def _mental(scenario: Scenario) -> Scenario:
+    """Return the mental scenario of a scenario.
 
     Raises:
-        ValueError: one is missing, added or of another size.
+        ValueError: there is none, or it lacks a command, has another one, or one of another size.
     """
+    if not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"a reasoner is for the scenario of the running testbed, testbed.scenario say, not {scenario!r}"
+        )
+    mental = scenario.mental()
+    if not isinstance(mental, Scenario):
+        raise ValueError(f"{type(scenario).__name__}.mental() returns a Scenario, not {mental!r}")
     here, there = ({c.name: c.size for c in s.interface().commands} for s in (scenario, mental))
     differing = sorted(name for name in here.keys() | there.keys() if here.get(name) != there.get(name))
     if differing:
@@ -342,3 +348,4 @@ def _check_commands(scenario: Scenario, mental: Scenario) -> None:
             f"the mental scenario {type(mental).__name__} has other commands than {type(scenario).__name__} "
             f"({', '.join(differing)}), so that a decision would not fit: give both the same interface"
         )
+    return mental

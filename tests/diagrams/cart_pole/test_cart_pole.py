@@ -128,23 +128,6 @@ def test_the_belief_is_the_state_of_the_sample_before() -> None:
     assert {belief.age for belief in builder.belief_rules} == {scenario.period}
 
 
-@pytest.mark.parametrize("instant", [0.5, 0.513])
-def test_a_mental_copy_begins_at_the_present(instant: float) -> None:
-    scenario = CartPoleScenario()
-    testbed = scenario.build()
-    context = testbed.default_context()
-    knots = np.random.default_rng(0).uniform(-60.0, 60.0, size=scenario.knots)
-    testbed.write(context, {"u.plan": [0.0, *knots]})
-    testbed.simulator(context).AdvanceTo(instant)
-    names = [f"{joint}.{part}" for part in ("position", "velocity") for joint in (CART, POLE)]
-    truth = np.array([testbed.read(context, name) for name in names])
-    late = np.abs(testbed.read(context, PERCEIVED) - truth)
-    testbed.start_from_belief(context)
-    error = np.abs([testbed.read(context, name) for name in names] - truth)
-    # It knows one force: that of the last sample.
-    assert (error < 0.1 * late).all()
-
-
 def test_the_mental_copy_has_the_same_dps_and_a_coarser_world() -> None:
     scenario = CartPoleScenario(position_errors=ErrorModel(noise=1e-3, bias=0.1, latency=1))
     mental = scenario.mental()

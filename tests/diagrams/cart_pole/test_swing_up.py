@@ -84,12 +84,13 @@ def test_over_lcm_the_dps_decides_for_a_machine_process(tmp_path: Path) -> None:
     assert vtb.replay(tmp_path / "swing.lcm").identical
 
 
-def test_a_mental_copy_begins_at_the_present_not_at_the_last_measurement() -> None:
+@pytest.mark.parametrize("instant", [0.5, 0.513])
+def test_a_mental_copy_begins_at_the_present_not_at_the_last_measurement(instant: float) -> None:
     scenario = CartPoleScenario()
     testbed, mental = scenario.build(), scenario.mental().build()
     context = testbed.default_context()
     testbed.write(context, {"sim.sys.cart_pole.pole_pin.position": 2.0, "u.plan": [0.0, *[20.0] * scenario.knots]})
-    testbed.simulator(context).AdvanceTo(0.5)
+    testbed.simulator(context).AdvanceTo(instant)
     beginning = Beginning(mental, mental.default_context(), mental.copier_from(mental))
     beginning.set(Belief.of(testbed, context).start(mental))
     true, believed = testbed.reader("plant.state")(context), mental.reader("plant.state")(beginning.context)
