@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 import numpy as np
@@ -74,12 +74,14 @@ class Drive:
         truth: The true poses X_WH, shape (n, 3).
         reckoned: Those of the odometry, X_OH, shape (n, 3).
         landmarks: What was detected in each scan, in H; n of them.
+        tilts: Errors of roll and pitch by the dead reckoning in rad, shape (n, 2); none if the drive is simulated.
     """
 
     times: Array
     truth: Array
     reckoned: Array
     landmarks: tuple[Landmarks, ...]
+    tilts: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def travelled(self) -> Array:
@@ -204,7 +206,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     testbed.write(context, {_SPEED: 0.0})
     period = scenario.eye_period
     limit = STANDING + 2.0 * length / scenario.speed + 10.0
-    rows: list[tuple[float, Array, Array]] = []
+    rows: list[tuple[float, Array, Array, Array]] = []
     landmarks: list[Landmarks] = []
     travelled = 0.0
     while travelled < length:
@@ -215,17 +217,18 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         simulator.AdvanceTo(due - 1e-9)
         if due > STANDING:
             testbed.write(context, {_SPEED: scenario.speed})
-        truth = pose(context)[[0, 1, 5]]
+        x, y, _, roll, pitch, yaw = pose(context)
         # By then the sample has arrived, and its time lies within the history.
         simulator.AdvanceTo(due + 2.0 * PERIOD)
         taken, past = float(time(context)), history(context)
-        rows.append((taken, truth, carrier_pose_at(past, taken)[3:]))
+        _, *tilt, x_O, y_O, heading = carrier_pose_at(past, taken)
+        rows.append((taken, np.array([x, y, yaw]), np.array([x_O, y_O, heading]), tilt - np.array([roll, pitch])))
         seen = [sample(context) for sample in samples]
         landmarks.append(detect(*seen, past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:
-            travelled += float(np.hypot(*(truth - rows[-2][1])[:2]))
-    times, truths, reckoned = (np.array(column) for column in zip(*rows, strict=True))
-    return Drive(times, truths, reckoned, tuple(landmarks))
+            travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
+    times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
+    return Drive(times, truths, reckoned, tuple(landmarks), tilts)
 
 
 @dataclass(frozen=True)
@@ -480,6 +483,10 @@ def main() -> None:
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
     print(f"{len(found)} forests, {path:.0f} m of path, range bias {chosen.bias:g} m")
+    tilts = np.concatenate([one["poor"].drive.tilts for one in found])
+    if len(tilts):
+        roll, pitch = (1e3 * _rms(errors) for errors in tilts.T)
+        print(f"the vertical is off by {roll:.1f} mrad in roll and {pitch:.1f} mrad in pitch (RMS)")
     least = least_error_along({seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}, MAPS["poor"])
     print(f"least error of an unbiased estimate on a poor map, by all trees within {REACH:g} m: {least:.2f} m")
 

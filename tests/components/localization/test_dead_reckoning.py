@@ -26,9 +26,12 @@ G = np.array([0.0, 0.0, -9.81])
 
 
 class Drive:
-    """A carrier that moves along x_B over bumps, at rest for the first seconds; what its sensors measure is exact."""
+    """A carrier that drives over bumps, at rest for the first seconds; what its sensors measure is exact.
 
-    def __init__(self, still=1.0, seconds=12.0, fine=20):
+    Only the point at x_B = axle does not move sideways.
+    """
+
+    def __init__(self, still=1.0, seconds=12.0, fine=20, axle=0.0):
         times = np.arange(0.0, seconds + T, T / fine)
         moving = np.maximum(times - still, 0.0)
         self.speed = 1.2 * np.minimum(moving / 2.0, 1.0)
@@ -36,8 +39,12 @@ class Drive:
             [0.08 * np.sin(1.7 * moving), 0.1 * np.sin(1.1 * moving), 0.5 * moving**2 / (1.0 + moving)]
         ).T
         self.R_OB = [RotationMatrix(RollPitchYaw(*angles)) for angles in self.angles]
-        forward = np.array([R.matrix()[:, 0] for R in self.R_OB])
-        self.v_O = self.speed[:, None] * forward
+        # The third component of w in B.
+        _, pitch_rate, yaw_rate = np.gradient(self.angles, T / fine, axis=0).T
+        roll, pitch = self.angles[:, :2].T
+        w_z = yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll)
+        v_B = np.array([self.speed, -axle * w_z, 0.0 * w_z]).T
+        self.v_O = np.array([R.matrix() @ v for R, v in zip(self.R_OB, v_B, strict=True)])
         steps = (self.v_O[1:] + self.v_O[:-1]) / 2.0 * (T / fine)
         self.p_O = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
         self.times, self.fine = times, fine
@@ -97,6 +104,13 @@ def test_follows_a_drive_over_bumps():
     assert heading == pytest.approx(drive.angles[548 * 20, 2], abs=3e-4)
     np.testing.assert_allclose([x, y], truth.translation()[:2], atol=2e-3)
     assert speed == pytest.approx(drive.speed[548 * 20])
+
+
+def test_bumps_beside_a_distant_axle_are_no_tilt():
+    """Pitch on a slope aside turns B about z_B, but not the heading: A swings as z_B tells."""
+    drive = Drive(axle=-0.8)
+    _, roll, pitch, *_ = motion_of(drive.samples()[:550], axle=-0.8)
+    np.testing.assert_allclose([roll, pitch], drive.angles[548 * 20, :2], atol=5e-4)
 
 
 def test_body_ahead_of_its_axle_swings_out_in_bends():
@@ -167,6 +181,25 @@ def test_noisy_wheels_and_rocking_at_rest_are_no_bias(seed):
     samples[:, 6] += 0.02 * rng.normal(size=150)
     # Of about 120 samples; a single one of a carrier that rocks would be off by 8e-3.
     np.testing.assert_allclose(value(samples, "gyro_bias"), bias, atol=1e-3)
+
+
+def test_bias_across_the_vertical_is_learned_on_the_way():
+    drive, bias = Drive(still=0.0), np.array([0.004, -0.003, 0.0])
+    samples = drive.samples()
+    samples[:, :3] += bias
+    np.testing.assert_allclose(value(samples[:550], "gyro_bias")[:2], bias[:2], atol=3e-4)
+    _, roll, pitch, *_ = motion_of(samples[:550])
+    # Without that, gyros that are off by 3 mrad/s for some five seconds tilt the vertical by 15 mrad.
+    np.testing.assert_allclose([roll, pitch], drive.angles[548 * 20, :2], atol=2e-3)
+
+
+def test_settling_on_the_springs_is_no_bias():
+    """A roll of 20 mrad fades at 6 mrad/s while the carrier stands still."""
+    times = T * np.arange(100)
+    angles = 0.02 * np.exp(-times / 2.0)
+    samples = np.array([[0.0, 0.0, 0.0, *(RotationMatrix.MakeXRotation(-a).matrix() @ -G), 0.0] for a in angles])
+    samples[1:, 0] = np.diff(angles) / T
+    assert np.abs(value(samples, "gyro_bias")).max() < 1e-3
 
 
 def test_samples_that_cannot_be_are_left_out():

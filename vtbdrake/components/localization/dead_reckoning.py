@@ -34,6 +34,8 @@ HISTORY_LENGTH = 1.0
 _SETTLING_TIME = 0.5
 # No carrier turns, accelerates or drives as fast, in rad/s, m/s^2 and m/s: such a number is a fault.
 _LARGEST = 1e3
+# Nothing is divided by less.
+_TINY = 1e-30
 # The standard deviation of the gyros' bias at the start, in rad/s.
 _BIAS_DEVIATION = 0.005
 
@@ -119,24 +121,28 @@ class DeadReckoning(LeafSystem):
     `HISTORY_LENGTH`, newest first, each laid out as `POSE` says; before the start, the carrier stood still. x, y and
     heading are those of H in O; the heading is continuous, not wrapped.
 
-    *Levelling.* The vertical u in B is turned by the gyros, and led with the time constant ``levelling_time`` to what
-    the accelerometers show without the acceleration of Bo, which has the velocity V = [v, -axle w_z, 0] in B:
+    *Levelling.* The reaction g to gravity, which points up in B, is turned by the gyros, and led to what the
+    accelerometers show without the acceleration of Bo, which has the velocity V = [v, -axle w_z, 0] in B:
 
-        u <- exp(-[w T]x) u,   u <- u + k (a / |a| - u),   a = f - dV/dt - w x V,
+        g <- exp(-[w T]x) g,   g <- g + k (a - g),   b <- b + l g x a / g^2,   a = f - dV/dt - w x V,
 
-    where w are the rates without the gyros' bias. k is T / levelling_time, at the start that of a mean: 1, 1/2, 1/3,
-    ... Only the direction of a counts, so that gravity need not be known.
+    where w are the rates without the gyros' bias b, and V = 0 while the carrier stands still. Only the direction
+    u = g / |g| is used, so that gravity need not be known. k and l are the gains of a Kalman filter for the errors of
+    u and of b across it, alike in all directions: gyros have the noise ``gyro_noise`` per sample, and b is a random
+    walk with the deviation ``bias_drift``. What the wheels do not tell of the acceleration, as when the carrier sways
+    or slips, is taken as noise with the deviation ``sway`` per sample. In the end, the time constant T / k is about
+    sway / (|g| gyro_noise).
 
     *Path.* A moves along x_B, and Bo stays ahead of it:
 
         heading <- heading + T (w_y u_y + w_z u_z) / (u_y^2 + u_z^2),
         p_A <- p_A + T v cos(pitch) [cos(heading), sin(heading)], halfway,   [x, y] = p_A - axle [cos(heading), ...].
 
-    *Bias of the gyros.* While the carrier stands still, what the gyros measure is their bias. A Kalman filter estimates
-    it: a random walk with the deviation ``bias_drift``, measured with ``gyro_noise``, in which rocking on the springs
-    is included. The carrier stands still when for half a second the rates have stayed below ``still_rate``, the mean
-    speed, with a time constant of half a second, below ``still_speed``, and no speed was above four times that: wheel
-    sensors are noisy at rest, too.
+    *Bias about the vertical.* Of this, accelerometers tell nothing. But while the carrier stands still, what the gyros
+    measure about the vertical is their bias: another Kalman filter, with the same noise. (About other axes, it is the
+    rocking on the springs, too.) The carrier stands still when for half a second the rates have stayed below
+    ``still_rate``, the mean speed, with a time constant of half a second, below ``still_speed``, and no speed was above
+    four times that: wheel sensors are noisy at rest, too.
 
     A sample with a number that is not finite, or with one of 1,000 or more, is left out and counted in ``ignored``:
     speed and turn rate go on.
@@ -163,32 +169,43 @@ class DeadReckoning(LeafSystem):
         length = history_size(period) // POSE
         past = np.zeros((length, POSE))
         past[:, 0] = -period * np.arange(1, length + 1)
-        motion = self.DeclareDiscreteState(np.array([-period, *[0.0] * (MOTION - 1)]))
-        history = self.DeclareDiscreteState(past.ravel())
-        # [up, samples, bias, its variance, samples at rest, ignored, mean speed]
-        inner = self.DeclareDiscreteState([0.0, 0.0, 1.0, *[0.0] * 4, _BIAS_DEVIATION**2, *[0.0] * 3])
-        self.DeclareStateOutputPort("motion", motion)
-        self.DeclareStateOutputPort("history", history)
-        self._motion, self._history, self._inner = int(motion), int(history), int(inner)
-        settings = self.DeclareNumericParameter(BasicVector([3.0, 0.03, 0.02, 1e-4, 5e-3, axle]))
+        variance = _BIAS_DEVIATION**2
+        starts = {
+            "motion": np.array([-period, *[0.0] * (MOTION - 1)]),
+            "history": past.ravel(),
+            # Gravity, velocity, and the gyros' bias.
+            "levelling": np.zeros(8),
+            # Of the vertical, with the bias across it, of that, and of the bias about it.
+            "variances": np.array([1.0, 0.0, variance, variance]),
+            # Samples, those at rest, those ignored, and the mean speed.
+            "counts": np.zeros(4),
+        }
+        groups = {name: self.DeclareDiscreteState(value) for name, value in starts.items()}
+        for port in ("motion", "history"):
+            self.DeclareStateOutputPort(port, groups[port])
+        self._groups = tuple(int(index) for index in groups.values())
+        motion, history, levelling, variances, counts = self._groups
+        settings = self.DeclareNumericParameter(BasicVector([0.1, 0.03, 0.02, 3e-5, 2e-3, axle]))
         bounds = (0.0, inf)
         self.variables = (
-            discrete_state("time", self._motion, unit="s"),
-            discrete_state("roll", self._motion, start=1, unit="rad"),
-            discrete_state("pitch", self._motion, start=2, unit="rad"),
-            discrete_state("position", self._motion, start=3, shape=(2,), unit="m"),
-            discrete_state("heading", self._motion, start=5, unit="rad"),
-            discrete_state("speed", self._motion, start=6, unit="m/s"),
-            discrete_state("turn_rate", self._motion, start=7, unit="rad/s"),
-            discrete_state("history", self._history, shape=(length, POSE), unit="s, rad, m"),
-            discrete_state("up", self._inner, shape=(3,)),
-            discrete_state("samples", self._inner, start=3, bounds=bounds),
-            discrete_state("gyro_bias", self._inner, start=4, shape=(3,), unit="rad/s"),
-            discrete_state("gyro_bias_variance", self._inner, start=7, unit="rad^2/s^2", bounds=bounds),
-            discrete_state("samples_at_rest", self._inner, start=8, bounds=bounds),
-            discrete_state("ignored", self._inner, start=9, bounds=bounds),
-            discrete_state("mean_speed", self._inner, start=10, unit="m/s"),
-            parameter("levelling_time", settings, unit="s", bounds=bounds),
+            discrete_state("time", motion, unit="s"),
+            discrete_state("roll", motion, start=1, unit="rad"),
+            discrete_state("pitch", motion, start=2, unit="rad"),
+            discrete_state("position", motion, start=3, shape=(2,), unit="m"),
+            discrete_state("heading", motion, start=5, unit="rad"),
+            discrete_state("speed", motion, start=6, unit="m/s"),
+            discrete_state("turn_rate", motion, start=7, unit="rad/s"),
+            discrete_state("history", history, shape=(length, POSE), unit="s, rad, m"),
+            discrete_state("gravity", levelling, shape=(3,), unit="m/s^2"),
+            discrete_state("velocity", levelling, start=3, shape=(2,), unit="m/s"),
+            discrete_state("gyro_bias", levelling, start=5, shape=(3,), unit="rad/s"),
+            discrete_state("levelling_covariance", variances, shape=(3,), unit="rad^2, rad^2/s, rad^2/s^2"),
+            discrete_state("vertical_bias_variance", variances, start=3, unit="rad^2/s^2", bounds=bounds),
+            discrete_state("samples", counts, bounds=bounds),
+            discrete_state("samples_at_rest", counts, start=1, bounds=bounds),
+            discrete_state("ignored", counts, start=2, bounds=bounds),
+            discrete_state("mean_speed", counts, start=3, unit="m/s"),
+            parameter("sway", settings, unit="m/s^2", bounds=bounds),
             parameter("still_speed", settings, start=1, unit="m/s", bounds=bounds),
             parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
             parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=bounds),
@@ -198,8 +215,9 @@ class DeadReckoning(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        _, roll, pitch, x, y, heading, v_before, turn_rate = context.get_discrete_state(self._motion).value().tolist()
-        inner = context.get_discrete_state(self._inner).value().tolist()
+        motion, past, *inner = (context.get_discrete_state(group).value() for group in self._groups)
+        levelling, variances, counts = (values.tolist() for values in inner)
+        _, roll, pitch, x, y, heading, v_before, turn_rate = motion.tolist()
         sample = [*self._imu.Eval(context).tolist(), *self._odometry.Eval(context).tolist()]
         axle = float(context.get_numeric_parameter(0).value()[5])
         T, now = self._period, context.get_time() - self._period
@@ -207,79 +225,85 @@ class DeadReckoning(LeafSystem):
         begun = now > -T / 2.0
         v = v_before
         if not all(abs(number) < _LARGEST for number in sample):
-            inner[9] += 1.0
+            counts[2] += 1.0
         elif begun:
             v = sample[6]
-            bias, inner[7], inner[8] = self._gyro_bias(context, sample, inner)
-            w = [rate - offset for rate, offset in zip(sample[:3], bias, strict=True)]
-            velocity = (v, -axle * w[2])
-            if not inner[3]:  # How fast the carrier was before the first sample is not known.
-                v_before, turn_rate = v, w[2]
-            before = (v_before, -axle * turn_rate)
-            up = self._levelled(context, inner, w, sample[3:6], before=before, after=velocity)
+            if not counts[0]:  # How fast the carrier was before the first sample is not known.
+                v_before = v
+            counts = self._counted(context, sample, counts)
+            up, w, levelling, variances = self._levelled(context, sample, levelling, variances, counts)
             across = up[1] ** 2 + up[2] ** 2
             turn_rate = (w[1] * up[1] + w[2] * up[2]) / max(across, 1e-9)
             roll, pitch = atan2(up[1], up[2]), atan2(-up[0], sqrt(across))
-            inner[:3], inner[3], inner[4:7] = up, inner[3] + 1.0, bias
         if begun:
             way, halfway, turned = T * (v_before + v) / 2.0 * cos(pitch), T * turn_rate / 2.0, T * turn_rate
             x += way * cos(heading + halfway) - axle * (cos(heading + turned) - cos(heading))
             y += way * sin(heading + halfway) - axle * (sin(heading + turned) - sin(heading))
             heading += turned
-        motion = [now, roll, pitch, x, y, heading, v, turn_rate]
-        state.set_value(self._motion, motion)
-        state.set_value(self._inner, inner)
-        past = context.get_discrete_state(self._history).value()
-        state.set_value(self._history, np.concatenate((motion[:POSE], past[:-POSE])))
+        pose = [now, roll, pitch, x, y, heading]
+        values = ([*pose, v, turn_rate], np.concatenate((pose, past[:-POSE])), levelling, variances, counts)
+        for group, value in zip(self._groups, values, strict=True):
+            state.set_value(group, value)
 
-    def _gyro_bias(self, context: Context, sample: list[float], inner: list[float]) -> tuple[list[float], float, float]:
-        """Return the gyros' bias (rad/s), its variance, and the number of samples at rest; the mean speed goes on."""
-        _, still_speed, still_rate, drift, noise, _ = context.get_numeric_parameter(0).value().tolist()
-        bias, variance = inner[4:7], inner[7] + drift**2 * self._period
-        speed, rates = sample[6], sample[:3]
-        inner[10] += max(self._period / _SETTLING_TIME, 1.0 / (inner[3] + 1.0)) * (speed - inner[10])
-        moves = abs(inner[10]) > still_speed or abs(speed) > 4.0 * still_speed
-        if moves or any(abs(rate) > still_rate for rate in rates):
-            return bias, variance, 0.0
-        at_rest = inner[8] + 1.0
-        if at_rest * self._period > _SETTLING_TIME:
-            gain = variance / (variance + max(noise, 1e-9) ** 2)
-            bias = [b + gain * (rate - b) for b, rate in zip(bias, rates, strict=True)]
-            variance *= 1.0 - gain
-        return bias, variance, at_rest
+    def _counted(self, context: Context, sample: list[float], counts: list[float]) -> list[float]:
+        """Return the samples, those at rest, those ignored, and the mean speed (m/s)."""
+        _, still_speed, still_rate, *_ = context.get_numeric_parameter(0).value().tolist()
+        samples, at_rest, ignored, mean = counts
+        rates, speed = sample[:3], sample[6]
+        mean += max(self._period / _SETTLING_TIME, 1.0 / (samples + 1.0)) * (speed - mean)
+        moves = abs(mean) > still_speed or abs(speed) > 4.0 * still_speed
+        moves = moves or any(abs(rate) > still_rate for rate in rates)
+        return [samples + 1.0, 0.0 if moves else at_rest + 1.0, ignored, mean]
 
     def _levelled(
-        self,
-        context: Context,
-        inner: list[float],
-        w: list[float],
-        f: list[float],
-        *,
-        before: tuple[float, float],
-        after: tuple[float, float],
-    ) -> list[float]:
-        """Return the vertical in B after a sample, (3,).
+        self, context: Context, sample: list[float], levelling: list[float], variances: list[float], counts: list[float]
+    ) -> tuple[list[float], list[float], list[float], list[float]]:
+        """Return the vertical in B, (3,), the angular velocity without bias (rad/s), (3,), and both states after it.
 
         Args:
             context: For the parameters.
-            inner: The state before.
-            w: Angular velocity without bias, in rad/s.
-            f: Specific force in m/s^2.
-            before: Velocity of Bo along x_B and y_B at the sample before, in m/s.
-            after: That at this sample.
+            sample: Angular velocity (rad/s), specific force (m/s^2) and speed (m/s), (7,).
+            levelling: Gravity (m/s^2), velocity (m/s) and bias (rad/s) before, (8,).
+            variances: Those before, (4,).
+            counts: Those of `_counted`, with this sample, (4,).
         """
-        T, u = self._period, _turned_back(inner[:3], w, self._period)
-        change = [(new - old) / T for old, new in zip(before, after, strict=True)]
-        inward = _cross(w, [(old + new) / 2.0 for old, new in zip(before, after, strict=True)] + [0.0])
-        a = [f[0] - change[0] - inward[0], f[1] - change[1] - inward[1], f[2] - inward[2]]
+        sway, _, _, bias_drift, gyro_noise, axle = context.get_numeric_parameter(0).value().tolist()
+        T, gravity, before, bias = self._period, levelling[:3], levelling[3:5], levelling[5:]
+        tilt, both, level, vertical = variances
+        vertical += bias_drift**2 * T
+        is_first, at_rest = counts[0] == 1.0, counts[1] * T > _SETTLING_TIME
+        if at_rest:
+            up = _direction(gravity)
+            gain = vertical / max(vertical + gyro_noise**2, _TINY)
+            excess = gain * sum((rate - b) * e for rate, b, e in zip(sample, bias, up, strict=False))
+            bias = [b + excess * e for b, e in zip(bias, up, strict=True)]
+            vertical *= 1.0 - gain
+        w = [rate - b for rate, b in zip(sample, bias, strict=False)]
+        velocity = [0.0, 0.0] if counts[1] else [sample[6], -axle * w[2]]
+        if is_first:
+            before = velocity
+        change = [(new - old) / T for old, new in zip(before, velocity, strict=True)]
+        inward = _cross(w, [(old + new) / 2.0 for old, new in zip(before, velocity, strict=True)] + [0.0])
+        a = [sample[3] - change[0] - inward[0], sample[4] - change[1] - inward[1], sample[5] - inward[2]]
         # The specific force is that of B halfway.
         a = _turned_back(a, w, T / 2.0)
-        size = sqrt(sum(e * e for e in a))
-        if size > 0.0:
-            gain = max(1.0 / (inner[3] + 1.0), T / max(float(context.get_numeric_parameter(0).value()[0]), T))
-            u = [e + gain * (b / size - e) for e, b in zip(u, a, strict=True)]
-        length = sqrt(sum(e * e for e in u))
-        return [e / length for e in u] if length > 0.0 else inner[:3]
+        gravity = a if is_first else _turned_back(gravity, w, T)
+        square = max(sum(e * e for e in gravity), _TINY)
+        tilt += T * (2.0 * both + T * level) + (gyro_noise * T) ** 2
+        both += T * level
+        level += bias_drift**2 * T
+        spread = max(tilt + sway**2 / square, _TINY)
+        gain, learned = tilt / spread, both / spread
+        bias = [b + learned * e / square for b, e in zip(bias, _cross(gravity, a), strict=True)]
+        gravity = [e + gain * (b - e) for e, b in zip(gravity, a, strict=True)]
+        variances = [(1.0 - gain) * tilt, (1.0 - gain) * both, level - learned * both, vertical]
+        return _direction(gravity), w, [*gravity, *velocity, *bias], variances
+
+
+def _direction(u: list[float]) -> list[float]:
+    """Return the direction of a vector in B, (3,); that of z_B if it has none."""
+    length = sqrt(sum(e * e for e in u))
+    return [e / length for e in u] if length > _TINY else [0.0, 0.0, 1.0]
 
 
 def _turned_back(u: list[float], w: list[float], duration: float) -> list[float]:
