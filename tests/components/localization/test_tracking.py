@@ -6,8 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from tests.components.localization.drives import PERIOD, Drive, drive, error, nees
-from vtbdrake.components.localization.dead_reckoning import DriftModel
+from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.tracking import Tracker, TrackState
@@ -25,7 +24,7 @@ def tracked(one: Drive, **settings):
     first = one.poses[0] + np.random.default_rng(len(one.map)).multivariate_normal(np.zeros(3), START)
     states = [tracker.start(first, START, one.scans[0])[0]]
     for k in range(1, len(one.scans)):
-        states.append(tracker.update(tracker.predict(states[-1], *one.motion(k)), one.scans[k])[0])
+        states.append(tracker.update(tracker.predict(states[-1], *one.motion(k), duration=PERIOD), one.scans[k])[0])
     return tracker, states
 
 
@@ -133,7 +132,7 @@ def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
     density, others = 1.0 / (2.0 * np.pi * 2.0 * variance), 2.0 * 2.0 / (view / 2.0 * 2.0**2)
     p = density / (density + others)
     assert 0.8 < p < 0.9
-    np.testing.assert_allclose(state.covariance[4:, 4:], np.eye(4) / (p**2 / variance + 1.0 / variance), atol=1e-6)
+    np.testing.assert_allclose(state.covariance[6:, 6:], np.eye(4) / (p**2 / variance + 1.0 / variance), atol=1e-6)
 
 
 @pytest.mark.parametrize(("deviations", "is_lost"), [(0.5, False), (2.2, True)])
@@ -150,12 +149,13 @@ def test_first_matches_that_fit_badly_are_a_loss(deviations, is_lost):
 
 
 def test_an_uncertain_position_is_a_loss():
-    tracker = Tracker(drive(0, ACCURATE).map, largest_deviation=0.5)
+    tracker = Tracker(drive(0, ACCURATE).map, largest_deviation=0.5, odometry_deviation=0.0)
     state, _ = tracker.start(np.zeros(3), np.diag([0.1, 0.1, 0.0]) ** 2)
     for way, is_lost in ((100.0, False), (300.0, True)):
         motion = np.array([way, 0.0, 0.0])
         # Along the way, its deviation is 0.03 m times the root of the metres.
-        assert tracker.is_lost(tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]))) == is_lost
+        after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), duration=0.0)
+        assert tracker.is_lost(after) == is_lost
 
 
 def test_fusing_the_map_in_each_scan_is_inconsistent():
@@ -167,9 +167,9 @@ def test_fusing_the_map_in_each_scan_is_inconsistent():
         for k in range(1, len(one.scans)):
             # All landmarks are forgotten: they enter anew, with the error of the map.
             forgetful = TrackState(
-                state.mean[:4], state.covariance[:4, :4], state.indices[:0], state.is_recent[:0], state.evidence
+                state.mean[:6], state.covariance[:6, :6], state.indices[:0], state.is_recent[:0], state.evidence
             )
-            state, _ = tracker.update(tracker.predict(forgetful, *one.motion(k)), one.scans[k])
+            state, _ = tracker.update(tracker.predict(forgetful, *one.motion(k), duration=PERIOD), one.scans[k])
         for squares, last in ((once, states[-1]), (afresh, state)):
             squares.append(nees(last.pose, last.pose_covariance, one.poses[-1]))
     assert np.mean(once) < BOUNDS[1] < 2.0 * BOUNDS[1] < np.mean(afresh)
@@ -190,11 +190,16 @@ def test_the_filter_equals_batch_least_squares(correlation):
         np.full(n, 0.3),
         np.full(n, np.inf),
     )
-    poses = [np.array([0.5, -0.5, 0.2])]
-    move = np.array([0.6, 0.1, 0.15])
+    poses, duration = [np.array([0.5, -0.5, 0.2])], 2.0
+    move, lasting, deviations = np.array([0.6, 0.1, 0.15]), np.array([0.2, -0.01]), np.array([0.1, 0.02])
+
+    def corrected(told, share, rate):
+        way = (1.0 - share) * rotation(-0.5 * rate * duration) @ told[:2]
+        return np.array([*way, told[2] - rate * duration])
+
     noise = np.array([[4e-4, 1e-4, 0.0], [1e-4, 4e-4, 5e-5], [0.0, 5e-5, 1e-4]])
     for _ in range(scans - 1):
-        poses.append(compose(poses[-1], move + rng.multivariate_normal(np.zeros(3), noise)))
+        poses.append(compose(poses[-1], corrected(move, *lasting) + rng.multivariate_normal(np.zeros(3), noise)))
     sensor, bias, deviation = np.array([0.8, 0.0]), 0.05, 0.02
 
     def expected(pose, offset, landmarks):
@@ -207,11 +212,20 @@ def test_the_filter_equals_batch_least_squares(correlation):
         for pose, rows in zip(poses, in_view, strict=True)
     ]
     tracker = Tracker(
-        known, sensor=tuple(sensor), least_deviation=0.0, gate=0.99999, correlation=correlation, correlated_share=share
+        known,
+        sensor=tuple(sensor),
+        odometry_deviation=deviations[0],
+        odometry_length=np.inf,
+        rate_deviation=deviations[1],
+        rate_walk=0.0,
+        least_deviation=0.0,
+        gate=0.99999,
+        correlation=correlation,
+        correlated_share=share,
     )
     state, _ = tracker.start(poses[0], START)
     for k, z in enumerate(seen):
-        state = tracker.predict(state, move, noise) if k else state
+        state = tracker.predict(state, move, noise, duration=duration) if k else state
         m = len(z)
         scan = Landmarks(z, np.tile(deviation**2 * np.eye(2), (m, 1, 1)), np.full(m, 0.3), np.full(m, np.inf))
         state, matches = tracker.update(state, scan)
@@ -221,9 +235,10 @@ def test_the_filter_equals_batch_least_squares(correlation):
         return np.linalg.solve(np.linalg.cholesky(covariance), residual)
 
     def residuals(x):
-        pose, offset, landmarks = x[: 3 * scans].reshape(-1, 3), x[3 * scans], x[3 * scans + 1 :].reshape(-1, 2)
-        parts = [whitened(START, pose[0] - poses[0]), [offset / tracker.bias_deviation]]
-        parts += [whitened(noise, compose(inverse(a), b) - move) for a, b in pairwise(pose)]
+        pose, (offset, *errors), landmarks = np.split(x, [3 * scans, 3 * scans + 3])
+        pose, landmarks = pose.reshape(-1, 3), landmarks.reshape(-1, 2)
+        parts = [whitened(START, pose[0] - poses[0]), [offset / tracker.bias_deviation], errors / deviations]
+        parts += [whitened(noise, compose(inverse(a), b) - corrected(move, *errors)) for a, b in pairwise(pose)]
         parts += [whitened(K, landmarks - known.positions).ravel()]
         parts += [
             (z - expected(p, offset, landmarks[rows])).ravel() / deviation
@@ -231,7 +246,7 @@ def test_the_filter_equals_batch_least_squares(correlation):
         ]
         return np.concatenate(parts)
 
-    batch = least_squares(residuals, np.concatenate([np.ravel(poses), [0.0], known.positions.ravel()]))
+    batch = least_squares(residuals, np.concatenate([np.ravel(poses), np.zeros(3), known.positions.ravel()]))
     order = np.arange(3 * (scans - 1), batch.x.size)
     covariance = np.linalg.inv(batch.jac.T @ batch.jac)[np.ix_(order, order)]
     np.testing.assert_allclose(state.covariance, covariance, atol=0.02 * covariance.diagonal().max(), rtol=0.05)
@@ -246,19 +261,18 @@ def test_correlated_errors_of_the_map_are_expected():
 
 def test_without_detections_covariance_grows_by_the_odometry():
     one = drive(0, ACCURATE)
-    tracker, states = tracked(one)
-    state, drift = states[-1], DriftModel(scale=0.0, rate=0.0)
+    tracker, states = tracked(one, odometry_deviation=0.0, rate_deviation=0.0, rate_walk=0.0)
+    state = states[-1]
     before = state.pose_covariance
     for _ in range(50):
         motion = np.array([0.2, 0.0, 0.0])
-        state, matches = tracker.update(
-            tracker.predict(state, motion, drift.covariance(motion, PERIOD)), Landmarks.empty()
-        )
+        predicted = tracker.predict(state, motion, DRIFT.covariance(motion, PERIOD), duration=PERIOD)
+        state, matches = tracker.update(predicted, Landmarks.empty())
         assert not matches.is_fused
     R_HW = rotation(-states[-1].pose[2])
     along, along_before = ((R_HW @ P[:2, :2] @ R_HW.T)[0, 0] for P in (state.pose_covariance, before))
-    assert along - along_before == pytest.approx(drift.along**2 * 10.0, rel=0.02)
-    grown = before[2, 2] + drift.heading**2 * 50 * PERIOD
+    assert along - along_before == pytest.approx(DRIFT.along**2 * 10.0, rel=0.02)
+    grown = before[2, 2] + DRIFT.heading**2 * 50 * PERIOD
     assert state.pose_covariance[2, 2] == pytest.approx(grown)
     # It is no loss not to see anything.
     assert not tracker.is_lost(state)
@@ -276,7 +290,7 @@ def test_landmarks_without_a_place_do_not_take_part():
         tracker = Tracker(landmarks)
         state, _ = tracker.start(one.poses[0], START, one.scans[0])
         for k in range(1, 6):
-            state, matches = tracker.update(tracker.predict(state, *one.motion(k)), one.scans[k])
+            state, matches = tracker.update(tracker.predict(state, *one.motion(k), duration=PERIOD), one.scans[k])
         assert matches.is_fused and len(state.indices) < 60
         poses.append(state.pose)
     # Only the distribution of all diameters differs.
@@ -307,11 +321,40 @@ def test_the_map_is_used_once_on_a_closed_route():
         n = len(near)
         scan = Landmarks(places, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01))
         slip = rng.multivariate_normal(np.zeros(3), drift)
-        state, matches = tracker.update(tracker.predict(state, motion + slip, drift), scan)
+        state, matches = tracker.update(tracker.predict(state, motion + slip, drift, duration=PERIOD), scan)
         seen |= set(matches.pairs[:, 1])
     assert matches.is_fused and len(seen) > 40
     assert (np.diagonal(state.pose_covariance)[:2] > deviation**2 / count).all()
     assert nees(state.pose, state.pose_covariance, truth) < chi2.ppf(0.999, 3)
+
+
+def test_lasting_errors_of_dead_reckoning_are_expected():
+    """Drive 100 m in a curve without landmarks, by the same odometry each time."""
+    known, rng, steps, duration = drive(0, ACCURATE).map, np.random.default_rng(5), 50, 2.0
+    told = np.array([2.0, 0.1, 0.1])
+    C, exactly = DRIFT.covariance(told, duration), 1e-12 * np.eye(3)
+    tracker, forgetful = Tracker(known), Tracker(known, odometry_deviation=0.0, rate_deviation=0.0, rate_walk=0.0)
+    last, without = (one.start(np.zeros(3), exactly)[0] for one in (tracker, forgetful))
+    for _ in range(steps):
+        last, without = (
+            one.predict(state, told, C, duration=duration) for one, state in ((tracker, last), (forgetful, without))
+        )
+    wrong = []
+    for _ in range(60):
+        share, rate = rng.normal(size=2) * [tracker.odometry_deviation, tracker.rate_deviation]
+        truth = np.zeros(3)
+        for noise in rng.multivariate_normal(np.zeros(3), C, steps):
+            way = (1.0 - share) * rotation(-0.5 * rate * duration) @ told[:2]
+            truth = compose(truth, np.array([*way, told[2] - rate * duration]) + noise)
+            rate += tracker.rate_walk * duration**0.5 * rng.normal()
+            kept = np.exp(-np.hypot(*told[:2]) / tracker.odometry_length)
+            share = kept * share + (1.0 - kept**2) ** 0.5 * tracker.odometry_deviation * rng.normal()
+        wrong.append(error(last.pose, truth))
+    low, high = chi2(3 * 60).ppf([0.025, 0.975]) / 60.0
+    honest, overconfident = (
+        np.einsum("ni,ij,nj->n", wrong, np.linalg.inv(state.pose_covariance), wrong).mean() for state in (last, without)
+    )
+    assert low < honest < high < 2.0 * high < overconfident
 
 
 def test_the_state_stays_small_and_is_a_value():
@@ -319,14 +362,14 @@ def test_the_state_stays_small_and_is_a_value():
     tracker, states = tracked(one, horizon=15.0, most=30)
     last = states[-1]
     assert max(len(state.indices) for state in states) <= 30
-    distances = np.linalg.norm(last.mean[4:].reshape(-1, 2) - last.pose[:2], axis=1)
+    distances = np.linalg.norm(last.mean[6:].reshape(-1, 2) - last.pose[:2], axis=1)
     assert distances.max() < 15.0 and len(last.indices) < len(np.unique(np.concatenate([s.indices for s in states])))
     assert copy.deepcopy(last) is last
     codec = codec_of(TrackState.none())
     again = codec.decode(codec.encode(last))
     motion = one.motion(3)
-    for name, array in codec.encode(tracker.predict(again, *motion)).items():
-        np.testing.assert_array_equal(array, codec.encode(tracker.predict(last, *motion))[name])
+    for name, array in codec.encode(tracker.predict(again, *motion, duration=PERIOD)).items():
+        np.testing.assert_array_equal(array, codec.encode(tracker.predict(last, *motion, duration=PERIOD))[name])
     with pytest.raises(ValueError):
         last.mean[0] = 1.0
 

@@ -179,7 +179,7 @@ def test_no_trees_in_sight_is_no_error():
     assert answers[-1].status == TRACKING
 
 
-def test_wheels_that_are_off_are_in_the_covariance_of_a_gap():
+def test_wheels_that_are_off_are_learned_and_in_the_covariance_of_a_gap():
     one = drive(3, ACCURATE, reach=18.0, scans=60)
     motions = [compose(inverse(a), b) for a, b in pairwise(one.poses)]
     reckoned = [np.zeros(3)]
@@ -188,8 +188,8 @@ def test_wheels_that_are_off_are_in_the_covariance_of_a_gap():
     scans = [*one.scans[:10], *[Landmarks.empty()] * 50]
     answers, state = run(unit_for(one.map), scans, reckoned)
     assert answers[-1].status == TRACKING and not answers[-1].matched
-    # 3 % of 20 m.
-    assert np.linalg.norm(error(answers[-1].pose, one.poses[-1])[:2]) > 0.4
+    # Of 3 % of 20 m, ten scans have taught a third.
+    assert 0.3 < np.linalg.norm(error(answers[-1].pose, one.poses[-1])[:2]) < 0.5
     assert nees(answers[-1].pose, answers[-1].covariance, one.poses[-1]) < 9.0
     # In the end, nothing is known any more.
     assert unit_for(one.map).step(state, scans[-1], X_OH=reckoned[-1], time=1e3)[0].status == LOST

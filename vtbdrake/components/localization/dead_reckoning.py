@@ -42,28 +42,23 @@ _BIAS_DEVIATION = 0.005
 
 @dataclass(frozen=True)
 class DriftModel:
-    """Dead reckoning drifts by random walks, and by errors that last. All values are standard deviations.
+    """Dead reckoning drifts by random walks, whose deviations grow with the roots of distance, time and turn.
 
-    The walks grow with the roots of distance, time and turn. Those along and across are calibrated with the simulated
-    carrier of `vtbdrake_diagrams.forest`, which slips on slopes; all others are assumed. What lasts, of the radius of a
-    wheel or of the gyros, grows with distance and time themselves: it matters where nothing else tells the pose for
-    long.
+    Those along and across are calibrated with the simulated carrier of `vtbdrake_diagrams.forest`, which slips on
+    slopes; the others are assumed. Errors that last for longer, of the wheels and of the gyros, are no random walks and
+    not contained: a `Tracker` estimates them.
 
     Attributes:
         along: Deviation along the path, in m per root metre.
         across: Deviation sideways by slip, in m per root metre.
         heading: Deviation of the heading, in rad per root second.
         turn: Deviation of the heading in turns, in rad per root radian.
-        scale: Deviation of the scale of the distance, which lasts, as a share.
-        rate: Deviation of the turn rate, which lasts, in rad/s.
     """
 
     along: float = 0.04
     across: float = 0.03
     heading: float = 0.001
     turn: float = 0.01
-    scale: float = 0.02
-    rate: float = 5e-4
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -72,20 +67,17 @@ class DriftModel:
                     f"{field.name} of a drift is a finite deviation of at least 0, not {getattr(self, field.name)!r}"
                 )
 
-    def covariance(self, motion: ArrayLike, duration: float, *, since: tuple[float, float] = (0.0, 0.0)) -> Array:
+    def covariance(self, motion: ArrayLike, duration: float) -> Array:
         """Return the covariance (3, 3) of a motion X_AB by dead reckoning, in the order x, y (in A, m), heading (rad).
 
         Args:
             motion: X_AB = [x, y, heading] from where the carrier was, (3,) in m and rad. It is about an arc.
             duration: How long it took, in s.
-            since: The distance in m and the time in s for which it had been dead reckoning alone before. The errors
-                that last add up with those of before: the covariance is by how much the variances grow.
         """
         x, y, turned = np.asarray(motion, dtype=float).tolist()
-        length, (before, elapsed) = hypot(x, y), since
-        along = self.along**2 * length + self.scale**2 * length * (2.0 * before + length)
+        length = hypot(x, y)
+        along = self.along**2 * length
         heading = self.heading**2 * abs(duration) + self.turn**2 * abs(turned)
-        heading += self.rate**2 * duration * (2.0 * elapsed + duration)
         # What the heading has drifted halfway leads aside.
         across = self.across**2 * length + heading * length**2 / 3.0
         in_chord = np.array(

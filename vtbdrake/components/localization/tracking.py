@@ -1,15 +1,23 @@
 """Tracking of a carrier among landmarks of a map, from a first pose on: simultaneous localization and map refinement.
 
-The state x = [X_WH; b; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector, and the
-true positions l_i (in W) of those landmarks of the map that have been seen. Each of them enters once, with its place
-in the map and the map's own error as the prior; from then on it is refined by detections, and correlated with the
-pose. A filter that takes the map's error afresh from every scan would become overconfident, because that error is the
-same in every scan. A detection z of landmark l in the level frame H is
+The state x = [X_WH; b; e; g; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector,
+two errors of dead reckoning that last, and the true positions l_i (in W) of those landmarks of the map that have
+been seen. Each of them enters once, with its place in the map and the map's own error as the prior; from then on it is
+refined by detections, and correlated with the pose. A filter that takes the map's error afresh from every scan would
+become overconfident, because that error is the same in every scan. A detection z of landmark l in the level frame H is
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
 where s is the place of the scanner. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous localization
 and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
+
+Dead reckoning tells a motion [t; turn] in the time T. Its share e is too far, and its gyros turn too fast by g:
+
+    true motion = [(1 - e) R(-g T / 2) t; turn - g T] + noise.
+
+e changes with the way as slopes do, on which wheels slip (a first-order Gauss-Markov process), g slowly with time (a
+random walk). Noise alone, independent from step to step, would be too small after a minute without landmarks. While
+landmarks are seen, e and g are learned.
 
 Errors of a map may be correlated: neighbours are displaced alike. With K_ij = c σ_i σ_j exp(-r_ij² / (2 L²)) +
 (1 - c) σ_i² δ_ij for the errors of the landmarks, per axis, the prior of a landmark that is seen for the first time is
@@ -37,7 +45,9 @@ from vtbdrake.components.world_model.association import chi_square_quantile
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_BIAS, _FIXED = 3, 4
+# Where b, e and g are in x, up to where it says what is seen of a landmark, and from where on it has landmarks.
+_BIAS, _ODOMETRY, _RATE = 3, 4, 5
+_SEEN, _FIXED = 4, 6
 
 # Standard deviations in m and rad of a pose of which nothing is to be known.
 _LOOSE = np.array([5.0, 5.0, 0.2])
@@ -75,8 +85,8 @@ class TrackState:
     """The memory of a `Tracker`: an immutable value with read-only arrays.
 
     Attributes:
-        mean: The estimate of x (m, rad), shape (4 + 2 n,); empty if nothing is tracked.
-        covariance: Its covariance, shape (4 + 2 n, 4 + 2 n).
+        mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
+        covariance: Its covariance, shape (6 + 2 n, 6 + 2 n).
         indices: Which landmarks of the map are in x, shape (n,).
         is_recent: Which of them the last scan that was fused showed, shape (n,).
         evidence: How well first matches agree with the map, see `Tracker`.
@@ -193,6 +203,10 @@ class Tracker:
         sensor: s = p_HoLo_H in the plane, in m.
         field_of_view: The angle in rad in which the detector sees landmarks: how dense its detections are.
         bias_deviation: Standard deviation of the range bias, in m; assumed.
+        odometry_deviation: Standard deviation of e, by which share odometry tells too far; assumed.
+        odometry_length: The way in m on which e loses two thirds of its correlation; assumed.
+        rate_deviation: Standard deviation of g, the bias that dead reckoning leaves of its gyros, in rad/s; assumed.
+        rate_walk: By how much g changes, in rad/s per root second; assumed.
         least_deviation: Standard deviation in m that is added to those of detections, per axis; assumed.
         scan_deviation: Standard deviation in m, per axis, by which all detections of a scan are displaced together;
             assumed.
@@ -214,6 +228,10 @@ class Tracker:
     sensor: tuple[float, float] = (0.0, 0.0)
     field_of_view: float = 2.0 * pi
     bias_deviation: float = 0.03
+    odometry_deviation: float = 0.02
+    odometry_length: float = 20.0
+    rate_deviation: float = 5e-4
+    rate_walk: float = 2e-5
     least_deviation: float = 0.01
     scan_deviation: float = 0.0
     correlation: float = 0.0
@@ -235,6 +253,10 @@ class Tracker:
         checks = {
             "field_of_view": (0.0 < self.field_of_view <= 2.0 * pi, "in rad, within (0, 2 pi]"),
             "bias_deviation": (0.0 <= self.bias_deviation < inf, "in m, at least 0"),
+            "odometry_deviation": (0.0 <= self.odometry_deviation < inf, "a share, at least 0"),
+            "odometry_length": (self.odometry_length > 0.0, "in m, positive"),
+            "rate_deviation": (0.0 <= self.rate_deviation < inf, "in rad/s, at least 0"),
+            "rate_walk": (0.0 <= self.rate_walk < inf, "in rad/s per root second, at least 0"),
             "least_deviation": (0.0 <= self.least_deviation < inf, "in m, at least 0"),
             "scan_deviation": (0.0 <= self.scan_deviation < inf, "in m, at least 0"),
             "correlation": (0.0 <= self.correlation < inf, "in m, at least 0"),
@@ -282,23 +304,35 @@ class Tracker:
         loose = self._at(pose, np.diag(_LOOSE**2))
         return self._fused(self._extended(loose, found.pairs[:, 1], found.probability), landmarks, found.pairs)
 
-    def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike) -> TrackState:
+    def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, duration: float) -> TrackState:
         """Return the state after a motion.
 
         Args:
             state: The state before.
-            motion: The pose of the carrier afterwards in its frame before, shape (3,).
-            covariance: The covariance of the motion, shape (3, 3).
+            motion: The pose of the carrier afterwards in its frame before, by dead reckoning, shape (3,).
+            covariance: The covariance of its noise, shape (3, 3).
+            duration: How long it took, in s.
         """
-        move = np.asarray(motion, dtype=float)
-        heading = state.mean[2]
+        told = np.asarray(motion, dtype=float)
+        mean, P, heading = state.mean.copy(), state.covariance.copy(), state.mean[2]
+        turned = mean[_RATE] * duration
+        way = rotation(-turned / 2.0) @ told[:2]
+        move = np.array([*((1.0 - mean[_ODOMETRY]) * way), told[2] - turned])
         F, G = np.eye(3), block_diag(rotation(heading), 1.0)
         F[:2, 2] = rotation(heading + np.pi / 2.0) @ move[:2]
-        mean, P = state.mean.copy(), state.covariance.copy()
+        aside = 0.5 * duration * move[:2]
+        # The derivatives of the pose with respect to e and g.
+        B = -G @ np.array([[way[0], -aside[1]], [way[1], aside[0]], [0.0, duration]])
         mean[:3] = compose(mean[:3], move)
-        P[:3] = F @ P[:3]
-        P[:, :3] = P[:, :3] @ F.T
+        P[:3] = F @ P[:3] + B @ P[_ODOMETRY:_FIXED]
+        P[:, :3] = P[:, :3] @ F.T + P[:, _ODOMETRY:_FIXED] @ B.T
         P[:3, :3] += G @ np.asarray(covariance, dtype=float) @ G.T
+        P[_RATE, _RATE] += self.rate_walk**2 * duration
+        kept = float(np.exp(-np.hypot(*told[:2]) / self.odometry_length))
+        mean[_ODOMETRY] *= kept
+        P[_ODOMETRY] *= kept
+        P[:, _ODOMETRY] *= kept
+        P[_ODOMETRY, _ODOMETRY] += (1.0 - kept**2) * self.odometry_deviation**2
         return state.with_arrays(mean=mean, covariance=P)
 
     def update(self, state: TrackState, landmarks: Landmarks) -> tuple[TrackState, Matches]:
@@ -335,8 +369,9 @@ class Tracker:
     # -- the state
 
     def _at(self, X_WH: Array, covariance: Array) -> TrackState:
-        P = block_diag(covariance, self.bias_deviation**2)
-        return replace(TrackState.none(), mean=np.append(X_WH, 0.0), covariance=P, evidence=self.first_credit)
+        P = block_diag(covariance, self.bias_deviation**2, self.odometry_deviation**2, self.rate_deviation**2)
+        mean = np.concatenate([X_WH, np.zeros(_FIXED - 3)])
+        return replace(TrackState.none(), mean=mean, covariance=P, evidence=self.first_credit)
 
     def _extended(self, state: TrackState, indices: Indices, probability: Array | None = None) -> TrackState:
         """Return the state with further landmarks of the map, (m,), which it does not have yet.
@@ -568,8 +603,8 @@ def _columns(rows: Indices) -> Indices:
 
 def _times_transpose(P: Array, H: Array, rows: Indices) -> Array:
     """Return P Hᵀ, shape (N, 2 m), for derivatives (m, 2, 6)."""
-    own = np.einsum("Nmj,mij->Nmi", P[:, _columns(rows)], H[:, :, _FIXED:])
-    return P[:, :_FIXED] @ H[:, :, :_FIXED].reshape(-1, _FIXED).T + own.reshape(len(P), -1)
+    own = np.einsum("Nmj,mij->Nmi", P[:, _columns(rows)], H[:, :, _SEEN:])
+    return P[:, :_SEEN] @ H[:, :, :_SEEN].reshape(-1, _SEEN).T + own.reshape(len(P), -1)
 
 
 def _times(H: Array, rows: Indices, columns: Array) -> Array:

@@ -89,7 +89,6 @@ class UnitState:
         track: The state of the tracker; none while there is no pose.
         submap: What was gathered since there is no pose; empty while there is one.
         tried_at: Distance travelled in m and time in s of the last match without a guess, shape (2,).
-        unseen: Distance travelled in m and time in s since a scan was fused last, shape (2,).
         ignored: Calls with a number that is not finite, or a time that was not after the last one.
         losses: How often the track was lost.
     """
@@ -98,7 +97,6 @@ class UnitState:
     track: TrackState = field(default_factory=TrackState.none)
     submap: Submap = field(default_factory=Submap.empty)
     tried_at: Array = field(default_factory=lambda: np.array([-inf, -inf]))
-    unseen: Array = field(default_factory=lambda: np.zeros(2))
     ignored: int = 0
     losses: int = 0
 
@@ -168,19 +166,17 @@ class LocalizationUnit:
         begins = not isfinite(last.time)
         motion = np.zeros(3) if begins else compose(inverse(last.X_OH), pose)
         duration = 0.0 if begins else time - last.time
-        before, elapsed = state.unseen.tolist()
-        C = self.drift.covariance(motion, duration, since=(before, elapsed))
+        C = self.drift.covariance(motion, duration)
         if begins:
             state = replace(state, submap=Submap.empty(pose))
         if state.track.is_tracking:
-            track, matches = self.tracker.update(self.tracker.predict(state.track, motion, C), landmarks)
+            predicted = self.tracker.predict(state.track, motion, C, duration=duration)
+            track, matches = self.tracker.update(predicted, landmarks)
             if not self.tracker.is_lost(track):
                 answer = _answer(track, matches, len(landmarks), pose, time)
                 if track.failures:
                     answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
-                step = np.array([np.hypot(*motion[:2]), duration])
-                unseen = np.zeros(2) if answer.matched else state.unseen + step
-                return answer, replace(state, answer=answer, track=track, unseen=unseen)
+                return answer, replace(state, answer=answer, track=track)
             lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
             submap = Submap.empty(pose).with_scan(landmarks)
             return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
@@ -220,7 +216,6 @@ _PARTS = {
     "track": codec_of(TrackState.none()),
     "submap": codec_of(Submap.empty()),
     "tried_at": codec_of(np.zeros(2)),
-    "unseen": codec_of(np.zeros(2)),
     "ignored": codec_of(0),
     "losses": codec_of(0),
 }
