@@ -36,7 +36,8 @@ BELOW: dict[str, set[str]] = {
 # laser scans.
 for _layers in BELOW.values():
     _layers.update({"argument_checks", "child_process", "lazy", "pickling", "scan", "spline"})
-BELOW["spline"] = {"argument_checks"}
+BELOW["spline"] = {"argument_checks", "spline_kernel"}
+BELOW["spline_kernel"] = {"state"}
 BELOW["scan"] = set()
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb, factorial, inf, perm
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.argument_checks import as_number, as_whole
+from vtbdrake.spline_kernel import value_at, weights_at
 
 Array = NDArray[np.float64]
 
@@ -19,17 +19,6 @@ Array = NDArray[np.float64]
 _LEAST_KNOTS = {"zero": 1, "linear": 2, "cubic": 2, "bspline": 4}
 _SMOOTHNESS = {"zero": 0, "linear": 1, "cubic": 3, "bspline": 3}
 ORDERS = tuple(_LEAST_KNOTS)
-
-# Of a piece: an instant that is this close to its end belongs to the next one, as k * period is rounded.
-_ROUNDING = 1e-9
-
-# The derivatives of (1, s, s^2, s^3).
-_POWERS: tuple[Callable[[float], tuple[float, ...]], ...] = (
-    lambda s: (1.0, s, s * s, s * s * s),
-    lambda s: (0.0, 1.0, 2.0 * s, 3.0 * s * s),
-    lambda s: (0.0, 0.0, 2.0, 6.0 * s),
-    lambda s: (0.0, 0.0, 0.0, 6.0),
-)
 
 
 @dataclass(frozen=True)
@@ -140,10 +129,17 @@ class Spline:
 
     def weights(self, t: float, derivative: int = 0) -> Array:
         """Return B(t), or a derivative, of one time within [0, duration]; shape (n,)."""
-        position = t / self.step
-        i = min(int(position + _ROUNDING), len(self.pieces) - 1)
-        s = max(t - i * self.step, 0.0)
-        return np.array(_POWERS[derivative](s)) @ self.pieces[i]
+        return weights_at(self.pieces, self.step, t, derivative)
+
+    def write_value(self, t: float, knots: Array, out: Array) -> None:
+        """Write y(t) at one time within [0, duration] into an array, as a system does in every sample.
+
+        Args:
+            t: In seconds.
+            knots: Shape (n m,), knot by knot.
+            out: Shape (m,).
+        """
+        value_at(self.pieces, self.step, t, knots, out)
 
     def extremes(self, knots: ArrayLike, derivative: int = 0) -> tuple[Array, Array]:
         """Return the least and the largest value that a curve, or a derivative, takes on [0, duration].

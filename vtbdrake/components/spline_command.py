@@ -86,10 +86,9 @@ class SplineCommand(LeafSystem):
         if t < -_ROUNDING:
             return
         if t > spline.duration + _ROUNDING and self._after is not None:
-            value = self._after
+            state.set_value(0, self._after)
         else:
-            value = spline.weights(min(max(t, 0.0), spline.duration)) @ plan[1:].reshape(spline.knots, self._size)
-        state.set_value(0, value)
+            spline.write_value(min(max(t, 0.0), spline.duration), plan[1:], state.get_mutable_value(0))
 
 
 def _vector(name: str, value: ArrayLike, size: int) -> np.ndarray:
