@@ -49,7 +49,7 @@ def mixed_problem():
 
 @pytest.fixture(scope="module")
 def study() -> Study:
-    return mixed_problem().study(solver="TPE", seed=1).run(rollouts=200, executor="serial", progress=False)
+    return mixed_problem().study(solver="TPE", seed=1).run(rollouts=120, executor="serial", progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +314,7 @@ def test_an_unknown_name_lists_those_that_are_there(url):
 
 
 def test_importances_of_optuna_are_ours(url):
-    at = np.random.default_rng(1).uniform(0.01, 1.0, size=(200, 2)).tolist()
+    at = np.random.default_rng(1).uniform(0.01, 1.0, size=(60, 2)).tolist()
     study = recorded([X, Y], [point((x, y), x) for x, y in at], qualities={"h": "maximize"})
     theirs = optuna.importance.get_param_importances(study.to_optuna(url, "linear"))
     (ours,) = importances(study)

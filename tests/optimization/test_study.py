@@ -38,6 +38,10 @@ def table(study):
     return [(t.parameters, t.values, t.exact, t.origin, t.batch) for t in study.trials], rollouts
 
 
+def on_one_python(*solvers):
+    return [pytest.param(solver, marks=pytest.mark.one_python) for solver in solvers]
+
+
 # -- what it finds
 
 
@@ -129,7 +133,7 @@ def test_fields_choices_and_integers_can_be_varied():
 # -- executors and interruptions change nothing
 
 
-@pytest.mark.parametrize("solver", ["cmaes", "TPE", "sobol"])
+@pytest.mark.parametrize("solver", ["cmaes", *on_one_python("TPE", "sobol")])
 def test_a_study_is_the_same_in_series_and_in_parallel(solver):
     studies = []
     for executor, workers in (("serial", None), ("threads", 2), ("processes", 2)):
@@ -141,7 +145,7 @@ def test_a_study_is_the_same_in_series_and_in_parallel(solver):
     assert table(studies[0])[1] == table(studies[1])[1] == table(studies[2])[1]
 
 
-@pytest.mark.parametrize("solver", ["cmaes", "TPE", "auto", "LN_COBYLA", "SNOPT"])
+@pytest.mark.parametrize("solver", ["cmaes", "SNOPT", *on_one_python("TPE", "auto", "LN_COBYLA")])
 def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
     whole = pendulum_problem().study(tmp_path / "whole.db", solver=solver, seed=2)
     whole.run(rollouts=45, executor="serial", progress=False)
@@ -155,7 +159,9 @@ def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
         assert table(second) == table(whole)
 
 
-@pytest.mark.parametrize("solver", ["cmaes", "TPE", "LN_COBYLA", "SNOPT", "differential-evolution", "sobol", "random"])
+@pytest.mark.parametrize(
+    "solver", ["cmaes", "SNOPT", *on_one_python("TPE", "LN_COBYLA", "differential-evolution", "sobol", "random")]
+)
 def test_larger_budget_continues_the_same_study(tmp_path, solver):
     whole = pendulum_problem().study(solver=solver, seed=2).run(rollouts=45, executor="serial", progress=False)
     study = pendulum_problem().study(tmp_path / "parts.db", solver=solver, seed=2)

@@ -24,6 +24,7 @@ def test_the_cost_is_zero_upright_in_the_middle() -> None:
     assert all(cost(UPRIGHT + step) > 0.0 for step in 1e-3 * np.eye(4))
 
 
+@pytest.mark.one_python
 def test_the_pole_is_swung_up_and_kept_upright() -> None:
     scenario = CartPoleScenario()
     with make_reasoner(scenario, rollouts=32, seed=1, executor="serial") as reasoner:
@@ -69,6 +70,7 @@ def test_a_mental_copy_as_fine_predicts_the_true_future() -> None:
     assert decision.quality == pytest.approx(np.trapezoid(costs, times), rel=1e-12)
 
 
+@pytest.mark.one_python
 def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
     swing = swing_up_onboard(CartPoleScenario(onboard=True), seconds=3.3)
     assert swing.tilt[-5:].max() < 0.4

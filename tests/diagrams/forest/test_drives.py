@@ -23,6 +23,8 @@ from vtbdrake_diagrams.forest.drives import (
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import Stand
 
+pytestmark = pytest.mark.one_python
+
 COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 0.0], [0.0, 0.0, 1e-6]])
 
 

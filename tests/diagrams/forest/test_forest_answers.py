@@ -17,6 +17,7 @@ def test_unit_over_lcm_finds_the_simulated_pose() -> None:
     assert found.difference > 0.0
 
 
+@pytest.mark.one_python
 def test_least_error_is_that_of_generalized_least_squares() -> None:
     """The mean of draws, weighted by their covariance: two trees, and the trees of a stand."""
     two = np.array([[0.0, 0.0], [30.0, 0.0]])
@@ -32,6 +33,7 @@ def test_least_error_is_that_of_generalized_least_squares() -> None:
     assert least_error(MAPS["poor"], places) > 0.5
 
 
+@pytest.mark.one_python
 def test_no_mean_of_maps_errs_by_less() -> None:
     stand = Stand(seed=2, length=60.0, width=40.0, density=300.0)
     places, errors = stand.trees().positions()[:, :2], MapErrors(position=0.7, correlation=40.0)
@@ -40,6 +42,7 @@ def test_no_mean_of_maps_errs_by_less() -> None:
     assert least_error(errors, places) < rms < np.sqrt(2.0) * 0.7
 
 
+@pytest.mark.one_python
 def test_least_error_is_by_the_trees_beside_the_path() -> None:
     stand, path = forest(5).stand(), np.array([[50.0 + k, 50.0, 0.0] for k in range(10)])
     drive = Drive(np.arange(10.0), path, path, (Landmarks.empty(),) * 10)

@@ -13,6 +13,8 @@ from vtbdrake_diagrams.forest.plain import RockField, rock_surface
 from vtbdrake_diagrams.forest.scenario import PlainScenario
 from vtbdrake_diagrams.forest.stand import ACCURATE, REMOTE
 
+pytestmark = pytest.mark.one_python
+
 
 def diameters(rocks: WorldModel) -> np.ndarray:
     """The geometric means of length and width."""

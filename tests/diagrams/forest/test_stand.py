@@ -10,6 +10,8 @@ from scipy.stats import kstest, weibull_min
 from vtbdrake.components.world_model import WorldModel, add_to_plant
 from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE, MapErrors, Stand, tree_height
 
+pytestmark = pytest.mark.one_python
+
 
 def diameters(model: WorldModel) -> np.ndarray:
     return np.array([one.number("trunk_diameter", unit="m") for one in model])

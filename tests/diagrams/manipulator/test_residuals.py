@@ -69,7 +69,7 @@ def test_perfect_model_leaves_nothing_whatever_the_latencies(scenario: Manipulat
         np.testing.assert_allclose([window.residual for window in monitor.history], 0.0, atol=1e-9)
 
 
-@pytest.fixture(scope="module", params=[0, 2], ids="latency {}".format)
+@pytest.fixture(scope="module", params=[pytest.param(0, marks=pytest.mark.one_python), 2], ids="latency {}".format)
 def nominal_and_heavy(request: pytest.FixtureRequest) -> Iterator[dict[str, Mapping[str, ResidualMonitor]]]:
     scenario = noisy(request.param)
     found = {}

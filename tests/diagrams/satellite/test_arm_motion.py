@@ -44,6 +44,7 @@ def test_mental_testbed_has_no_forces_and_the_same_addresses():
     np.testing.assert_allclose(joints, scenario.goal, atol=1e-12)
 
 
+@pytest.mark.one_python
 def test_the_decision_on_board_turns_the_base_ten_times_less():
     comparison = compare(ArmMotionScenario(onboard=True))
     assert comparison.ratio > 10.0

@@ -86,7 +86,7 @@ def test_a_plan_has_a_free_knot():
         MoveSpace(knots=4)
 
 
-@pytest.mark.parametrize("solve", [plan_by_casadi, plan_by_drake])
+@pytest.mark.parametrize("solve", [pytest.param(plan_by_casadi, marks=pytest.mark.one_python), plan_by_drake])
 def test_solvers_find_a_plan_that_turns_the_base_back(move, solve):
     plan = solve(move, attempts=1)
     assert move.excess(plan.knots) == {}
@@ -102,6 +102,7 @@ def test_unknown_solvers_are_refused(move):
         plan_by_drake(move, "NLOPT")
 
 
+@pytest.mark.one_python
 def test_the_descent_proposes_its_plan_and_ends_with_it():
     scenario = replace(ArmMotionScenario(), thinking_time=0.5)
     options = {"origin": scenario.start, "goal": scenario.goal, "duration": 20.0, "knots": 9}

@@ -70,6 +70,7 @@ def test_the_supervisor_is_not_varied_along_a_recorded_motion():
         mount_problem([vtb.Parameter("dps.impl.supervisor.standoff", 0.2, 0.3)], seeds=(0,))
 
 
+@pytest.mark.one_python
 def test_along_the_recorded_capture_the_count_is_the_same(problem):
     try:
         check_rendering()

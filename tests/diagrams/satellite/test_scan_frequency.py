@@ -19,6 +19,8 @@ from vtbdrake_diagrams.satellite.scan_frequency import (
     skew,
 )
 
+pytestmark = pytest.mark.one_python
+
 FREQUENCY = 2.0
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from vtbdrake.optimization import Problem
 from vtbdrake.rollout import RolloutRunner
 from vtbdrake_diagrams.space_climber import CraterScenario, crater
 from vtbdrake_diagrams.space_climber.crater import (
@@ -78,8 +79,9 @@ def test_a_mental_robot_walks_in_the_direction_of_its_heading() -> None:
 
 @pytest.mark.one_python
 def test_the_landscape_is_drawn_beside_a_continuous_search(tmp_path, monkeypatch) -> None:
-    # Decisions of a few short rollouts: worker processes would take longest to start.
+    # A few short rollouts: worker processes would take longest to start.
     monkeypatch.setattr(crater, "heading_reasoner", partial(heading_reasoner, executor="serial"))
+    monkeypatch.setattr(Problem, "sweep", partialmethod(Problem.sweep, executor="serial"))
     figure = tmp_path / "headings.png"
     options = ["--step", "45", "--candidates", "3", "--horizon", "4", "--figure", str(figure)]
     result = CliRunner().invoke(main, options, catch_exceptions=False)

@@ -54,6 +54,7 @@ def test_a_slower_robot_walks_as_many_strides() -> None:
     assert problem.scenario.gravity == 9.81
 
 
+@pytest.mark.one_python
 def test_with_locked_legs_it_tips_where_statics_says() -> None:
     problem = locked_problem()
     limit = static_limit(problem.testbed)

@@ -207,6 +207,7 @@ def test_auto_has_a_plan_for_every_budget(size, budget, methods, short_model):
     assert [method for _, method in solver.changes][: len(methods)] == methods
 
 
+@pytest.mark.one_python
 @pytest.mark.parametrize("function", [SPHERE, ROSENBROCK, ACKLEY])
 @pytest.mark.parametrize("budget", [90, 180])
 def test_auto_spends_its_whole_budget(function, budget, short_model):
@@ -239,6 +240,7 @@ def test_auto_searches_locally_in_a_range_of_two_numbers(short_model):
     assert max(told.values[0] for told in log) > -1e-8
 
 
+@pytest.mark.one_python
 def test_what_racing_saves_goes_to_the_later_phases_of_auto(short_model):
     # Every point takes a quarter of what its conditions would take: there are four times as many points.
     solver = make_solver("auto", SPHERE.space, budget=100)
@@ -251,6 +253,7 @@ def test_what_racing_saves_goes_to_the_later_phases_of_auto(short_model):
     assert [method for _, method in solver.changes][:2] == ["bayesian", "LN_BOBYQA around the best"]
 
 
+@pytest.mark.one_python
 def test_what_racing_dropped_is_no_start_of_a_local_search():
     solver = make_solver("auto", SPHERE.space, budget=300)
     while points := solver.ask():
@@ -263,6 +266,7 @@ def test_what_racing_dropped_is_no_start_of_a_local_search():
     assert SPHERE.cost(points[0]) < 0.1
 
 
+@pytest.mark.one_python
 def test_auto_starts_anew_with_larger_populations_and_another_method(short_model):
     solver = make_solver("auto", ACKLEY.space, budget=2500)
     methods = []

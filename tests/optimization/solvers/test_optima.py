@@ -96,6 +96,7 @@ def test_a_mixed_problem_agrees_with_brute_force(name):
         assert best.point[1] == pytest.approx(0.1 * brute[0], abs=1e-3)
 
 
+@pytest.mark.one_python
 def test_a_categorical_parameter_is_chosen_rightly():
     space = (Choice("kind", ["up", "down", "left"]), Parameter("x", 0.0, 1.0), Choice("flag", [True, 0, 2.5]))
 
