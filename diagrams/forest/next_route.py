@@ -6,7 +6,8 @@ DPS, and takes the one along which the DPS would know its position best. Then ev
 from the same state, and the errors tell whether the choice was good.
 
 ``python -m vtbdrake_diagrams.forest.next_route [--forests N]`` prints, for each forest, the expected deviations and the
-errors of all routes. What counts was fixed before the first result was seen: the mean over the last `COUNTED` s.
+errors of all routes, and in the end what the choices have gained. What counts was fixed before the first result was
+seen: the mean over the last `COUNTED` s.
 """
 
 from __future__ import annotations
@@ -129,16 +130,18 @@ class RouteAnswer:
         decision: The carrier's.
         expected: The mean deviation of the position along each route in its mind, in m, shape (n,).
         errors: The root mean square error of the position along each route in the true forest, in m, shape (n,).
+        in_use: The number of the route that was in use.
     """
 
     decision: Decision
     expected: Array
     errors: Array
+    in_use: int = 0
 
     @property
     def chosen(self) -> int:
         """The number of the route that was chosen; that in use if nothing is set."""
-        return round(float(self.decision.values.get(ROUTE, 0.0)))
+        return round(float(self.decision.values.get(ROUTE, self.in_use)))
 
     @property
     def rank(self) -> int:
@@ -175,7 +178,28 @@ def decide_and_drive(seed: int) -> RouteAnswer:
         if candidate.rollouts:
             expected[round(float(candidate.values.get(ROUTE, scenario.route)))] = candidate.rollouts[0].value / COUNTED
     errors = np.sqrt([rollout.value / COUNTED for rollout in sweep.rollouts])
-    return RouteAnswer(decision, expected, errors)
+    return RouteAnswer(decision, expected, errors, scenario.route)
+
+
+def summary(answers: dict[int, RouteAnswer]) -> str:
+    """Return what the choices have gained in the forests of these seeds, as text: a table, and the mean gain."""
+    heads = ("forest", "expected m", "chosen m", "in use m", "all m", "best m", "better routes")
+    rows = np.array([
+        [one.expected[one.chosen], one.errors[one.chosen], one.errors[one.in_use], one.errors.mean(), one.errors.min()]
+        for one in answers.values()
+    ])  # fmt: skip
+    ranks = [one.rank for one in answers.values()]
+    names, counts = [*map(str, answers), "mean"], [*map(str, ranks), f"{np.mean(ranks):.1f}"]
+    lines = [
+        (name, *(f"{value:.3f}" for value in row), rank)
+        for name, row, rank in zip(names, [*rows, rows.mean(axis=0)], counts, strict=True)
+    ]
+    text = [table(heads, lines)]
+    for name, column in (("the route in use", 2), ("the mean of all routes", 3)):
+        gains = rows[:, column] - rows[:, 1]
+        spread = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else np.nan
+        text.append(f"gain over {name}: {gains.mean():.3f} m, with a standard error of {spread:.3f} m")
+    return "\n".join(text)
 
 
 def squared_error(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
@@ -192,14 +216,16 @@ def main() -> None:
     parser.add_argument("--forests", type=int, default=1)
     parser.add_argument("--seed", type=int, default=SEED)
     chosen = parser.parse_args()
+    answers = {}
     for seed in range(chosen.seed, chosen.seed + chosen.forests):
-        found = decide_and_drive(seed)
+        answers[seed] = found = decide_and_drive(seed)
         rows = [
             (f"{number}{' (chosen)' if number == found.chosen else ''}", f"{expected:.3f}", f"{error:.3f}")
             for number, (expected, error) in enumerate(zip(found.expected, found.errors, strict=True))
         ]
         print(table(("route", "expected m", "error m"), rows))
         print(f"forest {seed}: {found.rank} routes would have been better\n", flush=True)
+    print(summary(answers))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Tests of the choices of a scanner and of a route: what counts, and that the testbed is asked as it should be."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,10 +10,13 @@ from vtbdrake_diagrams.forest.next_route import (
     COUNTED,
     FOUND,
     HORIZON,
+    ROUTE,
     UNKNOWN,
+    RouteAnswer,
     RouteScenario,
     deviation,
     squared_error,
+    summary,
 )
 from vtbdrake_diagrams.forest.scanner_choice import (
     BEAMS,
@@ -74,3 +79,18 @@ def test_routes_are_judged_after_they_have_parted() -> None:
     assert deviation(late, np.diag([np.inf, np.inf, np.inf])) == UNKNOWN
     assert squared_error(late, np.array([3.3, 4.4]), late - LAG, TRUTH, VELOCITY) == pytest.approx(0.25)
     assert squared_error(late, np.full(2, np.nan), late - LAG, TRUTH, VELOCITY) == UNKNOWN**2
+
+
+def test_summary_compares_the_choice_with_all_routes() -> None:
+    choice, none = SimpleNamespace(values={ROUTE: 1.0}), SimpleNamespace(values={})
+    answers = {
+        7: RouteAnswer(choice, np.array([0.2, 0.1, 0.3]), np.array([0.5, 0.2, 0.1])),
+        8: RouteAnswer(none, np.array([0.3, 0.4, 0.5]), np.array([0.1, 0.2, 0.6]), in_use=2),
+    }
+    assert [answer.chosen for answer in answers.values()] == [1, 2]
+    assert [answer.rank for answer in answers.values()] == [1, 2]
+    mean, use, every = summary(answers).splitlines()[-3:]
+    assert mean.split() == ["mean", "0.300", "0.400", "0.550", "0.283", "0.100", "1.5"]
+    # The gains are 0.3 and 0, and 0.067 and -0.3.
+    assert use.endswith("in use: 0.150 m, with a standard error of 0.150 m")
+    assert every.endswith("routes: -0.117 m, with a standard error of 0.183 m")
