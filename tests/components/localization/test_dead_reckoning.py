@@ -202,6 +202,21 @@ def test_settling_on_the_springs_is_no_bias():
     assert np.abs(value(samples, "gyro_bias")).max() < 1e-3
 
 
+@pytest.mark.parametrize(("resting", "bounds"), [(2e-3, (0.0, 1e-3)), (0.02, (5e-3, 0.02))])
+def test_failed_wheel_sensor_is_no_standstill(resting, bounds):
+    """The carrier rests for 2 s and turns slowly for 20 s, while the wheels show nothing: only the shaking tells.
+
+    It does not if the accelerometers were as noisy at rest.
+    """
+    rng, n = np.random.default_rng(4), 1100
+    samples = np.tile([0.0, 0.0, 0.0, *-G, 0.0], (n, 1))
+    samples[100:, 2] = 0.015
+    samples[:, :3] += 1e-3 * rng.normal(size=(n, 3))
+    samples[:, 3:6] += np.where(np.arange(n) < 100, resting, 0.02)[:, None] * rng.normal(size=(n, 3))
+    bias = value(samples, "gyro_bias")[2]
+    assert bounds[0] <= abs(bias) < bounds[1]
+
+
 def test_samples_that_cannot_be_are_left_out():
     samples = Drive().samples()[:300]
     broken = samples.copy()

@@ -134,7 +134,9 @@ class DeadReckoning(LeafSystem):
     measure about the vertical is their bias: another Kalman filter, with the same noise. (About other axes, it is the
     rocking on the springs, too.) The carrier stands still when for half a second the rates have stayed below
     ``still_rate``, the mean speed, with a time constant of half a second, below ``still_speed``, and no speed was above
-    four times that: wheel sensors are noisy at rest, too.
+    four times that: wheel sensors are noisy at rest, too. The accelerometers are a second witness, because a wheel
+    sensor that fails shows no speed either. The root mean square of what they measure beside its mean, with the same
+    time constant for both, is at most twice the least one so far, or ``still_force``, while the carrier stands still.
 
     A sample with a number that is not finite, or with one of 1,000 or more, is left out and counted in ``ignored``:
     speed and turn rate go on.
@@ -169,15 +171,15 @@ class DeadReckoning(LeafSystem):
             "levelling": np.zeros(8),
             # Of the vertical, with the bias across it, of that, and of the bias about it.
             "variances": np.array([1.0, 0.0, variance, variance]),
-            # Samples, those at rest, those ignored, and the mean speed.
-            "counts": np.zeros(4),
+            # Samples, those at rest, those ignored, mean speed and force, mean square of the shaking, and the least.
+            "counts": np.array([*[0.0] * 8, _LARGEST**2]),
         }
         groups = {name: self.DeclareDiscreteState(value) for name, value in starts.items()}
         for port in ("motion", "history"):
             self.DeclareStateOutputPort(port, groups[port])
         self._groups = tuple(int(index) for index in groups.values())
         motion, history, levelling, variances, counts = self._groups
-        settings = self.DeclareNumericParameter(BasicVector([0.1, 0.03, 0.02, 3e-5, 2e-3, axle]))
+        settings = self.DeclareNumericParameter(BasicVector([0.1, 0.03, 0.02, 3e-5, 2e-3, axle, 3e-3]))
         bounds = (0.0, inf)
         self.variables = (
             discrete_state("time", motion, unit="s"),
@@ -197,12 +199,16 @@ class DeadReckoning(LeafSystem):
             discrete_state("samples_at_rest", counts, start=1, bounds=bounds),
             discrete_state("ignored", counts, start=2, bounds=bounds),
             discrete_state("mean_speed", counts, start=3, unit="m/s"),
+            discrete_state("mean_force", counts, start=4, shape=(3,), unit="m/s^2"),
+            discrete_state("shaking", counts, start=7, unit="m^2/s^4", bounds=bounds),
+            discrete_state("least_shaking", counts, start=8, unit="m^2/s^4", bounds=bounds),
             parameter("sway", settings, unit="m/s^2", bounds=bounds),
             parameter("still_speed", settings, start=1, unit="m/s", bounds=bounds),
             parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
             parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=bounds),
             parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=bounds),
             parameter("axle", settings, start=5, unit="m"),
+            parameter("still_force", settings, start=6, unit="m/s^2", bounds=bounds),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -238,14 +244,19 @@ class DeadReckoning(LeafSystem):
             state.set_value(group, value)
 
     def _counted(self, context: Context, sample: list[float], counts: list[float]) -> list[float]:
-        """Return the samples, those at rest, those ignored, and the mean speed (m/s)."""
-        _, still_speed, still_rate, *_ = context.get_numeric_parameter(0).value().tolist()
-        samples, at_rest, ignored, mean = counts
-        rates, speed = sample[:3], sample[6]
-        mean += max(self._period / _SETTLING_TIME, 1.0 / (samples + 1.0)) * (speed - mean)
-        moves = abs(mean) > still_speed or abs(speed) > 4.0 * still_speed
-        moves = moves or any(abs(rate) > still_rate for rate in rates)
-        return [samples + 1.0, 0.0 if moves else at_rest + 1.0, ignored, mean]
+        """Return what is counted after a sample: the samples, those at rest, and the means, as ``counts`` has them."""
+        _, still_speed, still_rate, _, _, _, still_force = context.get_numeric_parameter(0).value().tolist()
+        samples, at_rest, ignored, speed, *force, shaking, least = counts
+        gain = max(self._period / _SETTLING_TIME, 1.0 / (samples + 1.0))
+        speed += gain * (sample[6] - speed)
+        force = [mean + gain * (f - mean) for mean, f in zip(force, sample[3:6], strict=True)]
+        shaking += gain * (sum((f - mean) ** 2 for f, mean in zip(sample[3:6], force, strict=True)) - shaking)
+        if samples * self._period > _SETTLING_TIME:
+            least = min(least, shaking)
+        moves = abs(speed) > still_speed or abs(sample[6]) > 4.0 * still_speed
+        moves = moves or any(abs(rate) > still_rate for rate in sample[:3])
+        moves = moves or shaking > max(4.0 * least, still_force**2)
+        return [samples + 1.0, 0.0 if moves else at_rest + 1.0, ignored, speed, *force, shaking, least]
 
     def _levelled(
         self, context: Context, sample: list[float], levelling: list[float], variances: list[float], counts: list[float]
@@ -257,9 +268,9 @@ class DeadReckoning(LeafSystem):
             sample: Angular velocity (rad/s), specific force (m/s^2) and speed (m/s), (7,).
             levelling: Gravity (m/s^2), velocity (m/s) and bias (rad/s) before, (8,).
             variances: Those before, (4,).
-            counts: Those of `_counted`, with this sample, (4,).
+            counts: Those of `_counted`, with this sample, (9,).
         """
-        sway, _, _, bias_drift, gyro_noise, axle = context.get_numeric_parameter(0).value().tolist()
+        sway, _, _, bias_drift, gyro_noise, axle, _ = context.get_numeric_parameter(0).value().tolist()
         T, gravity, before, bias = self._period, levelling[:3], levelling[3:5], levelling[5:]
         tilt, both, level, vertical = variances
         vertical += bias_drift**2 * T
