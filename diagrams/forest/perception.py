@@ -78,10 +78,10 @@ class ScanLandmarks:
 
         Args:
             scan: What was measured.
-            history: The port ``history`` of the `DeadReckoning`.
+            history: The port ``history`` of the `DeadReckoning`, also as rows of poses.
             time: When the scan was complete, by the clock of the DPS, in s.
         """
-        if len(scan.times) and time + scan.times.min() < history[-POSE]:
+        if len(scan.times) and time + scan.times.min() < np.ravel(history)[-POSE]:
             return Landmarks.empty()
         points_H = deskewed(scan, history, self.X_BL, time=time)
         _, roll, pitch, *_ = carrier_pose_at(history, time)

@@ -118,7 +118,7 @@ class DeadReckoning(LeafSystem):
 
         g <- exp(-[w T]x) g,   g <- g + k (a - g),   b <- b + l g x a / g^2,   a = f - dV/dt - w x V,
 
-    where w are the rates without the gyros' bias b, and V = 0 while the carrier stands still. Only the direction
+    where w are the rates without the gyros' bias b; V = 0 in samples that show no motion (below). Only the direction
     u = g / |g| is used, so that gravity need not be known. k and l are the gains of a Kalman filter for the errors of
     u and of b across it, alike in all directions: gyros have the noise ``gyro_noise`` per sample, and b is a random
     walk with the deviation ``bias_drift``. What the wheels do not tell of the acceleration, as when the carrier sways
