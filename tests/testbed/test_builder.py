@@ -87,6 +87,12 @@ def test_a_dps_that_does_not_fit_is_refused(dps, message):
         builder.set_dps(dps())
 
 
+def test_all_inputs_are_named_where_one_is_missing():
+    builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=RigidTransform()), SENSE], []))
+    with pytest.raises(SignalError, match="no input port y; it has: seen"):
+        builder.set_dps(PoseRelay())
+
+
 def test_an_input_of_the_dps_that_is_no_signal_is_refused():
     builder = VirtualTestbedBuilder(Interface([Signal("seen", model_value=RigidTransform())], []))
     builder.set_dps(PoseRelay())

@@ -180,9 +180,10 @@ class VirtualTestbedBuilder:
     def _check_ports(self, dps: System) -> None:
         inputs = {dps.get_input_port(i).get_name(): dps.get_input_port(i) for i in range(dps.num_input_ports())}
         outputs = {dps.get_output_port(i).get_name(): dps.get_output_port(i) for i in range(dps.num_output_ports())}
+        known = ", ".join(inputs) or "none"
         for signal in [*self.interface.sense, *self.interface.commands]:
             if signal.name not in inputs:
-                raise SignalError(f"the DPS has no input port {signal.name}; it has: {', '.join(inputs) or 'none'}")
+                raise SignalError(f"the DPS has no input port {signal.name}; it has: {known}")
             signal.check_port(inputs.pop(signal.name), "the DPS")
         for signal in self.interface.act:
             if signal.name not in outputs:

@@ -25,7 +25,15 @@ from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoi
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders, SampledSensor, connect_to_plant, normal_noise
+from vtbdrake.components.sensors import (
+    ContactSensor,
+    Imu,
+    JointEncoders,
+    JointTachometers,
+    SampledSensor,
+    connect_to_plant,
+    normal_noise,
+)
 
 PERIOD = 0.01
 G = 9.81
@@ -169,6 +177,15 @@ def test_encoders_refuse_a_floating_base() -> None:
     del builder
     with pytest.raises(ValueError, match="7 positions"):
         JointEncoders(plant, [plant.GetJointByName("body")], period=PERIOD)
+
+
+@pytest.mark.parametrize("sensor", [JointEncoders, JointTachometers])
+def test_joint_sensors_refuse_a_plant_before_finalize(sensor) -> None:
+    plant = MultibodyPlant(0.001)
+    body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    joint = plant.AddJoint(RevoluteJoint("joint", plant.world_frame(), body.body_frame(), [0, 1, 0]))
+    with pytest.raises(RuntimeError, match=r"call Finalize\(\) first"):
+        sensor(plant, [joint], period=PERIOD)
 
 
 def noisy_readings(*, seed: float, stream: int, std: float, start: float = 0.0) -> list[float]:

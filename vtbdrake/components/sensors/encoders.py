@@ -72,8 +72,9 @@ class JointEncoders(_JointSensor):
         errors: ErrorModel | None = None,
     ) -> None:
         _check_single(joints, self)
+        positions = plant.GetDefaultPositions()  # Before Finalize it raises; position_start would raise SystemExit.
         entries = [joint.position_start() for joint in joints]
-        default = plant.GetDefaultPositions()[entries]
+        default = positions[entries]
         super().__init__(
             "joint_encoders", plant, entries, default=default, period=period, unit="rad", stream=stream, errors=errors
         )
