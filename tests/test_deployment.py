@@ -20,7 +20,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment, DeploymentError
 from vtbdrake.lcm.hub import Hub
-from vtbdrake.lcm.protocol import ProtocolError
+from vtbdrake.lcm.protocol import Protocol, ProtocolError
 from vtbdrake.machine import MachineProcess
 from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
@@ -76,6 +76,12 @@ def test_limited_rate_without_continuity_is_refused() -> None:
         (Deployment(continuity={"velocity": ("velocity", 1.0)}), "not from 'velocity' to 'velocity'"),
         (Deployment(continuity={"speed": ("speed", 1.0)}), "not from 'speed' to 'speed'"),
         (Deployment(continuity=CONTINUITY, guards={"fallback": {"torque": Hold()}}), "fallback is given for torque"),
+        (
+            Deployment(continuity=CONTINUITY, guards={"fallback": {"velocity": Hold}}),
+            "a Fallback, Zero() say, not <class",
+        ),
+        (Deployment(continuity=CONTINUITY, protocol=Protocol(sense=[], act=[])), "position"),
+        (Deployment(continuity=CONTINUITY, pace="posture"), "(position, speed), not by 'posture'"),
     ],
 )
 def test_deployment_that_does_not_fit_the_signals_is_refused(deployment: Any, reason: str) -> None:
@@ -125,7 +131,7 @@ def test_take_over_starts_from_the_first_measurement() -> None:
 
 def test_take_over_waits_until_the_machine_is_ready() -> None:
     def blocked_by(bridge: Bridge) -> str | None:
-        return None if bridge.sensed["position"].count > 2500 else "its brakes are on"
+        return None if bridge.sensed["position"].arrived >= 2.5 else "its brakes are on"
 
     machine = Machine(Deployment(continuity=CONTINUITY, blocked_by=blocked_by))
     machine.take_over()
@@ -195,6 +201,20 @@ def test_whole_testbed_is_deployed_from_a_snapshot() -> None:
         runtime.run(cycles=50)
         assert testbed.read(runtime.context, "dps.gain") == 3.0
         assert runtime.time == pytest.approx(50 * PERIOD)
+
+
+def test_protocol_of_a_given_deployment_is_used() -> None:
+    scenario = ServoMachineScenario()
+    given = scenario.deployment()
+    assert given.protocol is not None
+    maps = {
+        side: [replace(m, channel=f"OTHER_{m.channel}") for m in getattr(given.protocol, side)]
+        for side in ("sense", "act")
+    }
+    deployment = replace(given, protocol=Protocol(**maps))
+    with Hub(port=0) as hub, scenario.deploy(hub.url, deployment=deployment) as runtime:
+        channels = set(runtime.bridge.channels.values())
+    assert channels == {m.channel for m in maps["sense"]}
 
 
 def test_missing_bus_and_missing_protocol_are_errors() -> None:

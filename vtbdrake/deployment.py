@@ -46,7 +46,7 @@ class Deployment:
                     sense=[iiwa_status({"position": "joint_position_measured"})],
                     act=[iiwa_command({"torque": "joint_torque"})],
                 ),
-                guards={"fallback": {"torque": Hold()}},
+                guards={"fallback": {"torque": Silence()}},
                 continuity={"torque": ("torque_measured", 5.0)},
             )
 
@@ -96,9 +96,14 @@ class Deployment:
         """Check that the DPS with this interface can run safely.
 
         Raises:
-            ValueError: The deployment does not fit the signals, a limited actuator signal has no continuity, or a
-                silent machine would not be noticed.
+            ValueError: The deployment or its protocol does not fit the signals, a limited actuator signal has no
+                continuity, or a silent machine would not be noticed.
         """
+        if self.protocol is not None:
+            self.protocol.check(interface)
+        names = [signal.name for signal in interface.sense]
+        if self.pace and self.pace not in names:
+            raise ValueError(f"a loop is paced by a sensor signal ({', '.join(names)}), not by {self.pace!r}")
         guards = self._guards(interface)
         if self.check_age and interface.sense and all(signal.max_age == inf for signal in interface.sense):
             raise ValueError(
@@ -165,7 +170,8 @@ def deploy(
     deployment = deployment or Deployment.of(scenario)
     interface = scenario.interface()
     deployment.check(interface)
-    bridge = protocol_of(scenario).bridge(interface, url)
+    protocol = deployment.protocol or protocol_of(scenario)  # Which raises, if the scenario has none, either.
+    bridge = protocol.bridge(interface, url)
     target = target or DpsAlone(scenario)
     context = context or target.default_context()
     if start is not None:

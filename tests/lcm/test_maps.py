@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -164,9 +165,12 @@ def test_signals_that_share_a_length_have_one_size() -> None:
         iiwa_status(SENSE).decoder(signals(position=7, torque=6))
 
 
-def test_type_not_made_by_lcm_gen_is_refused() -> None:
+@pytest.mark.parametrize(
+    "make", [lambda: LcmMap(channel="A", type=dict, signals=["a"]), lambda: vector_map("A", dict, {"a": "a"})]
+)
+def test_type_not_made_by_lcm_gen_is_refused(make: Callable[[], LcmMap]) -> None:
     with pytest.raises(ValueError, match="is no class made by lcm-gen"):
-        LcmMap(channel="A", type=dict, signals=["a"])
+        make()
 
 
 @pytest.mark.parametrize("channel", ["", "C" * 64])

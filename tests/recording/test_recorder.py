@@ -243,7 +243,7 @@ def test_stopped_worker_process_loses_cycles_only(tmp_path: Path, caplog: pytest
 def test_log_is_overwritten_only_on_request(tmp_path: Path) -> None:
     (tmp_path / "run.lcm").write_text("dear")
     servo = Servo()
-    with pytest.raises(FileExistsError, match=r"run\.lcm exists: record to another file, or with overwrite=True"):
+    with pytest.raises(FileExistsError, match=r"run\.lcm exists: record to another file, or remove it"):
         Recorder(servo.runtime, tmp_path / "run.lcm")
     assert (tmp_path / "run.lcm").read_text() == "dear"
     Recorder(servo.runtime, tmp_path / "run.lcm", overwrite=True).close()

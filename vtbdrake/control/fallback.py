@@ -175,11 +175,13 @@ def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[F
     """Return a fallback, the one that replaces it if it fails, and so on.
 
     Raises:
-        ValueError: One of them cannot command ``signal``.
+        ValueError: One of them is no fallback, or cannot command ``signal``.
     """
     found: list[Fallback] = []
     link: Fallback | None = fallback
     while link is not None and link not in found:
+        if not isinstance(link, Fallback):
+            raise ValueError(f"the fallback of {signal.name} is a Fallback, Zero() say, not {link!r}")
         link.check(signal, interface=interface)
         found.append(link)
         link = link.otherwise

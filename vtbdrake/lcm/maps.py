@@ -116,8 +116,7 @@ class LcmMap:
             raise ValueError(
                 f"an LCM channel's name has 1 to {LONGEST_CHANNEL_NAME} bytes, not {size}: {self.channel!r}"
             )
-        if not callable(getattr(self.type, "_get_packed_fingerprint", None)):
-            raise ValueError(f"channel {self.channel}: {self.type!r} is no class made by lcm-gen")
+        _check_type(self.channel, self.type)
         if not self.signals or len(set(self.signals)) < len(self.signals):
             raise ValueError(f"channel {self.channel} carries at least one signal, each once, not {self.signals}")
 
@@ -182,6 +181,11 @@ class Field(NamedTuple):
     def size(self) -> int:
         """Return how many numbers the field has if its dimensions are fixed."""
         return prod(size for size in self.dimensions if isinstance(size, int))
+
+
+def _check_type(channel: str, message_type: Any) -> None:
+    if not callable(getattr(message_type, "_get_packed_fingerprint", None)):
+        raise ValueError(f"channel {channel}: {message_type!r} is no class made by lcm-gen")
 
 
 def _fields(message_type: Any, prefix: str = "") -> tuple[Field, ...]:
@@ -305,6 +309,7 @@ def vector_map(
     Raises:
         ValueError: There is no such field, or it does not hold numbers.
     """
+    _check_type(channel, message_type)
     try:
         known_fields = _fields(message_type)
     except RecursionError:

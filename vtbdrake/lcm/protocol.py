@@ -45,6 +45,21 @@ class Protocol:
     reported: Mapping[str, str] = field(default_factory=dict)
     periods: Mapping[str, float] = field(default_factory=dict)
 
+    def check(self, interface: Interface) -> None:
+        """Check that the maps carry the signals of ``interface``.
+
+        Raises:
+            ValueError: A signal has no map or several, a map does not fit it, or a period is not that of a channel.
+        """
+        self.bridge(interface, "memq://")
+        channels = [map.channel for map in self.sense]
+        for channel, period in self.periods.items():
+            if channel not in channels or not period > 0.0:
+                raise ValueError(
+                    f"its periods must map channels of sense ({', '.join(channels)}) to positive times, "
+                    f"not {channel!r} to {period!r} s"
+                )
+
     def bridge(self, interface: Interface, url: str, **options: Any) -> LcmBridge:
         """Return the controller's end, not yet open.
 
@@ -71,14 +86,7 @@ def protocol_of(scenario: Scenario) -> Protocol:
             "Deployment(protocol=Protocol(...))"
         )
     try:
-        protocol.bridge(scenario.interface(), "memq://")
+        protocol.check(scenario.interface())
     except ValueError as error:
         raise ProtocolError(f"the protocol of {name} does not fit its signals: {error}") from error
-    channels = [map.channel for map in protocol.sense]
-    for channel, period in protocol.periods.items():
-        if channel not in channels or not period > 0.0:
-            raise ProtocolError(
-                f"periods in the protocol of {name} must map channels of sense ({', '.join(channels)}) to positive "
-                f"times, not {channel!r} to {period!r} s"
-            )
     return protocol

@@ -125,7 +125,9 @@ class Recorder:
         try:
             self.path.open("wb" if overwrite else "xb").close()
         except FileExistsError:
-            raise FileExistsError(f"{self.path} exists: record to another file, or with overwrite=True") from None
+            raise FileExistsError(
+                f"{self.path} exists: record to another file, or remove it (Recorder(..., overwrite=True) does)"
+            ) from None
         self._worker = BackgroundProcess(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
