@@ -17,6 +17,7 @@ BENCHMARKS: Registry = {
     "testbed_overhead": "benchmarks.space_climber:testbed_overhead",
     "sweep_speedup": "benchmarks.space_climber:sweep_speedup",
     "rollout_rtf": "benchmarks.space_climber:rollout_rtf",
+    "rollout_ladder": "benchmarks.ladder:rollout_ladder",
     "parallel_efficiency_cpp": "benchmarks.parallel:parallel_efficiency_cpp",
     "parallel_efficiency_python": "benchmarks.parallel:parallel_efficiency_python",
     "cluster_projection": "benchmarks.cluster:cluster_projection",
