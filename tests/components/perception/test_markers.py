@@ -195,6 +195,13 @@ def test_corners_that_do_not_fit_the_board_are_no_estimate() -> None:
     assert not pose_from_markers(exchanged, board(), INTRINSICS, time=0.0).valid
 
 
+def test_corners_that_are_no_markers_are_no_estimate() -> None:
+    together = Detections(board().ids, np.full((4, 4, 2), 100.0))
+    assert not pose_from_markers(together, board(), INTRINSICS, time=0.0).valid
+    with pytest.raises(ValueError, match="corners of markers are finite"):
+        pose_from_markers(Detections(board().ids, np.full((4, 4, 2), np.nan)), board(), INTRINSICS, time=0.0)
+
+
 def test_marker_that_the_board_lacks_is_ignored() -> None:
     found = Detections(np.array([5, 3, 3]), np.zeros((3, 4, 2)))
     assert found.on(board()).ids.tolist() == [3]

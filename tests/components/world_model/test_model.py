@@ -173,6 +173,13 @@ def test_what_is_no_object_is_refused(make: object, message: str) -> None:
         make()
 
 
+def test_status_and_deviation_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="a status is one of tentative, confirmed, revised, retired, not 'confirmd'"):
+        WorldModel().find(status="confirmd")
+    with pytest.raises(ValueError, match=r"at least 0 m, not -0\.1"):
+        position_estimate(np.zeros(3), deviation=-0.1)
+
+
 @pytest.mark.parametrize("unit", ["m", "kg/m^3", "1", "1/s", "N*m", "rad", "m/s^2"])
 def test_si_units_are_accepted(unit: str) -> None:
     assert Quantity(1.0, unit).unit == unit

@@ -231,8 +231,9 @@ def test_attributes_are_fused() -> None:
     assert after["species"].value == "pine" and after["height"].value == 20.0
 
 
-def test_units_of_a_sighting_must_agree() -> None:
-    one = tree("t", [0.0, 0.0, 0.0], attributes={"trunk_diameter": Quantity(0.3, "rad", 0.02)})
+@pytest.mark.parametrize("deviation", [0.02, 0.0])
+def test_units_of_a_sighting_must_agree(deviation: float) -> None:
+    one = tree("t", [0.0, 0.0, 0.0], attributes={"trunk_diameter": Quantity(0.3, "rad", deviation)})
     with pytest.raises(ValueError, match="in rad, but was seen in m"):
         observe(WorldModel([one]), [seen([0.0, 0.0, 0.0], diameter=0.3)])
 

@@ -382,12 +382,17 @@ def pose_from_markers(
 
     Returns:
         An estimate of X_CT; a missing one if there are too few markers, if they do not fit, or if two poses do.
+
+    Raises:
+        ValueError: A corner is not finite.
     """
     found = detections.on(board)
     if not len(found.ids) or (prediction is None and len(found.ids) < fewest):
         return PoseEstimate.missing(time=time)
     points = board.corners[board.find(found.ids)].reshape(-1, 3)
     pixels = found.corners.reshape(-1, 2)
+    if not np.isfinite(pixels).all():
+        raise ValueError("corners of markers are finite numbers of pixels: leave out what was not found")
     intrinsics = np.asarray(intrinsics, dtype=float)
     start = prediction if len(found.ids) < fewest else _start(points, pixels, intrinsics)
     fit = None if start is None else _refine(points, pixels, intrinsics, start)
@@ -426,7 +431,10 @@ def _start(points: Array, pixels: Array, intrinsics: Array) -> RigidTransform | 
 
     fx, fy, cx, cy = intrinsics
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    solved, rotation, translation = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    try:
+        solved, rotation, translation = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:  # All corners are in one place.
+        return None
     if not solved or not np.isfinite(rotation).all():
         return None
     return RigidTransform(RotationMatrix(rotation_matrix(rotation.ravel())), translation.ravel())

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.components.world_model.objects import Quantity, Relation, WorldObject
+from vtbdrake.components.world_model.objects import STATUSES, Quantity, Relation, WorldObject
 from vtbdrake.state.declarations import Codec
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ class WorldModel:
                 Objects without the attribute do not meet the condition.
 
         Raises:
-            ValueError: A point, a box or the condition of an attribute is not one.
+            ValueError: A point, a box, a status or the condition of an attribute is not one.
         """
         chosen: Iterable[WorldObject] = self
         if near is not None:
@@ -117,6 +117,9 @@ class WorldModel:
                 raise ValueError(f"a box is its least and its largest coordinates, (2,) or (3,), not {box!r}")
             chosen = [one for one in chosen if _inside(one.pose.matrix[: low.size, 3], low, high)]
         statuses = (status,) if isinstance(status, str) else None if status is None else tuple(status)
+        for one_status in statuses or ():
+            if one_status not in STATUSES:
+                raise ValueError(f"a status is one of {', '.join(STATUSES)}, not {one_status!r}")
         conditions = [(name, _condition(name, wanted)) for name, wanted in (attributes or {}).items()]
         return tuple(
             one

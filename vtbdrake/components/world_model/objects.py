@@ -180,8 +180,13 @@ def position_estimate(
         deviation: The standard deviation of each coordinate in m, one number or three; ``inf`` where a coordinate is
             not known.
         time: When it held, in s.
+
+    Raises:
+        ValueError: A deviation is negative or NaN.
     """
     deviations = np.broadcast_to(np.asarray(deviation, dtype=float), (3,))
+    if not (deviations >= 0.0).all():
+        raise ValueError(f"deviations of a position are at least 0 m, not {deviation!r}")
     variances = np.concatenate([np.full(3, np.inf), deviations**2])
     return PoseEstimate.of(RigidTransform(np.asarray(p_WoOo_W, dtype=float)), np.diag(variances), time=time)
 

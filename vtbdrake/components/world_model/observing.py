@@ -170,8 +170,9 @@ def _fused_attributes(one: WorldObject, sighting: Sighting) -> Mapping[str, Quan
     attributes = dict(one.attributes)
     for name, seen in sighting.attributes.items():
         known = attributes.setdefault(name, seen)
-        if known is not seen and known.is_measured and seen.is_measured:
+        if known is not seen:
             check_units(one, name, known, seen)
+        if known is not seen and known.is_measured and seen.is_measured:
             gain = known.deviation**2 / (known.deviation**2 + seen.deviation**2)
             value = float(known.value) + gain * (float(seen.value) - float(known.value))
             attributes[name] = Quantity(value, known.unit, float(np.sqrt(gain)) * seen.deviation)
