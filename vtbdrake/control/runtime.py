@@ -145,6 +145,8 @@ class Runtime(Stepped):
     ) -> None:
         """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
 
+        What has arrived since the last run is read before the first cycle, which gets the newest values.
+
         Args:
             cycles: Number of cycles.
             seconds: Time on the clock.
