@@ -80,6 +80,13 @@ def test_memory_is_constant() -> None:
     assert len(histogram.to_dict()["bins"]) <= 1622  # 1620 bins between 1 us and 10 s at 1 %, and one at each end.
 
 
+def test_histogram_shows_itself_in_a_line() -> None:
+    histogram = Histogram()
+    histogram.record(0.1)
+    histogram.record(0.3)
+    assert repr(histogram) == "Histogram(2 durations, mean 0.2 s, largest 0.3 s)"
+
+
 def test_empty_histogram_has_nan_statistics() -> None:
     histogram = Histogram()
     assert all(isnan(x) for x in (histogram.mean, histogram.least, histogram.largest, histogram.percentile(50.0)))

@@ -75,7 +75,11 @@ class Hold(Fallback):
 
 
 class Zero(Fallback):
-    """Commands zero torque, force or velocity, approached within the limits."""
+    """Commands zero torque, force or velocity, approached within the limits.
+
+    Zero torque is safe for an arm that carries its own weight. Another one falls, and its time-out does not brake it,
+    as commands go on: take `Silence`, or a `FallbackController` with a model.
+    """
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
         if not signal.is_vector:

@@ -41,6 +41,9 @@ class Histogram:
         self._shift = 1.0 - self._scale * log(lowest)
         self._bins = [0] * (ceil(self._scale * log(highest / lowest)) + 2)
 
+    def __repr__(self) -> str:
+        return f"Histogram({self.count} durations, mean {self.mean:.3g} s, largest {self.largest:.3g} s)"
+
     def record(self, seconds: float) -> None:
         """Add one duration.
 
