@@ -67,8 +67,9 @@ def test_poll_notices_a_killed_hub_and_finds_its_successor() -> None:
             assert wait(arm, lambda: arm.connected)
             assert (arm.link.losses, arm.link.reconnections) == (1, 1)
             peer = Peer(arm.url)
-            peer.lcm.publish("IIWA_STATUS", status(2).encode())
+            peer.lcm.publish("IIWA_STATUS", status(3_600_000_000).encode())  # An hour is missing.
             assert wait(arm, lambda: arm.sensed["position"].count == 2)
+            assert arm.sensed["position"].rejected == {}
             arm.publish({"position": np.zeros(7)})
             assert [channel for channel, _ in peer.hear(2)] == ["IIWA_STATUS", "IIWA_COMMAND"]
     finally:

@@ -39,8 +39,8 @@ class LcmBridge(Bridge):
 
     A message is rejected as ``out of order`` if its time is before the last accepted one's, as a ``duplicate`` if it is
     the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` ahead of what the quickest message so far and the
-    time that has passed here let expect. A sender that was restarted, or whose clock was set, is accepted after
-    ``reorder_window`` seconds in which no message has continued its old time.
+    time that has passed here let expect, unless the bus was lost in between. A sender that was restarted, or whose
+    clock was set, is accepted after ``reorder_window`` seconds in which no message has continued its old time.
 
     Limiting actuator commands is the guards' business, but one that is not finite or not within its signal's limits is
     never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
@@ -122,7 +122,7 @@ class LcmBridge(Bridge):
             handlers |= {map.channel: self._foreign.take for map in act}
         if url.startswith(_HUB):
             handlers[STATUS_CHANNEL] = self._foreign.take_status
-        self.link = LcmLink(url, handlers, connect_timeout=connect_timeout)
+        self.link = LcmLink(url, handlers, connect_timeout=connect_timeout, reconnected=self._expect_gap)
 
     @property
     def clock_jumps(self) -> dict[str, int]:
@@ -204,6 +204,10 @@ class LcmBridge(Bridge):
 
         return take
 
+    def _expect_gap(self) -> None:
+        for reader in self._readers:
+            reader.expect_gap()
+
     def claim(self) -> None:
         """Claim the protected actuator channels at the hub, which grants those whose owner has fallen silent.
 
@@ -237,6 +241,10 @@ class ChannelReader:
         self._ahead = inf  # by how much it was ahead of ours, at most: a message that has waited does not count
         self._unfit_since = inf  # when the first message since then came that does not continue the sender's time
 
+    def expect_gap(self) -> None:
+        """Accept the next message however far ahead it is: after a loss of the bus, messages are missing."""
+        self._ahead = inf
+
     def take(self, channel: str, data: bytes) -> None:
         """Handle one message."""
         now = time.monotonic()
@@ -261,7 +269,7 @@ class ChannelReader:
                 accepted = True
         if accepted and isfinite(sent):
             ahead = sent - now
-            if fits and isfinite(self._last):
+            if fits and self._ahead < inf:
                 ahead = max(ahead, self._ahead)
             self.clock_jumps += not fits
             self._last, self._ahead, self._unfit_since = sent, ahead, inf

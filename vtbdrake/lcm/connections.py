@@ -285,7 +285,13 @@ class LcmLink:
     """Receives and publishes while there is a bus, and searches for it while there is none."""
 
     def __init__(
-        self, url: str, handlers: Mapping[str, Handler], *, connect_timeout: float, stamped: bool = False
+        self,
+        url: str,
+        handlers: Mapping[str, Handler],
+        *,
+        connect_timeout: float,
+        stamped: bool = False,
+        reconnected: Callable[[], None] = lambda: None,
     ) -> None:
         """Prepare the link; `open` connects.
 
@@ -294,6 +300,7 @@ class LcmLink:
             handlers: By channel, what takes its messages.
             connect_timeout: Seconds to wait for a hub.
             stamped: Whether the kernel shall stamp what arrives; see `TcpqConnection`.
+            reconnected: Called when the bus was found again, before any message of the new connection.
         """
         self.url = url  # the LCM URL of the bus
         self.losses = 0  # how often the bus was lost
@@ -303,6 +310,7 @@ class LcmLink:
             self._connect = partial(TcpqConnection, url, handlers, connect_timeout, stamped=stamped)
         self._connection: Connection | None = None
         self._search: _Search | None = None
+        self._reconnected = reconnected
 
     def open(self) -> None:
         """Connect to the bus.
@@ -352,6 +360,7 @@ class LcmLink:
         if self._search is not None and (found := self._search.result(timeout)) is not None:
             self._connection, self._search = found, None
             self.reconnections += 1
+            self._reconnected()
         return self._connection
 
     def _required(self, timeout: float = 0.0) -> Connection | None:
