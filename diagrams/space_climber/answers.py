@@ -125,4 +125,4 @@ def _reasons(case: crater.Case) -> str:
     failing = [angle for angle, passes in sorted(case.passable.items()) if not passes]
     reasons = crater.explain(crater.model(case.seed), failing)
     texts = [f"{np.degrees(angle):.0f} deg {' or '.join(found) or 'unexplained'}" for angle, found in reasons.items()]
-    return f"crater {case.seed}: {', '.join(texts)}"
+    return f"crater {case.seed}: {', '.join(texts) or 'none'}"
