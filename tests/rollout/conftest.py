@@ -1,4 +1,7 @@
-"""Pools of processes that several tests share; each is started when it is first asked for."""
+"""Pools of processes that several tests share; each is started when it is first asked for.
+
+The cluster ends with the module: its processes are busy all the time.
+"""
 
 import concurrent.futures
 from concurrent.futures import ProcessPoolExecutor
@@ -9,7 +12,7 @@ import pytest
 from benchmarks.dask_cluster import dask_cluster
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def cluster():
     """A Dask scheduler and two workers, which gives a rollout up when it has lost it with one of them."""
     with dask_cluster(workers=2, allowed_failures=0) as running:
