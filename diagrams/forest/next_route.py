@@ -182,7 +182,7 @@ def decide_and_drive(seed: int) -> RouteAnswer:
 
 
 def summary(answers: dict[int, RouteAnswer]) -> str:
-    """Return what the choices have gained in the forests of these seeds, as text: a table, and the mean gain."""
+    """Return what the choices have gained in the forests of these seeds, as text: a table, gains and spreads."""
     heads = ("forest", "expected m", "chosen m", "in use m", "all m", "best m", "better routes")
     rows = np.array([
         [one.expected[one.chosen], one.errors[one.chosen], one.errors[one.in_use], one.errors.mean(), one.errors.min()]
@@ -199,6 +199,11 @@ def summary(answers: dict[int, RouteAnswer]) -> str:
         gains = rows[:, column] - rows[:, 1]
         spread = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else np.nan
         text.append(f"gain over {name}: {gains.mean():.3f} m, with a standard error of {spread:.3f} m")
+    promised = np.mean([one.expected[one.in_use] - one.expected[one.chosen] for one in answers.values()])
+    text.append(f"expected gain over the route in use: {promised:.3f} m")
+    for name, values in (("errors", "errors"), ("expected deviations", "expected")):
+        spreads = np.mean([np.var(getattr(one, values)) for one in answers.values()]) ** 0.5
+        text.append(f"standard deviation of the {name} of the routes of a forest: {spreads:.3f} m")
     return "\n".join(text)
 
 

@@ -89,8 +89,11 @@ def test_summary_compares_the_choice_with_all_routes() -> None:
     }
     assert [answer.chosen for answer in answers.values()] == [1, 2]
     assert [answer.rank for answer in answers.values()] == [1, 2]
-    mean, use, every = summary(answers).splitlines()[-3:]
+    mean, use, every, promised, errors, expected = summary(answers).splitlines()[-6:]
     assert mean.split() == ["mean", "0.300", "0.400", "0.550", "0.283", "0.100", "1.5"]
     # The gains are 0.3 and 0, and 0.067 and -0.3.
     assert use.endswith("in use: 0.150 m, with a standard error of 0.150 m")
     assert every.endswith("routes: -0.117 m, with a standard error of 0.183 m")
+    assert promised.endswith(": 0.050 m")
+    assert errors.endswith("errors of the routes of a forest: 0.194 m")
+    assert expected.endswith("expected deviations of the routes of a forest: 0.082 m")
