@@ -81,11 +81,6 @@ class Arm:
         return (self.base_height, *self.lengths[:-1])
 
     @property
-    def tip_offset(self) -> float:
-        """Distance from the origin of the last link to T, along z (m)."""
-        return self.lengths[-1] + self.tool_length
-
-    @property
     def reflected_inertias(self) -> NDArray[np.float64]:
         """Inertias of the rotors about the axes of the joints, N^2 I, shape (7,), in kg m^2."""
         return self.gear_ratio**2 * np.array(self.rotor_inertias)

@@ -42,7 +42,7 @@ _SOURCES = {"camera": "markers", "scanner": "registration", "pose_sensor": "pose
 
 
 @dataclass(frozen=True)
-class Eyes:
+class TargetSensors:
     """The sensors with which the DPS perceives the target.
 
     Attributes:
@@ -62,7 +62,7 @@ class Eyes:
     pose_latency: float
 
 
-def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Diagram:
+def make_dps(sensing: TargetSensors, *, period: float = PERIOD, wheels: bool = False) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` leads the capture, ``act`` limits.
 
     Input ports: ``joint_position`` (9: the arm's joints in rad, the fingers in m), ``imu`` (6), ``target_pose`` (7, see
@@ -74,12 +74,12 @@ def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Dia
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", make_calibration({"joint_position": len(JOINT_NAMES), "imu": 6}))
-    env = builder.AddNamedSystem("env", _make_env(eyes, period=period))
+    env = builder.AddNamedSystem("env", _make_env(sensing, period=period))
     impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
     act = builder.AddNamedSystem("act", _make_act(wheels=wheels))
     for signal in ("joint_position", "imu"):
         builder.ExportInput(sense.GetInputPort(signal), signal)
-    for signal in ("target_pose", *(_SIGNALS[sensor] for sensor in eyes.aboard)):
+    for signal in ("target_pose", *(_SIGNALS[sensor] for sensor in sensing.aboard)):
         builder.ExportInput(env.GetInputPort(signal), signal)
     builder.ExportInput(impl.GetInputPort("capture"), "capture")
     builder.Connect(sense.GetOutputPort("imu"), env.GetInputPort("imu"))
@@ -94,7 +94,7 @@ def make_dps(eyes: Eyes, *, period: float = PERIOD, wheels: bool = False) -> Dia
     return dps
 
 
-def _make_env(eyes: Eyes, *, period: float) -> Diagram:
+def _make_env(sensing: TargetSensors, *, period: float) -> Diagram:
     """Return the perceived environment: where the base is in its inertial frame I, and how the target moves there.
 
     The tracker has an input port for every source that is aboard; those that do not guide it show no estimate there.
@@ -102,33 +102,33 @@ def _make_env(eyes: Eyes, *, period: float) -> Diagram:
     """
     builder = DiagramBuilder()
     base = builder.AddNamedSystem("base", BaseEstimator(period=period))
-    reader = PoseReader(period=period, latency=eyes.pose_latency)
+    reader = PoseReader(period=period, latency=sensing.pose_latency)
     builder.AddNamedSystem("pose_reader", reader)
-    sensors = (*eyes.aboard, "pose_sensor")
-    starting = [_SOURCES[sensor] for sensor in eyes.guides if sensor != "scanner"] or [_SOURCES["scanner"]]
+    sensors = (*sensing.aboard, "pose_sensor")
+    starting = [_SOURCES[sensor] for sensor in sensing.guides if sensor != "scanner"] or [_SOURCES["scanner"]]
     tracker = TargetTracker(
-        [_SOURCES[sensor] for sensor in sensors], starting=starting, period=period, motion=eyes.config.motion
+        [_SOURCES[sensor] for sensor in sensors], starting=starting, period=period, motion=sensing.config.motion
     )
     target = builder.AddNamedSystem("target", tracker)
     sources = {"pose_sensor": reader.GetOutputPort("estimate")}
-    if eyes.image is not None:
+    if sensing.image is not None:
         markers = add_marker_part(
             builder,
             base,
             target,
-            config=eyes.config,
+            config=sensing.config,
             period=period,
-            info=eyes.image,
-            image_latency=eyes.image_latency,
+            info=sensing.image,
+            image_latency=sensing.image_latency,
         )
         sources["camera"] = markers.GetOutputPort("estimate")
-    if "scanner" in eyes.aboard:
-        attitude = RotationMatrix() if eyes.guides == ("scanner",) else None
-        registration = add_scan_part(builder, base, target, config=eyes.config, period=period, attitude=attitude)
+    if "scanner" in sensing.aboard:
+        attitude = RotationMatrix() if sensing.guides == ("scanner",) else None
+        registration = add_scan_part(builder, base, target, config=sensing.config, period=period, attitude=attitude)
         sources["scanner"] = registration.GetOutputPort("estimate")
     for sensor in sensors:
         port = sources[sensor]
-        if sensor not in eyes.guides:
+        if sensor not in sensing.guides:
             unused = builder.AddNamedSystem(
                 f"no_{_SOURCES[sensor]}", ConstantValueSource(Value(PoseEstimate.missing()))
             )

@@ -26,7 +26,7 @@ from vtbdrake.scan import Scan
 from vtbdrake.state.systems import pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, Eyes, make_dps
+from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, TargetSensors, make_dps
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, target_board
 from vtbdrake_diagrams.satellite.plant import plant_config
 from vtbdrake_diagrams.satellite.supervisor import GO, STOP
@@ -177,7 +177,7 @@ class SatelliteScenario(Scenario):
         return signals
 
     def make_dps(self) -> Diagram:
-        eyes = Eyes(
+        sensing = TargetSensors(
             guides=tuple(self.perception.split("+")),
             aboard=self.aboard,
             config=self.evaluation,
@@ -185,7 +185,7 @@ class SatelliteScenario(Scenario):
             image_latency=self.camera_errors.latency / self.camera_rate,
             pose_latency=self.pose_errors.latency * POSE_PERIOD,
         )
-        return make_dps(eyes, wheels=self.wheels)
+        return make_dps(sensing, wheels=self.wheels)
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on its satellite: joints hold after a fault, and CAPTURE carries the command.

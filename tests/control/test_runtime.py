@@ -601,6 +601,7 @@ def test_interruption_dropped_by_pybind11_ends_the_loop(number):
         ({"continuity": {"velocty": ("speed", 1.0)}}, "not from 'velocty' to 'speed'; there are velocity and"),
         ({"continuity": {"velocity": ("sped", 1.0)}}, "not from 'velocity' to 'sped'"),
         ({"continuity": {"velocity": ("speed", np.nan)}}, "must not be negative, unlike nan"),
+        ({"continuity": {"velocity": ("speed", 1.0, 2.0)}}, r"is \(sensor signal, largest difference\)"),
         ({"guards": Guards(ServoScenario().interface(), 1.0)}, "made for a period of 1.0 s, not for 0.001 s"),
         ({"statistics": LoopStatistics(1.0)}, "made for a period of 1.0 s, not for 0.001 s"),
         (

@@ -84,11 +84,15 @@ def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, f
     """Check the ``continuity`` argument of `Runtime`.
 
     Raises:
-        ValueError: A signal does not exist, two signals have different sizes, or a largest difference is negative.
+        ValueError: An entry is no such pair, a signal does not exist, two signals have different sizes, or a largest
+            difference is negative.
     """
     acted = {signal.name: signal for signal in interface.act}
     sensed = {signal.name: signal for signal in interface.sense}
-    for name, (sensor, limit) in continuity.items():
+    for name, entry in continuity.items():
+        if not isinstance(entry, tuple | list) or len(entry) != 2:
+            raise ValueError(f"continuity of {name} is (sensor signal, largest difference), not {entry!r}")
+        sensor, limit = entry
         if name not in acted or sensor not in sensed or acted[name].size != sensed[sensor].size:
             raise ValueError(
                 "continuity goes from an actuator signal to a sensor signal of its size, not from "
