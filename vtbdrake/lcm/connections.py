@@ -146,6 +146,10 @@ class TcpqConnection(Connection):
         # The kernel does not time-stamp data from a Unix socket.
         shortcut = None if stamped else connect_shortcut(*address)
         self._socket = shortcut or socket.create_connection(address, timeout)
+        if shortcut is None and not stamped and (shortcut := connect_shortcut(*address)):
+            # The hub, which opens its shortcut first, has started between the two attempts.
+            self._socket.close()
+            self._socket = shortcut
         try:
             if shortcut is None:
                 self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
