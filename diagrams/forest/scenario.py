@@ -51,10 +51,6 @@ _LEAST_RANGE_NOISE = 0.005
 # simulated, and not contained.
 _LEVELLING = 0.002
 
-# What the fit of a trunk does not tell of its errors in one scan, in m, per axis. Calibrated by the innovations in
-# development drives, which with 1 cm would be far smaller than expected.
-_LEAST_DEVIATION = 0.005
-
 
 def plant_config() -> MultibodyPlantConfig:
     """Return the configuration of the plant: discrete, as the wheels are stepped with it."""
@@ -426,8 +422,7 @@ class ForestScenario(CarrierScenario):
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         unit = super().unit(world_map)
         if self.perception == "scanner":
-            noise = {"lasting_deviation": TrunkDetector.position_floor, "least_deviation": _LEAST_DEVIATION}
-            return replace(unit, tracker=replace(unit.tracker, **noise))
+            return unit
         tracker = replace(unit.tracker, field_of_view=self.stereo.camera().field_of_view)
         return replace(unit, tracker=tracker, begins_with_submap=True)
 

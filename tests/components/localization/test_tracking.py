@@ -119,19 +119,6 @@ def spread_out(places, deviation):
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, np.inf))
 
 
-def test_errors_of_detections_that_last_count_once():
-    """The mean of 50 scans has what lasts of the variance 0.05^2 = 0.03^2 + 0.04^2 as a whole."""
-    angles = np.arange(8) * np.pi / 4.0
-    places = 8.0 * np.column_stack([np.cos(angles), np.sin(angles)])
-    seen, exact = spread_out(places, 0.05), spread_out(places, 1e-5)
-    tracker = Tracker(exact, lasting_deviation=0.03, least_deviation=0.0, bias_deviation=1e-6)
-    state, _ = tracker.start(np.zeros(3), START)
-    for _ in range(50):
-        state, _ = tracker.update(state, seen)
-    expected = 1.0 / (8.0 / (0.03**2 + 0.04**2 / 50.0) + 1.0 / START[0, 0])
-    np.testing.assert_allclose(state.pose_covariance[[0, 1], [0, 1]], expected, rtol=0.02)
-
-
 @pytest.mark.parametrize(("view", "variance"), [(2.0 * np.pi, 0.045), (np.pi, 0.025)])
 def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
     places = np.array([[2.0, 0.0], [0.0, -2.0]])

@@ -210,9 +210,6 @@ class Tracker:
         least_deviation: Standard deviation in m that is added to those of detections, per axis; assumed.
         scan_deviation: Standard deviation in m, per axis, by which all detections of a scan are displaced together;
             assumed.
-        lasting_deviation: Standard deviation in m, per axis, that the covariances of detections contain, but that is
-            the same in all detections of a landmark, as of a trunk that leans: the floor of a detector. It counts once,
-            with the landmark.
         correlation: L in m, 0 if the map's errors are independent.
         correlated_share: c, of the variance; assumed.
         gate: The share of right pairs that the gate lets pass.
@@ -237,7 +234,6 @@ class Tracker:
     rate_walk: float = 2e-5
     least_deviation: float = 0.01
     scan_deviation: float = 0.0
-    lasting_deviation: float = 0.0
     correlation: float = 0.0
     correlated_share: float = 0.98
     gate: float = 0.997
@@ -263,7 +259,6 @@ class Tracker:
             "rate_walk": (0.0 <= self.rate_walk < inf, "in rad/s per root second, at least 0"),
             "least_deviation": (0.0 <= self.least_deviation < inf, "in m, at least 0"),
             "scan_deviation": (0.0 <= self.scan_deviation < inf, "in m, at least 0"),
-            "lasting_deviation": (0.0 <= self.lasting_deviation < inf, "in m, at least 0"),
             "correlation": (0.0 <= self.correlation < inf, "in m, at least 0"),
             "correlated_share": (0.0 <= self.correlated_share < 1.0, "a share from 0 to below 1"),
             "gate": (0.0 < self.gate < 1.0, "a share between 0 and 1"),
@@ -386,12 +381,11 @@ class Tracker:
             indices: Which landmarks.
             probability: That they are the ones that are seen, (m,); by default 1.
         """
-        places = self.landmarks.positions
-        variances = self.landmarks.covariances[indices] + self.lasting_deviation**2 * np.eye(2)
+        places, variances = self.landmarks.positions, self.landmarks.covariances
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
         factor = np.ones(m) if probability is None else probability**-2.0
         if self.correlation == 0.0:
-            prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances))
+            prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
         else:
             K = self._covariance(np.concatenate([state.indices, indices]))
@@ -419,7 +413,7 @@ class Tracker:
         K: Array = (
             self.correlated_share * np.exp(-0.5 * squares / self.correlation**2) * np.outer(deviations, deviations)
         )
-        K[np.diag_indices_from(K)] = deviations**2 + self.lasting_deviation**2
+        K[np.diag_indices_from(K)] = deviations**2
         return K
 
     def _fused(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> tuple[TrackState, Matches]:
@@ -449,10 +443,7 @@ class Tracker:
         return _without(fused, far), Matches(pairs, float(parts.sum()), is_fused=True)
 
     def _noise(self, landmarks: Landmarks) -> Array:
-        """Return the covariances (n, 2, 2) of what is new in each scan, at least least_deviation^2."""
-        variances, axes = np.linalg.eigh(landmarks.covariances)
-        new = np.maximum(variances - self.lasting_deviation**2, 0.0) + self.least_deviation**2
-        return (axes * new[:, None, :]) @ axes.transpose(0, 2, 1)
+        return landmarks.covariances + self.least_deviation**2 * np.eye(2)
 
     def _expected(self, state: TrackState, rows: Indices) -> tuple[Array, Array]:
         """Return where landmarks of the state are to be seen in H, (m, 2), and the derivatives (m, 2, 6).
