@@ -146,7 +146,7 @@ class TcpqConnection(Connection):
         # The kernel does not time-stamp data from a Unix socket.
         shortcut = None if stamped else connect_shortcut(*address)
         self._socket = shortcut or socket.create_connection(address, timeout)
-        if shortcut is None and not stamped and (shortcut := connect_shortcut(*address)):
+        if shortcut is None and not stamped and (shortcut := connect_shortcut(*address, quiet=True)):
             # The hub, which opens its shortcut first, has started between the two attempts.
             self._socket.close()
             self._socket = shortcut

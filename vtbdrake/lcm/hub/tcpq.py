@@ -111,8 +111,14 @@ def listen_shortcut(host: str, port: int) -> socket.socket | None:
     return sock
 
 
-def connect_shortcut(host: str, port: int) -> socket.socket | None:
-    """Connect to the Unix socket of the hub at this address without waiting; return None if only TCP is possible."""
+def connect_shortcut(host: str, port: int, *, quiet: bool = False) -> socket.socket | None:
+    """Connect to the Unix socket of the hub at this address without waiting; return None if only TCP is possible.
+
+    Args:
+        host: The hub's address.
+        port: Its port.
+        quiet: Log no warning if another user listens there.
+    """
     name = shortcut_name(host, port)
     if name is None:
         return None
@@ -130,7 +136,8 @@ def connect_shortcut(host: str, port: int) -> socket.socket | None:
     # user could also end the hub and take its port; another user could not.
     if user not in (0, os.geteuid()):
         sock.close()
-        _log.warning("using TCP: the Unix socket %r belongs to user %s, neither to this user nor to root", name, user)
+        if not quiet:
+            _log.warning("using TCP: the Unix socket %r belongs to user %s, neither this user nor root", name, user)
         return None
     return sock
 
