@@ -1,4 +1,4 @@
-"""Where the time of a rollout goes: the same world, from plain Drake up to a rollout of the testbed.
+"""Measure where the time of a rollout goes: the same world, from plain Drake up to a rollout of the testbed.
 
 Processor time, of variants that run in turns. What a rung takes beyond the one above is the price of what it adds.
 """
@@ -45,7 +45,7 @@ def rollout_ladder(repeats: int = 20) -> list[Benchmark]:
 
 
 def _cart_pole() -> dict[str, Rung]:
-    """What `predictive_sampling_testbed` simulates."""
+    """Return the rungs up to what `predictive_sampling_testbed` simulates."""
     with make_reasoner(CartPoleScenario(), executor="serial") as reasoner:
         task = reasoner.task
     mental = CartPoleScenario().mental()
@@ -89,7 +89,7 @@ class _HeldGait(CppClimberScenario):
 
 
 def _climber() -> dict[str, Rung]:
-    """What `rollout_rtf` simulates."""
+    """Return the rungs up to what `rollout_rtf` simulates."""
     scenario = SpaceClimberScenario()
     task = replace(payload_problem(phases=(0.0,)).task, scenario=scenario, horizon=WALK)
     simulation = partial(_simulation, config=scenario.simulator_config, seconds=WALK)

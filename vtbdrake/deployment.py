@@ -170,7 +170,7 @@ def deploy(
     deployment = deployment or Deployment.of(scenario)
     interface = scenario.interface()
     deployment.check(interface)
-    protocol = deployment.protocol or protocol_of(scenario)  # Which raises, if the scenario has none, either.
+    protocol = deployment.protocol or protocol_of(scenario)  # An error if the scenario has none, either.
     bridge = protocol.bridge(interface, url)
     target = target or DpsAlone(scenario)
     context = context or target.default_context()

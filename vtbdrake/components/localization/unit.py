@@ -25,7 +25,7 @@ from vtbdrake.state.codecs import codec_of
 Array = NDArray[np.float64]
 
 SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
-"""What a `Localization` says: no pose yet; a pose; no pose any more; the last scan does not show the place where the
+"""A `Localization` says: no pose yet; a pose; no pose any more; or that the last scan does not show the place where the
 carrier should be. Searching goes on after a loss, too, and tracking while the pose is doubtful."""
 
 STATUS_NAMES = ("searching", "tracking", "lost", "doubtful")

@@ -459,7 +459,7 @@ def _mirror(n: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """How well the corners fit to a pose.
+    """A pose, and how well the corners fit to it.
 
     Attributes:
         X_CT: The pose.
