@@ -23,7 +23,7 @@ from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
 from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
-from vtbdrake.components.world_model import WorldModel, load_geojson
+from vtbdrake.components.world_model import GeoJsonError, WorldModel, load_geojson
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import image_array_map, scan_map
 from vtbdrake.scan import Scan
@@ -191,11 +191,19 @@ class CarrierScenario(Scenario):
         Features of a file without a covariance get the deviation of ``map``.
 
         Raises:
-            GeoJsonError: The file is no map.
+            GeoJsonError: The file is no map, or one of another place.
         """
         if not self.map_file:
             return self.surveyed_map()
-        return load_geojson(self.map_file, deviation=MAPS[self.map].position)
+        found = load_geojson(self.map_file, deviation=MAPS[self.map].position)
+        places, area = found.positions()[:, :2], np.array([self.length, self.width])
+        if len(places) and not ((places >= 0.0) & (places <= area)).all(axis=1).any():
+            x, y = places.mean(axis=0).tolist()
+            raise GeoJsonError(
+                f"{self.map_file}: no object lies in the area from (0, 0) to ({self.length:g}, {self.width:g}) m, "
+                f"their mean is ({x:.0f}, {y:.0f}) m: local_frame of the file must be where the origin of the area is"
+            )
+        return found
 
     def check_perception(self) -> None:
         """Raise a ValueError if the DPS cannot see landmarks with its scanner.
@@ -262,7 +270,13 @@ class CarrierScenario(Scenario):
     def make_dps(self) -> Diagram:
         world_map = self.global_map()
         signals = {signal.name: signal.model_value for signal in self.perception_signals()}
-        localizer = Localizer(self.detector(), self.unit(world_map), tuple(signals))
+        try:
+            unit = self.unit(world_map)
+        except ValueError as error:
+            if self.map_file:
+                raise GeoJsonError(f"{self.map_file}: {error}") from error
+            raise
+        localizer = Localizer(self.detector(), unit, tuple(signals))
         return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
@@ -340,7 +354,7 @@ class ForestScenario(CarrierScenario):
     perception: str = "scanner"
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
-    # natural, clustered or plantation, see `Stand`.
+    # natural, clustered, plantation or windthrown, see `Stand`.
     stand_kind: str = "natural"
     # Trees per hectare, before the roads are cleared.
     density: float = 800.0

@@ -197,7 +197,7 @@ TREE = ("features", 1)
         ),
         (change((*TREE, "geometry"), None), "its geometry is a Point, not None"),
         (change((*TREE, "geometry", "coordinates"), [6800000.0, 450000.0]), "tree-1.*degrees of longitude"),
-        (change((*TREE, "geometry", "coordinates"), [61.2, 25.05]), "tree-1.*map of another place"),
+        (change((*TREE, "geometry", "coordinates"), [61.2, 25.05]), "tree-1.*frame, at 25.05, 61.2: .*in this order"),
         (change((*TREE, "geometry", "coordinates"), [25.0, None]), "tree-1.*coordinates are longitude"),
         (change((*TREE, "geometry", "coordinates"), [25.0, float("nan")]), "NaN is not a number of JSON"),
         (change(("units", "trunk_diameter"), "cm"), "tree-1.*trunk_diameter: a unit is made of SI units.*'cm'"),
@@ -219,6 +219,8 @@ TREE = ("features", 1)
         (change((*TREE, "properties", "relations"), [{"kind": "on", "other": "x"}]), "tree-1 on 'x'"),
         (change(("local_frame",), {"lon": 1}), "local_frame has numbers"),
         (change(("local_frame", "latitude_deg"), 95.0), "latitude between -90 and 90"),
+        (change(("local_frame", "latitude_deg"), "61.2"), "local_frame has numbers .*'61.2'"),
+        (change(("local_frame",), None), "local_frame, which other programs drop, is missing: add"),
         (change(("crs",), {"type": "name", "properties": {"name": "EPSG:3067"}}), "convert them, and remove crs"),
         (change(("type",), "Feature"), "FeatureCollection"),
         (change(("features",), {}), "list of features"),
@@ -240,6 +242,10 @@ def test_text_that_is_no_json_is_refused(tmp_path: Path) -> None:
     for text in ("{", '{"type": 1, "type": 2}', "[" * 100_000, "\0"):
         path.write_text(text)
         with pytest.raises(GeoJsonError, match="map.geojson"):
+            load_geojson(path)
+    for text in ("id,x,y", "\xe4"):
+        path.write_text(text, encoding="latin-1")
+        with pytest.raises(GeoJsonError, match="map.geojson: no JSON in UTF-8, convert"):
             load_geojson(path)
     with pytest.raises(FileNotFoundError):
         load_geojson(tmp_path / "none.geojson")

@@ -243,3 +243,9 @@ def test_sighting_without_an_uncertainty_is_refused() -> None:
         seen([0.0, 0.0, 0.0], deviation=0.0)
     with pytest.raises(ValueError, match="a position at least"):
         seen([0.0, 0.0, 0.0], deviation=np.inf)
+
+
+def test_objects_are_no_sightings() -> None:
+    known = tree("t", [0.0, 0.0, 0.0], deviation=0.0)
+    with pytest.raises(ValueError, match="of the class Sighting, not WorldObject: give"):
+        observe(WorldModel([known]), [known])

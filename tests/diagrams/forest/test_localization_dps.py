@@ -203,15 +203,20 @@ def test_scans_of_anything_are_no_place_and_no_error(kind: type[CarrierScenario]
 
 
 @pytest.mark.parametrize(
-    ("kind", "unit", "message"),
-    [("rock", "m", "has no tree"), ("tree", "kg", "kg")],
+    ("kind", "unit", "x", "message"),
+    [
+        ("rock", "m", 0.0, "map.geojson: .* has no tree"),
+        ("tree", "kg", 0.0, "map.geojson: .*kg"),
+        ("tree", "m", 0.0, "map.geojson: trunk_diameter of the tree tree-0 is 30 m"),
+        ("tree", "m", 55e3, r"map.geojson: no object .* mean is \(55006, 6\) m: local_frame of the file"),
+    ],
 )
-def test_map_files_that_do_not_fit_are_refused(tmp_path: Path, kind: str, unit: str, message: str) -> None:
+def test_map_files_that_do_not_fit_are_refused(tmp_path: Path, kind: str, unit: str, x: float, message: str) -> None:
     objects = (
         WorldObject(
             f"{kind}-{k}",
             kind,
-            position_estimate([3.0 * k, float(k**2), 0.0], deviation=0.1),
+            position_estimate([x + 3.0 * k, float(k**2), 0.0], deviation=0.1),
             attributes={"trunk_diameter": Quantity(30.0, unit)},
         )
         for k in range(5)

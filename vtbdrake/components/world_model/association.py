@@ -104,7 +104,16 @@ def associate(
         objects: The objects that may have been seen.
         sightings: What was seen at one instant.
         probability: The share of right pairs that the gate lets pass.
+
+    Raises:
+        ValueError: One of the sightings is something else.
     """
+    for one in sightings:
+        if not isinstance(one, Sighting):
+            raise ValueError(
+                f"sightings are of the class Sighting, not {type(one).__name__}: give class, pose, and attributes of "
+                "what was seen, as Sighting(kind, pose, attributes)"
+            )
     gain = np.zeros((len(sightings), len(objects)))
     for i, j in np.argwhere(_within_reach(objects, sightings, probability)):
         distance, degrees = mahalanobis(objects[j], sightings[i])

@@ -130,6 +130,8 @@ def load_geojson(
     try:
         data = json.loads(Path(path).read_text("utf-8-sig"), parse_constant=_reject, object_pairs_hook=_unique)
         return _Reader(data, frame, units or {}, deviation).model()
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise GeoJsonError(f"{path}: no JSON in UTF-8, convert other formats to GeoJSON: {error}") from error
     except (ValueError, RecursionError) as error:
         raise GeoJsonError(f"{path}: {error}") from error
 
@@ -232,8 +234,12 @@ class _Reader:
 
     def _pose(self, position: Array, properties: Mapping[str, Any]) -> PoseEstimate:
         if not np.abs(position).max() < _FARTHEST:
-            far = np.abs(position).max() / 1e3
-            raise ValueError(f"it lies {far:.0f} km from the origin of the local frame: this is a map of another place")
+            far, origin = np.abs(position).max() / 1e3, self._frame
+            raise ValueError(
+                f"it lies {far:.0f} km from the origin of the local frame, at {origin.longitude_deg:g}, "
+                f"{origin.latitude_deg:g}: this is a map of another place, or its coordinates are not longitude and "
+                "latitude in degrees, in this order"
+            )
         covariance = np.diag([np.inf] * 3 + [self._variance] * 3)
         if "covariance" in properties:
             covariance = _covariance(_plain(properties["covariance"]))
@@ -275,11 +281,16 @@ class _Reader:
 
 def _local_frame(data: Any, given: LocalFrame | None) -> LocalFrame:
     if data is None and given is None:
-        raise ValueError("no local_frame (longitude_deg, latitude_deg, ...) is declared: give frame=LocalFrame(...)")
+        raise ValueError(
+            "the member local_frame, which other programs drop, is missing: add its place on Earth to the file, as "
+            '"local_frame": {"longitude_deg": ..., "latitude_deg": ...}, or give frame=LocalFrame(...)'
+        )
     try:
         declared = given if data is None else LocalFrame(**data)
-    except TypeError as error:
-        raise ValueError(f"local_frame has numbers longitude_deg, latitude_deg, height, x_axis_deg: {error}") from None
+    except TypeError:
+        raise ValueError(
+            f"local_frame has numbers longitude_deg, latitude_deg, height, x_axis_deg, and is not {data!r}"
+        ) from None
     if declared is None or given not in (None, declared):
         raise ValueError(f"the file declares {declared}, and not frame={given}: leave frame out")
     return declared

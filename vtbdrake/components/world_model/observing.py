@@ -86,6 +86,7 @@ def observe(
 
     Raises:
         KeyError: An expected object is not in the model.
+        ValueError: One of the sightings is no `Sighting`.
     """
     candidates = [one for one in model if one.status != RETIRED]
     pairs = associate(candidates, sightings, probability=rules.gate)
