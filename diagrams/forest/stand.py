@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 HECTARE = 1e4
 
-# Streams of random numbers: trees and maps of one seed are independent.
-_TREES, _MAP = 0, 1
+# Streams of random numbers: trees, maps and storms of one seed are independent.
+_TREES, _MAP, _STORM = 0, 1, 10
 
 # Coefficients of Näslund's curve h = 1.3 m + d² / (a + b d)² with d in cm, assumed: 20 m at 30 cm.
 _NAESLUND = (1.2, 0.19)
@@ -32,11 +32,13 @@ _NAESLUND = (1.2, 0.19)
 # Random sequential placement of discs ends at a coverage of 0.547; the last per cent take ever more attempts.
 _LARGEST_COVERAGE = 0.45
 
-KINDS = ("natural", "clustered", "plantation")
+KINDS = ("natural", "clustered", "plantation", "windthrown")
 """The kinds of stands, see `Stand`."""
 
 # A clustered stand has so many clusters per hectare, of this radius in m.
 _CLUSTERS, _CLUSTER_RADIUS = 60.0, 6.0
+# A storm leaves so many gaps per hectare, of this radius in m, which may overlap [assumed].
+_GAPS, _GAP_RADIUS = 3.0, 25.0
 # The distance of the rows of a plantation, and the standard deviation per axis with which trees are planted, in m.
 _ROWS, _JITTER = 2.5, 0.15
 # The number of attempts to place one tree.
@@ -91,19 +93,20 @@ class Stand:
     of a hard-core process: trees are placed at random one after the other, and a place too close to an earlier tree is
     given up. In a ``natural`` stand all places are equally likely. In a ``clustered`` one, they lie in discs around
     points that are placed at random: a Matérn cluster process (Matérn, "Spatial Variation", 1960) with a hard core. In
-    a ``plantation``, trees stand in rows along x, 2.5 m apart, nearly where they were planted.
+    a ``plantation``, trees stand in rows along x, 2.5 m apart, nearly where they were planted. A ``windthrown`` stand
+    was a natural one of the same seed, before a storm felled all trees in three round gaps per hectare, 50 m wide.
 
     Attributes:
         seed: Determines trees, roads and maps.
         length: Extent along x in m.
         width: Extent along y in m.
-        density: Trees per hectare, before roads are cleared.
+        density: Trees per hectare, before roads are cleared and storms.
         spacing: The least distance of two trees in m; a plantation has its own.
         diameter_scale: Scale of the Weibull distribution of trunk diameters in m.
         diameter_shape: Shape of this distribution; 1 is an exponential distribution, 3.6 nearly a normal one.
         least_diameter: The least trunk diameter in m.
         largest_diameter: The largest trunk diameter in m.
-        kind: ``natural``, ``clustered`` or ``plantation``.
+        kind: ``natural``, ``clustered``, ``plantation`` or ``windthrown``.
         road_width: Width of the strip roads in m, which are free of trees; 0 for a stand without roads.
         road_spacing: Distance of the strip roads in m, see `strip_roads`.
     """
@@ -147,7 +150,7 @@ class Stand:
 
     @property
     def count(self) -> int:
-        """The number of trees before roads are cleared."""
+        """The number of trees before roads are cleared and storms."""
         if self.kind == "plantation":
             rows, columns = self._rows
             return rows * columns
@@ -178,10 +181,10 @@ class Stand:
         rng = np.random.default_rng([self.seed, _TREES])
         places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
         diameters = self.diameters(rng.random(self.count))
-        free = distances(self.routes(), places)
+        is_free = distances(self.routes(), places) > 0.5 * (self.road_width + diameters)
         objects = (
             _tree(f"tree-{k}", places[k], diameters[k], source=f"stand {self.seed}")
-            for k in np.flatnonzero(free > 0.5 * (self.road_width + diameters))
+            for k in np.flatnonzero(is_free & ~self._felled(places))
         )
         return WorldModel(objects)
 
@@ -231,6 +234,17 @@ class Stand:
                     f"{self.density:g} trees/ha find no place in clusters {self.spacing:g} m apart: reduce one of them"
                 )
         return np.array(places)
+
+    def _felled(self, places: Array) -> NDArray[np.bool_]:
+        """Return which of the places (n, 2) lie in gaps that a storm has left, (n,)."""
+        if self.kind != "windthrown":
+            return np.zeros(len(places), dtype=bool)
+        from scipy.spatial import cKDTree
+
+        size = np.array([self.length, self.width])
+        gaps = np.random.default_rng([self.seed, _STORM]).random((round(_GAPS * size.prod() / HECTARE), 2)) * size
+        felled: NDArray[np.bool_] = cKDTree(gaps).query(places)[0] < _GAP_RADIUS
+        return felled
 
     def _cell(self, x: float, y: float) -> tuple[int, int]:
         return (int(x / self.spacing), int(y / self.spacing)) if self.spacing > 0.0 else (0, 0)

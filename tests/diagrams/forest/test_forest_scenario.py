@@ -293,7 +293,7 @@ def test_positions_in_a_file_are_not_taken_as_exact(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"stand_kind": "jungle"}, "stand_kind must be one of natural, clustered, plantation, not 'jungle'"),
+        ({"stand_kind": "jungle"}, "stand_kind must be one of natural, .*windthrown, not 'jungle'"),
         ({"map": "perfect"}, "map must be one of exact, accurate, remote, poor"),
         ({"route": 99}, "route must be the number of one of 6 routes, from 0 on, not 99"),
         ({"scanner_height": 0.5}, "over the carrier's roof, not 0.5"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from scipy.stats import kstest, weibull_min
 
@@ -60,6 +61,19 @@ def test_trees_of_a_clustered_stand_have_more_neighbours() -> None:
     by_chance = 0.08 * np.pi * 9.0
     assert 0.7 * by_chance < neighbours["natural"] < by_chance
     assert neighbours["clustered"] > 1.3 * by_chance
+
+
+def test_storm_fells_the_trees_of_round_gaps() -> None:
+    before = {tuple(place) for place in Stand(seed=4, road_width=4.0).trees().positions()[:, :2].tolist()}
+    after = {tuple(p) for p in Stand(seed=4, road_width=4.0, kind="windthrown").trees().positions()[:, :2].tolist()}
+    assert after < before
+    # All middles of discs of 25 m without a tree that stands, to 0.5 m.
+    x, y = np.meshgrid(np.arange(0.0, 100.5, 0.5), np.arange(0.0, 100.5, 0.5))
+    empty = np.column_stack([x.ravel(), y.ravel()])
+    empty = empty[cKDTree(list(after)).query(empty)[0] > 24.5]
+    assert (cKDTree(empty).query(list(before - after))[0] < 25.5).all()
+    # Three discs overlap, and lie in part outside.
+    assert 0.2 < 1.0 - len(after) / len(before) < 3.0 * np.pi * 0.25**2
 
 
 def test_trees_of_a_plantation_stand_in_rows() -> None:
@@ -151,7 +165,7 @@ def test_heights_are_plausible() -> None:
         (lambda: Stand(density=float("nan")), "density of a stand is positive and finite, not nan"),
         (lambda: Stand(spacing=-1.0), "at least 0 m apart, not -1.0 m"),
         (lambda: Stand(least_diameter=0.5), "no such range"),
-        (lambda: Stand(kind="jungle"), "a stand is natural, clustered, plantation, not 'jungle'"),
+        (lambda: Stand(kind="jungle"), "a stand is natural, clustered, plantation, windthrown, not 'jungle'"),
         (lambda: Stand(road_width=9.0), "at most 8 m wide"),
         (lambda: Stand(kind="clustered", density=1500.0, spacing=1.9, length=30.0).trees(), "no place in clusters"),
         (lambda: MapErrors(position=-0.1), "at least 0, not -0.1"),
