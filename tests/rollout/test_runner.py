@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import LeafSystem
+from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import RandomSource
 from scipy.special import ellipk
 
@@ -218,8 +218,6 @@ class Terminating(SampledFeedback):
         self.DeclarePeriodicUnrestrictedUpdateEvent(0.1, 0.05, self._enough)
 
     def _enough(self, context, state):
-        from pydrake.systems.framework import EventStatus
-
         return (
             EventStatus.ReachedTermination(self, "had enough") if context.get_time() > 0.5 else EventStatus.Succeeded()
         )
@@ -236,6 +234,34 @@ def test_a_system_may_end_the_rollout():
     assert result.end == "terminated"
     assert "had enough" in result.message
     assert 0.5 < result.h < 0.7
+
+
+class Unwilling(SampledFeedback):
+    """Ends the simulation before it begins, when it is initialized or when it publishes at first."""
+
+    def __init__(self, declare):
+        super().__init__(0.02)
+        getattr(self, declare)(publish=lambda context: EventStatus.ReachedTermination(self, "will not"))
+
+
+@dataclass
+class UnwillingScenario(AcrobotScenario):
+    declare: str = "DeclareInitializationPublishEvent"
+
+    def make_dps(self):
+        return Unwilling(self.declare)
+
+
+@pytest.mark.parametrize("declare", ["DeclareInitializationPublishEvent", "DeclarePerStepPublishEvent"])
+def test_a_system_may_end_the_rollout_where_it_begins(declare):
+    task = RolloutTask(UnwillingScenario(declare=declare), 2.0, Quality(lambda t: 1.0 + t, "time"), keep_state=True)
+    runner = RolloutRunner(task)
+    result = runner.run({})
+    assert (result.end, result.t_star, result.times.tolist()) == ("terminated", 0.0, [0.0])
+    assert "will not" in result.message
+    simulator = runner.testbed.simulator()
+    assert not simulator.Initialize().succeeded()
+    assert result.state == runner.state({}, 0.0) == runner.testbed.snapshot(simulator.get_context())
 
 
 class SelfWilled(SampledFeedback):

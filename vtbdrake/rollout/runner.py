@@ -124,7 +124,7 @@ class RolloutRunner:
                     reached = self._context.get_time() - self._t0 if terminated else t
                     if samples.take(reached) and not self.task.run_on:
                         break
-                    if terminated and status is not None:
+                    if terminated:
                         end, message = TERMINATED, status.FormatMessage()
                         break
                     if samples.ending:
@@ -187,7 +187,7 @@ class RolloutRunner:
                 for time_, instant in zip(self._times[: last + 1], self._instants[: last + 1], strict=True):
                     interruptible.check()
                     status = self._advance(time_, instant)
-                    if status is not None and _terminated(status):
+                    if _terminated(status) and self._context.get_time() < self._instants[last]:
                         raise SimulationError(status.FormatMessage())
         except SimulationError as failure:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
@@ -261,7 +261,8 @@ class RolloutRunner:
             self._variables.write(self._context, parameters)
             before = self._variables.read(self._context, list(parameters))
             # Initialization events are part of a default s0; in a restored s0 they have happened already.
-            self._simulator.Initialize(InitializeParams(suppress_initialization_events=restored))
+            params = InitializeParams(suppress_initialization_events=restored)
+            self._initialized = self._simulator.Initialize(params)
         for address, value in before.items():
             after = self._variables[address].get(self._context)
             if not np.array_equal(after, value):
@@ -270,9 +271,9 @@ class RolloutRunner:
                     "it: vary what that event reads"
                 )
 
-    def _advance(self, t: float, instant: float) -> SimulatorStatus | None:
+    def _advance(self, t: float, instant: float) -> SimulatorStatus:
         if t == 0.0:
-            return None
+            return self._initialized  # A system may ask for the end there already.
         with _failures_as_outcomes:
             status = self._simulator.AdvanceTo(instant)
         self._refuse_nonfinite(t)
@@ -308,8 +309,8 @@ def _world_state(testbed: VirtualTestbed, context: Context) -> Callable[[], np.n
     return lambda: plant.GetPositionsAndVelocities(own)
 
 
-def _terminated(status: SimulatorStatus | None) -> bool:
-    return status is not None and not status.succeeded()
+def _terminated(status: SimulatorStatus) -> bool:
+    return not status.succeeded()
 
 
 class _FailuresAsOutcomes:
