@@ -235,7 +235,6 @@ def test_method_that_cannot_be_repeated_is_refused():
         ({"budget": Budget(seconds=1.0)}, "has a budget of rollouts"),
         ({"decision": [Parameter("u.goal", 0.0, 1.0)]}, "decides its own parameter, dps.<path>.candidate, not u.goal"),
         ({"horizon": 0.2}, "a horizon of 0.2 s ends before a decision is shown"),
-        ({"niceness": -5}, "the niceness of a process is from 0 to 19, not -5"),
         ({"latency": 0.3}, "choose a period of at least 0.3 s"),
     ],
 )

@@ -176,10 +176,10 @@ class StudyRun:
         return evaluations
 
     def _ask(self) -> list[Point]:
-        """Return what the solver asks for; wait for it until the time limit at most."""
+        """Return the points that the solver asks for; wait until the time limit at most."""
         points = ask_within(self._solver, self._deadline - time.monotonic())
         if points is None:
-            raise _RunEnd(TIME, f"the time is over, while {self._solver.name} was thinking")
+            raise _RunEnd(TIME, f"the time is over, before {self._solver.name} asked for more points")
         return points
 
     def _resume(self) -> int:

@@ -22,7 +22,7 @@ from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.testbed.testbed import BeliefRule
 
-# Two ways to compute a time may differ by so much, in s.
+# Times that differ by less are equal, in s.
 _ROUNDING = 1e-6
 
 # An estimate may lie beyond the bounds of its variable by this share of their distance: a joint a little past its stop.
@@ -38,8 +38,8 @@ class World:
     """A true simulated world, for a perfect belief.
 
     Attributes:
-        contents: Of the whole testbed.
-        values: By address, all that can be set in the simulated world.
+        contents: Contents of the whole testbed.
+        values: Address -> value of every variable of the simulated world that can be set.
     """
 
     contents: FlatState
@@ -48,14 +48,14 @@ class World:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Belief:
-    """What a DPS believes at one instant: itself, as it stands, and the world, as its estimates have it.
+    """What a DPS believes at one instant: its own state, and the world according to its estimates.
 
-    The rules that lead from estimates to variables of the world are those of the mental scenario
-    (`VirtualTestbedBuilder.believe`), and so is all that no rule sets. A belief is plain data, which can be pickled.
+    The mental scenario has the rules by which estimates set variables of the world (`VirtualTestbedBuilder.believe`),
+    and determines everything that no rule sets. A belief is plain data, which can be pickled.
 
     Attributes:
         dps: The DPS: its state, parameters and commands, and the sensor values that it has received last.
-        world: The true world, of a perfect belief; None for every other one.
+        world: The true world if the belief is perfect, else None.
     """
 
     dps: DpsState
@@ -70,8 +70,8 @@ class Belief:
         """Return the belief of the DPS in ``context``.
 
         Args:
-            target: A testbed, or a DPS alone: the target of a Runtime, say.
-            context: Of the target; it stays as it is.
+            target: A testbed, or a DPS alone; for example the target of a Runtime.
+            context: Context of the target; not changed.
 
         Raises:
             ValueError: The context belongs to another target.
@@ -81,10 +81,10 @@ class Belief:
 
     @classmethod
     def perfect(cls, testbed: VirtualTestbed, context: Context) -> Belief:
-        """Return a belief that knows the simulated world as it is: for tests, and for bounds of what can be reached.
+        """Return a belief that equals the true simulated world: for tests, and as a bound for any estimator.
 
         With the same scenario, a mental rollout is then the true future, see `AddressedDiagram.fork`. With another
-        mental scenario, all variables of the world that both have are the true ones.
+        mental scenario, all variables of the world that both scenarios have get their true values.
 
         Raises:
             ValueError: The context belongs to another testbed.
@@ -95,7 +95,7 @@ class Belief:
         return cls(testbed.dps_state(context), World(testbed.whole_layout.take(context), values))
 
     def start(self, mental: VirtualTestbed) -> Start:
-        """Return where a rollout of ``mental`` begins that is as it is believed to be; see `Starter.start`."""
+        """Return the start of a rollout of ``mental`` in the believed world; see `Starter.start`."""
         return Starter(mental).start(self)
 
 
@@ -107,29 +107,29 @@ Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
 class Starter:
     """Turns beliefs into starts for the rollouts of one mental testbed.
 
-    1. The DPS continues as it stands, at its own time; u is as it was.
-    2. The world is that of the mental scenario, with the variables that the scenario's rules set
-       (`VirtualTestbedBuilder.believe`) as the DPS's estimates have them. An estimate that lies beyond the bounds of
-       its variable by at most 5 % of their distance is clipped. Velocities without a rule are zero.
-    3. Sensors show the values that the DPS has received last, also those in transit, until they sample in the mental
-       world. (What they would measure in the believed state differs from that by the errors of the estimates: the
-       DPS's filters would see a jump that does not happen.) Actuators stand as if they had been given the DPS's
-       present command for some time. Sensors and actuators without a method ``resume``, such as cameras, begin as in
-       the mental scenario.
+    1. The DPS continues in its present state, at its own time, with its present commands u.
+    2. The world is that of the mental scenario, except for the variables that the DPS's estimates set by the
+       scenario's rules (`VirtualTestbedBuilder.believe`). An estimate that lies beyond the bounds of its variable by at
+       most 5 % of their distance is clipped. Velocities without a rule are zero.
+    3. Sensors keep the values that the DPS has received last, also for samples in transit, until they sample in the
+       mental world. (A measurement of the believed state would differ from these values by the errors of the estimates,
+       and the filters of the DPS would see a jump.) Actuators begin as if they had received the present command of the
+       DPS for some time. Sensors and actuators without a method ``resume``, such as cameras, begin as in the mental
+       scenario.
 
-    A rule may lead its estimates from the instant that they are about to the present (``period``). The others are not
-    extrapolated: what they set is late, by the age of the estimates and by up to a sample period.
+    A rule with a ``period`` extrapolates its estimates to the present. Variables set by other rules are late, by the
+    age of the estimates and by up to a sample period.
 
     Args:
         mental: The testbed of the rollouts.
-        uncertainty: By address of a variable of the simulated world, how uncertain the belief about it is: a standard
-            deviation, a covariance matrix, or a function (believed value, random generator) -> value. A variable
-            without a rule is uncertain about its value in the mental scenario.
+        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world: a standard deviation, a
+            covariance matrix, or a function (believed value, random generator) -> value. For a variable without a
+            rule, the believed value is that of the mental scenario.
         seed: With the number of a sample, determines its random numbers, in the same way for every belief.
         max_age: The largest age of a belief in seconds.
 
     Raises:
-        BeliefError: An uncertainty is of no variable of the simulated world, or does not fit its shape.
+        BeliefError: An uncertainty names no variable of the simulated world, or does not fit its shape.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Starter:
             for variable in [self._variables[address]]
         }
         self._draws = {address: self._draw(address, how) for address, how in (uncertainty or {}).items()}
-        # What is believed without a rule.
+        # The believed values of uncertain variables without a rule.
         self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in self._draws}
         set_by = [*self._prior, *(target.rule.target for target in self._targets)]
         self._kinds = {a: (v.kind, mental.start_layout.slice_of(v)) for a in set_by for v in [self._variables[a]]}
@@ -174,7 +174,7 @@ class Starter:
     def _draw(self, address: str, how: Uncertainty) -> Callable[[np.ndarray, np.random.Generator], ArrayLike]:
         variable = self._variables[address]
         if not address.startswith("sim.") or variable.derived:
-            raise BeliefError(f"uncertain is a variable of the simulated world that can be set, unlike {address}")
+            raise BeliefError(f"uncertainty is of variables of the simulated world that can be set, unlike {address}")
         if callable(how):
             return how
         spread, size = np.asarray(how, dtype=float), int(np.prod(variable.shape, dtype=int))
@@ -196,10 +196,10 @@ class Starter:
         return lambda mean, rng: mean + spread * rng.standard_normal(variable.shape)
 
     def start(self, belief: Belief, *, now: float = -inf) -> Start:
-        """Return where a rollout begins in the world as it is believed to be.
+        """Return the start of a rollout in the believed world.
 
         Args:
-            belief: Of the DPS.
+            belief: The belief of the DPS.
             now: The present time of the DPS in seconds, from which the age of the belief follows.
 
         Raises:
@@ -214,8 +214,8 @@ class Starter:
     def starts(self, belief: Belief, *, samples: int, now: float = -inf) -> list[Start]:
         """Return starts in ``samples`` worlds, drawn from the belief and its uncertainty; see `start`.
 
-        The n-th is drawn with the seed and n, so that the same belief gives the same starts. A value beyond the bounds
-        of its variable is clipped. Without uncertainty, all are the believed one.
+        World n is drawn with the seed and n, so that the same belief gives the same starts. A value beyond the bounds
+        of its variable is clipped. Without uncertainty, all worlds are the believed one.
 
         Raises:
             BeliefError: As in `start`.
@@ -257,7 +257,7 @@ class Starter:
             )
 
     def _believed(self, dps: DpsState) -> dict[str, ArrayLike]:
-        """Return what a DPS believes that is not a mere copy of an estimate, by address."""
+        """Return the believed values by address, except copies of single estimates (see `_Copied`)."""
         if not self._targets:
             raise BeliefError(
                 f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
@@ -293,7 +293,7 @@ class Starter:
         return {address: value for address, value in commands.items() if address in self._variables}
 
     def _start(self, dps: DpsState, believed: Mapping[str, ArrayLike]) -> Start:
-        """Return the start of a world that is as believed, in which the DPS goes on."""
+        """Return the start of a rollout with the believed values, in which the DPS continues."""
         context, layout, commands = self._context, self._mental.start_layout, self._commands(dps)
         numbers, rest, later = np.array(self._default.numbers), {}, {}
         numbers[self._dps] = dps.contents.numbers
@@ -313,7 +313,7 @@ class Starter:
             # The commands matter here to actuators alone.
             self._variables.write(context, rest | commands if self._actuators else rest)
         except VariableError as error:
-            raise BeliefError(f"the world cannot be as it is believed to be: {error}") from error
+            raise BeliefError(f"the believed values cannot be set in the mental world: {error}") from error
         for name, sensor in self._sensors.items():
             _resume(sensor, context, dps.received[name])
         own = self._mental.dps.GetMyContextFromRoot(context)
@@ -335,7 +335,7 @@ class Starter:
         try:
             self._variables.write(context, alike)
         except VariableError as error:
-            raise BeliefError(f"the mental world cannot be as the true one: {error}") from error
+            raise BeliefError(f"the true values cannot be set in the mental world: {error}") from error
         return Start(dps.time, self._mental.whole_layout.take(context), values)
 
 
@@ -351,34 +351,30 @@ class _Target:
         # An infinite value is within no bounds.
         largest = np.finfo(float).max
         self._least, self._most = np.maximum(lower, -largest), np.minimum(upper, largest)
-        # Where the estimate and the variable lie, if the one is the other.
+        # The places of the estimate and of the variable, if the variable is a copy of the estimate.
         self.source = mental.dps_layout.slice_of(mental.variables()[rule.of[0]]) if rule.by is None else None
         self.place = mental.start_layout.slice_of(self.variable)
-        self._interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
+        # The bounds of a scalar; no value lies within those of an array.
+        self.interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
 
     @property
     def is_copy(self) -> bool:
-        """Return whether one number, as it lies in the contents of the DPS, is the believed value."""
+        """Return whether the believed value is one number of the contents of the DPS, unchanged."""
         return self.source is not None and self.place is not None and self.variable.shape == ()
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Return the bounds of a scalar; an infinite value is within none."""
-        return self._interval
-
     def value(self, estimates: Mapping[str, Any], late: float = 0.0) -> ArrayLike:
-        """Return what is believed of the variable, within its bounds.
+        """Return the believed value, within the bounds of the variable.
 
         Args:
-            estimates: By address.
-            late: The time in seconds since the instant that they are about.
+            estimates: Address -> value.
+            late: Age of the estimates in seconds.
 
         Raises:
-            BeliefError: It is missing, or lies beyond the bounds.
+            BeliefError: The value is missing, or lies beyond the bounds.
         """
         of = [estimates[address] for address in self.rule.of]
         value = self.rule.value_of(of, late=late)
-        if isinstance(value, float) and self._interval[0] <= value <= self._interval[1]:
+        if isinstance(value, float) and self.interval[0] <= value <= self.interval[1]:
             return value  # Most are of joints: numpy would take ten times as long.
         variable, told = self.variable, dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))
         try:
@@ -398,7 +394,7 @@ class _Target:
 
 
 class _Copied:
-    """Variables that are believed to be an estimate each, such as joint angles: all at once."""
+    """Scalar variables that are copies of single estimates, such as joint angles; written all at once."""
 
     def __init__(self, targets: Sequence[_Target]) -> None:
         self.targets = targets
@@ -407,7 +403,7 @@ class _Copied:
         self._least, self._most = np.array([target.interval for target in targets]).reshape(-1, 2).T
 
     def write(self, estimates: np.ndarray, numbers: np.ndarray) -> None:
-        """Write what is believed into the numbers of a start.
+        """Write the believed values into the numbers of a start.
 
         Raises:
             BeliefError: A value is missing, or lies beyond the bounds.
@@ -420,7 +416,7 @@ class _Copied:
 
 
 def _resume(system: System, root: Context, value: Any) -> None:
-    """Let a sensor or actuator go on where one stands that showed, or was given, ``value`` last."""
+    """Set a sensor or an actuator to the state of one whose last output or input, respectively, was ``value``."""
     own = system.GetMyMutableContextFromRoot(root)
     if isinstance(system, ZeroOrderHold | DiscreteTimeDelay):
         own.SetDiscreteState(0, np.resize(value, own.get_discrete_state(0).size()))
@@ -429,5 +425,5 @@ def _resume(system: System, root: Context, value: Any) -> None:
 
 
 def _resumes(system: System) -> bool:
-    """Return whether a sensor or actuator holds values that come from earlier."""
+    """Return whether `_resume` can set the state of a sensor or an actuator."""
     return hasattr(system, "resume") or isinstance(system, ZeroOrderHold | DiscreteTimeDelay)

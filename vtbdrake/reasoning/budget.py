@@ -10,15 +10,15 @@ from vtbdrake.argument_checks import as_number, as_whole
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a decision may take; whichever ends first, if both are given.
+    """How much a decision may take. If both limits are given, the decision ends at the first that is reached.
 
     Attributes:
-        rollouts: how many rollouts. Such a decision can be repeated exactly, with any executor.
-        seconds: of wall time. When it ends, the rollouts under way are cancelled, and the best candidate of those that
-            have finished is the decision.
+        rollouts: Number of rollouts. A decision with this budget alone can be repeated exactly, with any executor.
+        seconds: Wall time. When it is over, the rollouts under way are cancelled, and the best candidate that has
+            finished is the decision.
 
     Raises:
-        ValueError: neither is given, or one is not positive.
+        ValueError: Neither is given, or one is not positive.
     """
 
     rollouts: int | None = None
@@ -41,7 +41,7 @@ def check_budget(budget: Budget, samples: int) -> None:
     """Check that a budget suffices for one candidate.
 
     Raises:
-        ValueError: it does not, or it is no budget.
+        ValueError: The budget does not suffice, or is not a `Budget`.
     """
     if not isinstance(budget, Budget):
         raise ValueError(f"a budget is Budget(rollouts=...) or Budget(seconds=...), not {budget!r}")

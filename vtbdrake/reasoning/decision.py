@@ -1,4 +1,4 @@
-"""What a reasoner answers: the best candidate of those that it tried, how sure it is, and why it ended."""
+"""The answer of a reasoner: the best candidate that was tried, the other candidates, and why the search ended."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Candidate:
     """One alternative that was tried.
 
     Attributes:
-        number: in the order of trying; 0 is the plan in use.
-        values: address -> value that it sets; of candidate 0 what is set already.
+        number: Position in the order of trying; 0 is the plan in use.
+        values: Address -> value that the candidate sets; for candidate 0 the values that are set already.
         status: ``eligible``, ``violates`` (a constraint), ``cut off`` (it could not win any more), ``failed`` (a
             simulation did), ``unfinished`` (the budget ended before all its samples were simulated).
-        quality: over all samples, in the user's terms: a cost as a cost. NaN if a simulation failed or is missing; of a
-            candidate that was cut off, the best that it could still have reached.
-        violations: one per constraint, the worst over the samples: at most 0 where it holds.
-        rollouts: one per sample of the belief, as far as they have finished.
+        quality: Quality over all samples, in the user's terms: a cost as a cost. NaN if a simulation failed or is
+            missing. For a candidate that was cut off, the best that it could still have reached.
+        violations: One per constraint, the worst over the samples: at most 0 where it holds.
+        rollouts: The finished rollouts, at most one per sample of the belief.
     """
 
     number: int
@@ -50,12 +50,12 @@ class Candidate:
 
     @property
     def has_trajectory(self) -> bool:
-        """Return whether its quality over time is known, from the first sample of the belief at least."""
+        """Return whether the quality over time is known, from the first sample of the belief at least."""
         return bool(self.rollouts) and self.rollouts[0].quality.size > 0
 
     @property
     def text(self) -> str:
-        """Return its values as text."""
+        """Return the values as text."""
         return ", ".join(f"{address} = {_short(value)}" for address, value in self.values.items())
 
 
@@ -64,16 +64,16 @@ class Health:
     """How a decision was reached, to tell a planner that is too slow from a quality that is wrong.
 
     Attributes:
-        rollouts: how many have finished.
-        failed: how many of them failed.
-        cut_off: how many of them ended early, see `Pruning`.
-        rollout_time: the mean wall time of one, in seconds.
-        elapsed: the wall time of the decision, in seconds.
-        used: the share of the budget that was used, of rollouts or of time; of both the larger one.
-        improvement: by how much the quality is better than that of the plan in use, in the unit of the quality; at
+        rollouts: Number of finished rollouts.
+        failed: Number of rollouts that failed.
+        cut_off: Number of rollouts that ended early, see `Pruning`.
+        rollout_time: The mean wall time of a rollout, in seconds.
+        elapsed: The wall time of the decision, in seconds.
+        used: The share of the budget that was used, of rollouts or of time, whichever is larger.
+        improvement: By how much the quality is better than that of the plan in use, in the unit of the quality; at
             least 0. NaN without a decision, or if the plan in use is not eligible.
-        margin: by how much it is better than the best other eligible candidate; NaN if there is none.
-        spread: the standard deviation of the quality over the samples of the belief.
+        margin: By how much the quality is better than that of the second best eligible candidate; NaN if there is none.
+        spread: The standard deviation of the quality over the samples of the belief.
     """
 
     rollouts: int
@@ -92,18 +92,19 @@ class Decision:
     """The answer of a reasoner; false if no candidate is eligible.
 
     Attributes:
-        values: address -> value of the chosen candidate; empty if none is eligible.
-        quality: of the chosen candidate, over all samples, in the user's terms; NaN if none is eligible.
-        chosen: the number of the chosen candidate; None if none is eligible.
-        candidates: the plan in use, and all others of which a rollout has finished.
-        health: how it was reached.
-        end: why it ended: ``rollouts`` or ``time`` (the budget was spent), ``method`` (the method has finished).
-        message: the same in a sentence; without a decision, why no candidate is eligible.
-        time: the DPS's time for which it was made, in seconds.
-        warnings: what speaks against it, one sentence each; empty if nothing does.
-        name: of the quality.
-        minimize: whether the quality is a cost.
-        starts: where the rollouts began, one per sample of the belief.
+        values: Address -> value of the chosen candidate; empty if none is eligible.
+        quality: Quality of the chosen candidate, over all samples, in the user's terms; NaN if none is eligible.
+        chosen: The number of the chosen candidate; None if none is eligible.
+        candidates: The plan in use, and every other candidate with at least one finished rollout.
+        health: How the decision was reached.
+        end: Why the search ended: ``rollouts`` or ``time`` (the budget was spent), ``method`` (the method has
+            finished).
+        message: The end in a sentence; without a decision, why no candidate is eligible.
+        time: The DPS's time at which the decision begins, in seconds.
+        warnings: Reasons not to trust the decision, one sentence each; empty if there are none.
+        name: Name of the quality.
+        minimize: Whether the quality is a cost.
+        starts: Where the rollouts began, one per sample of the belief.
     """
 
     values: Mapping[str, Any]
@@ -124,7 +125,7 @@ class Decision:
 
     @property
     def poor(self) -> bool:
-        """Return whether something speaks against it, see ``warnings``."""
+        """Return whether there are reasons not to trust the decision, see ``warnings``."""
         return bool(self.warnings)
 
     @property
@@ -136,7 +137,7 @@ class Decision:
         """Set the chosen values in a context of the running testbed, or of its DPS alone.
 
         Raises:
-            ValueError: no candidate is eligible.
+            ValueError: No candidate is eligible.
         """
         if not self:
             raise ValueError(
@@ -203,17 +204,17 @@ class Decision:
         return summary_html(repr(self), {**rows, **self._facts()}, self.plot() if drawn else None)
 
     def plot(self) -> Figure:
-        """Plot the quality of the candidates over time (Figure 5), and over what is decided (Figure 6).
+        """Plot the quality of the candidates over time (Figure 5), and over the decided values (Figure 6).
 
         Raises:
-            ValueError: no rollout has a quality.
+            ValueError: No rollout has a quality.
         """
         from vtbdrake.visualization import plot_decision
 
         return plot_decision(self)
 
 
-# So many candidates are shown at most.
+# The largest number of candidates shown.
 _SHOWN = 10
 
 

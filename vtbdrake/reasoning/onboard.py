@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# The share of the time for an answer that a decision beside a loop may take; the rest is for the way there and back.
+# The share of the latency that a decision beside a loop may take; the rest is for communication.
 _SHARE = 0.8
+
+# The niceness of the processes beside a loop, so that they leave the processors to others.
+_NICENESS = 5
 
 _DECISION, _CANDIDATE, _CANDIDATE_AT = "decision", "candidate", "candidate_at"
 _QUALITY, _IMPROVEMENT, _ROLLOUTS = "quality", "improvement", "rollouts"
@@ -51,48 +54,46 @@ class OnboardReasoner(SlowPart):
         - improvement (over the plan in use, likewise; NaN if that is not eligible)
         - rollouts (that the decision took)
         - sampled_at (s; when the state was sampled from which the decision was made, at first -inf)
-        - valid (1 if the decision that was due last was there, else 0)
-        - missed (how many were not)
+        - valid (1 if the decision that was due last was made in time, else 0)
+        - missed (the number of decisions that were not)
         - taken (only with ``on_request``: the request that was taken last, at first 0)
 
-    At t_k it samples the state of the DPS. From t_k + latency on, ``decision`` is the best candidate that a `Reasoner`
-    has found. If none is eligible, or nothing can be believed, or the answer does not come in time, the plan in use
-    stays and ``valid`` is 0: what the DPS does then is its own business.
+    At t_k the part samples the state of the DPS. From t_k + latency on, ``decision`` is the best candidate that a
+    `Reasoner` has found. If none is eligible, or no rollout can begin from the belief, or the answer is late, the plan
+    in use stays and ``valid`` is 0; the DPS must react to that itself.
 
     In a mental copy (``mental=True``) the same part, with the same ports, does not reason. At t_k + latency it shows
-    the candidate of that rollout, its parameter ``candidate``. So each candidate enters the DPS at the port and at the
+    the candidate of the rollout, its parameter ``candidate``. So each candidate enters the DPS at the port and at the
     instant at which the decision will enter it. Afterwards the plan stays, and no request is taken. The outputs
-    ``quality``, ``improvement``, ``rollouts`` and ``missed`` do not change in a mental copy: a DPS whose behaviour
-    depends on them is not predicted rightly.
+    ``quality``, ``improvement``, ``rollouts`` and ``missed`` do not change in a mental copy: if the behaviour of the
+    DPS depends on them, mental rollouts predict it wrongly.
 
-    In a simulation the thinking time is the latency, and the budget is one of rollouts, so that a decision can be
-    repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop it thinks in
-    processes of its own, and the budget ends after 0.8 of the latency less one period of the loop; the best candidate
-    by then is the decision.
+    In a simulation a decision takes exactly the latency, and the budget counts rollouts, so that the decision can be
+    repeated exactly; the rollouts run one after another in the thread of the simulation. Beside a loop they run in
+    processes of their own, and the decision is the best candidate found within 0.8 (latency - period of the loop).
 
     Args:
-        size: Entries of the decision.
-        scenario: That of the DPS. Its `Scenario.mental` has this part in the same place, with ``mental=True``.
-        decision: What is decided, see `Reasoner`: elements of the parameter ``candidate`` of this part
-            (``dps.<path>.candidate``, or one entry ``dps.<path>.candidate[0]``).
+        size: Number of entries of the decision.
+        scenario: Scenario of the DPS. Its `Scenario.mental` has this part in the same place, with ``mental=True``.
+        decision: The decided elements, see `Reasoner`: the parameter ``candidate`` of this part
+            (``dps.<path>.candidate``), or entries of it (``dps.<path>.candidate[0]``).
         quality: See `Reasoner`.
-        horizon: Of a rollout in seconds from t_k on; longer than the latency.
-        budget: Of a decision; it counts rollouts. Its seconds, if given, are the longest time beside a loop: more,
-            say, for a machine in lock-step, which waits.
+        horizon: Length of a rollout from t_k on, in seconds; longer than the latency.
+        budget: Budget of a decision, which counts rollouts. Its seconds, if given, are the time limit beside a loop:
+            for a machine in lock-step, which waits, it may be longer than the latency.
         period, latency, offset, patience: See `SlowPart`. As a decision takes no longer than its latency, the patience
             is short.
         initial: The decision until the first one is made, a scalar or shape (size,).
-        on_request: Whether it decides once for each new request. Otherwise it decides at every t_k, at a receding
+        on_request: Whether to decide once for each new request. Otherwise the part decides at every t_k, at a receding
             horizon, and the latency is at most the period.
         believed: Names of further input ports, with their sizes. In a mental copy, the parameter of that name of this
             part is the value of the port at t_k, for the rules that lead from estimates to the simulated world
             (`VirtualTestbedBuilder.believe`).
         mental: Whether this is the part of a mental copy.
-        niceness: Of the processes beside a loop, from 0 to 19, so that they leave the processors to others.
-        options: Further arguments of `Reasoner`. Its executor and workers are used beside a loop.
+        options: Further arguments of `Reasoner`. ``executor`` and ``workers`` apply beside a loop only.
 
     Raises:
-        ValueError: The budget does not count rollouts, something else than a candidate is decided, the horizon ends
+        ValueError: The budget does not count rollouts, another element than ``candidate`` is decided, the horizon ends
             before a decision is shown, or see `SlowPart`.
     """
 
@@ -115,10 +116,9 @@ class OnboardReasoner(SlowPart):
         on_request: bool = False,
         believed: Mapping[str, int] | None = None,
         mental: bool = False,
-        niceness: int = 5,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        _check(decision, budget, horizon, latency, niceness)
+        _check(decision, budget, horizon, latency)
         arguments = {
             "scenario": scenario,
             "decision": tuple(decision),
@@ -128,9 +128,9 @@ class OnboardReasoner(SlowPart):
             **(options or {}),
         }
         believed = dict(believed or {})
-        self._thinker = _Thinker(arguments, niceness)
+        self._decider = _Decider(arguments)
         super().__init__(
-            self._thinker,
+            self._decider,
             inputs=believed,
             outputs={_DECISION: size, **dict.fromkeys((_QUALITY, _IMPROVEMENT, _ROLLOUTS), 1)},
             period=period,
@@ -157,8 +157,7 @@ class OnboardReasoner(SlowPart):
         )
 
     def function_beside(self, period: float) -> SlowFunction:
-        thinker = self._thinker.limited(_SHARE * (self.latency - period))
-        return replace(self.function, function=thinker)
+        return replace(self.function, function=self._decider.limited(_SHARE * (self.latency - period)))
 
     def _sample(self, context: Context, state: State) -> None:
         if not self.mental:
@@ -180,35 +179,34 @@ class OnboardReasoner(SlowPart):
         return bool(abs(at - self.offset - tick * self.period) < 0.5 * self.period)
 
 
-class _Thinker:
-    """The function of an `OnboardReasoner`. It makes its reasoner when it is first needed, and keeps it.
+class _Decider:
+    """The function of an `OnboardReasoner`. It makes its reasoner at the first call, and keeps it.
 
     A decision depends on nothing but the arguments of the call. Several contexts of one Diagram take turns.
 
     Args:
-        arguments: Those of the reasoner.
-        niceness: Of the process beside a loop, and of its workers.
+        arguments: Arguments of the reasoner.
         seconds: The longest wall time of a decision beside a loop, if the budget has none.
     """
 
-    def __init__(self, arguments: Mapping[str, Any], niceness: int, seconds: float | None = None) -> None:
+    def __init__(self, arguments: Mapping[str, Any], seconds: float | None = None) -> None:
         self._arguments = dict(arguments)
-        self._niceness, self._seconds = niceness, seconds
+        self._seconds = seconds
         self._budget: Budget = replace(self._arguments["budget"], seconds=None)
         self._reasoner: Reasoner | None = None
         self._last_reason = ""
         self._taking_turns = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _Thinker, (self._arguments, self._niceness, self._seconds)
+        return _Decider, (self._arguments, self._seconds)
 
-    def limited(self, seconds: float) -> _Thinker:
-        """Return one whose decisions beside a loop take ``seconds`` at most."""
-        return _Thinker(self._arguments, self._niceness, seconds)
+    def limited(self, seconds: float) -> _Decider:
+        """Return a copy whose decisions beside a loop take at most ``seconds``."""
+        return _Decider(self._arguments, seconds)
 
     def prepare(self) -> None:
         """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""
-        os.nice(self._niceness)
+        os.nice(_NICENESS)
         budget = self._arguments["budget"]
         self._budget = replace(budget, seconds=budget.seconds or self._seconds)
         self._make(**self._arguments).warm_up()
@@ -220,7 +218,7 @@ class _Thinker:
 
         Args:
             dps: The state of the DPS.
-            request: What it was asked; all requests ask for the same.
+            request: The request; its value does not matter.
             **believed: The values of the further ports.
         """
         with self._taking_turns:
@@ -232,12 +230,12 @@ class _Thinker:
                 reason = "" if decision else decision.message
             except BeliefError as error:
                 reason = str(error)
-            if reason and reason != self._last_reason:  # Once, not with every sample.
+            if reason and reason != self._last_reason:  # Not with every sample.
                 _log.warning("nothing was decided at t = %g s: %s", dps.time, reason)
             self._last_reason = reason
             if reason:
                 return None
-            # What is decided may be some entries only.
+            # The decision may set only some entries of the candidate.
             decision.apply(self._testbed, self._context)
             return {
                 _DECISION: np.atleast_1d(self._variables[_CANDIDATE].get(self._context)),
@@ -262,7 +260,7 @@ class _Thinker:
         if not reasoner.reproducible:
             raise ValueError(
                 f"{self._arguments['method']} takes its random numbers from the clock, so that a run could not be "
-                "repeated: take CEM, say"
+                "repeated: take CEM, for example"
             )
         for element in self._arguments["decision"]:
             if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
@@ -282,9 +280,9 @@ class _Thinker:
         return Belief(replace(dps, contents=replace(contents, numbers=numbers)))
 
 
-def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency: float, niceness: int) -> None:
+def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency: float) -> None:
     if budget.rollouts is None:
-        raise ValueError(f"a reasoner on board has a budget of rollouts, Budget(rollouts=70), say, not {budget}")
+        raise ValueError(f"a reasoner on board has a budget of rollouts, such as Budget(rollouts=70), not {budget}")
     for element in decision:
         if not element.address.partition("[")[0].endswith(f".{_CANDIDATE}"):
             raise ValueError(
@@ -296,5 +294,3 @@ def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency:
             f"a horizon of {horizon:g} s ends before a decision is shown, {latency:g} s after its sample: choose a "
             "longer one"
         )
-    if not 0 <= niceness <= 19:
-        raise ValueError(f"the niceness of a process is from 0 to 19, not {niceness}")

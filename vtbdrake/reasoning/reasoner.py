@@ -1,4 +1,4 @@
-"""The reasoner: tries alternatives in a mental copy of the testbed, within a budget, and answers with the best."""
+"""The reasoner: simulates alternatives in a mental copy of the testbed, within a budget, and returns the best."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.reasoning.belief import Belief, Starter, Uncertainty
 from vtbdrake.reasoning.budget import Budget, check_budget
 from vtbdrake.reasoning.decision import Decision
+from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
-from vtbdrake.reasoning.thinking import Thinking
 from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Beginning, Start
@@ -35,61 +35,61 @@ _LEAST_TIME_LIMIT = 10.0
 
 
 class ReasonerError(RuntimeError):
-    """A decision that was asked for at the wrong time: while another one is under way, or after the end."""
+    """A decision was requested while another one is under way, or after the reasoner was closed."""
 
 
 class Reasoner:
     """Decides what a running DPS should do, by rollouts of its own testbed (section 5).
 
-    Each decision begins at the DPS's state as it stands, in the world as the DPS believes it to be. Candidate 0 is the
-    plan in use: nothing is set, and the DPS goes on. The method proposes the others; problem (18) is solved over what
-    is decided, until the budget is spent. The rollouts run in workers that keep their testbeds from decision to
-    decision.
+    Each decision begins at the DPS's present state, in the world as the DPS believes it to be. Candidate 0 is the plan
+    in use: nothing is set, and the DPS goes on. The method proposes the other candidates, and so solves problem (18)
+    over the decided elements until the budget is spent. The rollouts run in workers that keep their testbeds from
+    decision to decision.
 
     A decision is a function of the state from which it begins (its time included), the plan and the seed: nothing is
-    remembered. What warms up the method is the plan in use, which is part of that state.
+    remembered. The method starts at the plan in use, which is part of that state.
 
     Args:
-        scenario: that of the running testbed; its `Scenario.mental` is what is simulated.
-        decision: what is decided: commands (``u.<name>``) and other elements of the DPS: `Parameter`, `Choice` or
-            `Trajectory`.
-        quality: f, larger is better, or a cost.
-        horizon: of a rollout, in seconds.
-        budget: how much a decision may take.
-        method: a name from `vtbdrake.optimization.solvers` (``CEM``, ``predictive-sampling``, ``MPPI``, ``grid``,
-            ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
-        options: of the method.
-        constraints: what the rollouts of an eligible candidate keep.
-        samples: how many samples of an uncertain belief each candidate is simulated from; at least 2. 1: the belief is
-            certain.
-        uncertainty: of the belief, see `Starter`; by address of a variable of the simulated world.
-        max_age: the largest age of a belief, in seconds.
-        risk: how the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
-        threshold: f_m: a rollout ends when f exceeds it.
-        sample_period: of f, in seconds.
-        pruning: when the rollout of a candidate that cannot win any more ends. A quality is compared with the best one
-            before its round of 8 candidates, if there is one sample or the risk is ``worst``. With CEM, MPPI and others
-            that learn from all points, it is another search.
-        executor: where the rollouts run, see `Problem.sweep`. ``auto`` takes processes if a system in Python has work
+        scenario: Scenario of the running testbed. The rollouts simulate its `Scenario.mental`.
+        decision: The elements of the DPS that are decided, commands (``u.<name>``) and others, each a `Parameter`, a
+            `Choice` or a `Trajectory`.
+        quality: Quality f, larger is better, or a cost.
+        horizon: Length of a rollout, in seconds.
+        budget: How much a decision may take.
+        method: Name of a solver from `vtbdrake.optimization.solvers` (``CEM``, ``predictive-sampling``, ``MPPI``,
+            ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
+        options: Options of the method.
+        constraints: Constraints that the rollouts of an eligible candidate keep.
+        samples: Number of samples of an uncertain belief from which each candidate is simulated, at least 2; 1 if the
+            belief is certain.
+        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `Starter`.
+        max_age: The largest age of a belief, in seconds.
+        risk: How the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
+        threshold: Threshold f_m: a rollout ends when f exceeds it.
+        sample_period: Sample period of f, in seconds.
+        pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
+            one before its round of 8 candidates, if there is one sample or the risk is ``worst``. Methods that learn
+            from all points, such as CEM and MPPI, propose other candidates with pruning than without.
+        executor: Where the rollouts run, see `Problem.sweep`. ``auto`` takes processes if a system in Python has work
             to do, else threads.
-        workers: how many threads or processes; by default the number of cores.
-        time_limit: the longest wall time of one rollout in a process, in seconds: a worker that hangs is ended then. By
-            default the horizon, but at least 10 s.
-        seed: of the method; in each decision it is combined with the time at which that begins.
+        workers: Number of threads or processes; by default the number of cores.
+        time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
+            By default the horizon, but at least 10 s.
+        seed: Seed of the method; combined with the time at which a decision begins.
 
     Attributes:
-        problem: problem (18) in the mental testbed, one condition per sample.
-        task: what its rollouts have in common.
-        executor: where they run.
-        starter: turns beliefs into starts of rollouts.
-        space: what is decided.
-        budget: how much a decision may take.
-        samples: how many samples of the belief each candidate is simulated from.
-        reproducible: whether a decision can be repeated; false with the few methods that take their random numbers from
+        problem: Problem (18) in the mental testbed, one condition per sample.
+        task: The data that all rollouts share.
+        executor: Where the rollouts run.
+        starter: Turns beliefs into starts of rollouts.
+        space: The decided elements.
+        budget: How much a decision may take.
+        samples: Number of samples of the belief from which each candidate is simulated.
+        reproducible: Whether a decision can be repeated; false with the few methods that take their random numbers from
             the clock.
 
     Raises:
-        ValueError: an address is not part of the DPS, the mental scenario has other commands, the budget does not
+        ValueError: An address is not part of the DPS, the mental scenario has other commands, the budget does not
             suffice for one candidate, the method is unknown or cannot decide this, or an argument of `Problem` is
             invalid.
     """
@@ -147,13 +147,13 @@ class Reasoner:
         self.task = replace(self.problem.task, catch=True, pruning=pruning)
         testbed = self.problem.testbed
         self.starter = Starter(testbed, uncertainty=uncertainty, seed=seed, max_age=max_age)
-        # Shows what a start holds.
+        # Reads values from a start.
         self._beginning = Beginning(testbed, testbed.default_context(), testbed.copier_from(testbed))
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
         self._method = method
         self._options = dict(options or {})
         self._seed = as_whole("a seed", seed)
-        # A method that cannot decide this is refused here. Candidate 0 is not its own.
+        # A method that cannot decide this is refused here. Candidate 0 does not count: the method does not propose it.
         affordable = None if budget.rollouts is None else max(budget.rollouts // self.samples - 1, 1)
         solver = self.solver(0.0, budget=affordable)
         solver.close()
@@ -174,9 +174,9 @@ class Reasoner:
         """Return the method of a decision that begins at ``time``.
 
         Args:
-            time: in seconds; with the seed it determines the random numbers.
-            budget: how many candidates it may ask for; None: any number.
-            start: where it starts, if it starts at a point.
+            time: Time of the DPS in seconds; with the seed it determines the random numbers.
+            budget: Number of candidates that the method may propose; None: any number.
+            start: Where the method starts, if it starts at a point.
         """
         entropy = [self._seed, int(np.float64(time).view(np.uint64))]
         return make_solver(
@@ -190,9 +190,9 @@ class Reasoner:
         )
 
     def warm_up(self) -> None:
-        """Let every worker build its testbed, so that no decision has to wait for that.
+        """Let every worker build its testbed, so that no decision has to wait for it.
 
-        The first decision with a budget of wall time does so before its budget begins.
+        The first decision with a budget of wall time warms up before its budget begins.
 
         Raises:
             ReasonerError: a decision is under way (in another thread), or the reasoner is closed.
@@ -216,19 +216,19 @@ class Reasoner:
         budget: Budget | None = None,
         now: float = -inf,
     ) -> Decision:
-        """Return the best candidate for a DPS that stands as it does, in the world as it believes it to be.
+        """Return the best candidate for a DPS in its present state, in the world as the DPS believes it to be.
 
         Args:
-            believer: the running testbed, or its DPS alone; or a belief; or where the mental rollouts begin.
-            context: of the running testbed or DPS; it stays as it is.
-            plan: address -> value of a plan from which the method starts, tried beside the one in use.
-            budget: of this decision; None: that of the reasoner.
-            now: the present time of the DPS in seconds, from which the age of a belief follows (``max_age``).
+            believer: The running testbed, or its DPS alone; or a belief; or where the mental rollouts begin.
+            context: Context of the running testbed or DPS; not changed.
+            plan: Address -> value of a plan from which the method starts, tried beside the one in use.
+            budget: Budget of this decision; None: the reasoner's.
+            now: The present time of the DPS in seconds, from which the age of a belief follows (``max_age``).
 
         Raises:
             ReasonerError: a decision is under way (in another thread), or the reasoner is closed.
-            BeliefError: no rollout can begin from the belief.
-            ValueError: the plan sets what is not decided, or lies outside its ranges; the budget does not suffice for
+            BeliefError: No rollout can begin from the belief.
+            ValueError: The plan sets what is not decided, or lies outside its ranges; the budget does not suffice for
                 one candidate; or a context is missing.
         """
         with self._only_one():
@@ -241,7 +241,7 @@ class Reasoner:
             starts = self._starts(believer, context, now)
             held = self._plan_in_use(starts[0])
             given = None if plan is None else self.space.point(plan, starts[0].time)
-            return Thinking(self, budget, starts, held, given, begin).decision()
+            return DecisionRun(self, budget, starts, held, given, begin).decision()
 
     def _starts(
         self, believer: AddressedDiagram | Belief | Start, context: Context | None, now: float
@@ -255,9 +255,9 @@ class Reasoner:
         return self.starter.starts(believer, samples=self.samples, now=now)
 
     def _plan_in_use(self, start: Start) -> dict[str, Any]:
-        """Return what the decision is about as it is in a start, address -> value."""
+        """Return the values of the decided elements in a start, address -> value."""
         if self._readers.keys() <= start.values.keys():
-            # Commands, as a rule: to set a context to the start would take a fifth of the time before the rollouts.
+            # Usually so: commands. Setting a context to the start would take a fifth of the time before the rollouts.
             given = {address: np.asarray(start.values[address], dtype=float) for address in self._readers}
             return {address: value if value.shape else value.item() for address, value in given.items()}
         self._beginning.set(start)
@@ -270,10 +270,10 @@ class Reasoner:
 
         Args:
             decision: a decision of this reasoner.
-            candidate: the number of the candidate.
+            candidate: The number of the candidate.
 
         Raises:
-            ValueError: the decision has no such candidate, or the mental testbed has no plant.
+            ValueError: The decision has no such candidate, or the mental testbed has no plant.
         """
         if not 0 <= candidate < len(decision.candidates):
             raise ValueError(
@@ -304,7 +304,7 @@ class Reasoner:
             self._alone.release()
 
     def close(self) -> None:
-        """End the workers. A decision that is under way is finished first."""
+        """End the workers, after a decision that is under way."""
         with self._alone:
             self._closed = True
             if self._owned:
@@ -340,7 +340,7 @@ def _mental(scenario: Scenario) -> Scenario:
     """Return the mental scenario of a scenario.
 
     Raises:
-        ValueError: there is none, or it lacks a command, has another one, or one of another size.
+        ValueError: There is none, or it lacks a command, has another one, or one of another size.
     """
     if not isinstance(scenario, Scenario):
         raise ValueError(

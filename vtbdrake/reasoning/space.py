@@ -1,4 +1,4 @@
-"""What is decided: elements of the DPS, as a search sees them (numbers in ranges) and as the DPS takes them."""
+"""The elements of the DPS that are decided: as parameters of a search, and as values that the DPS takes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class DecisionSpace:
     """The elements of a decision, and the parameters that a search varies for them.
 
     Args:
-        decision: commands (``u.<name>``) and other elements of the DPS, each a `Parameter`, a `Choice` or a
+        decision: Commands (``u.<name>``) and other elements of the DPS, each a `Parameter`, a `Choice` or a
             `Trajectory`.
 
     Attributes:
-        elements: the elements.
-        parameters: what a search varies: one number for a parameter or a choice, the knots of a trajectory.
+        elements: The decided elements.
+        parameters: The parameters of the search: one for a parameter or a choice, the knots of a trajectory.
 
     Raises:
-        ValueError: there is no element, or one is not a part of the DPS.
+        ValueError: There is no element, or one is not a part of the DPS.
     """
 
     def __init__(self, decision: Sequence[Element]) -> None:
@@ -40,7 +40,7 @@ class DecisionSpace:
             if not element.address.startswith(("u.", "dps.")):
                 raise ValueError(
                     f"a decision sets a command (u.<name>) or another element of the DPS (dps.<...>), but "
-                    f"{element.address} is neither; what it depends on besides is for vtb.Problem"
+                    f"{element.address} is neither; other variables are varied by vtb.Problem"
                 )
         parts = [e.parameters if isinstance(e, Trajectory) else (e,) for e in self.elements]
         self.parameters: tuple[Dimension, ...] = tuple(parameter for part in parts for parameter in part)
@@ -53,24 +53,24 @@ class DecisionSpace:
         return tuple(element.address for element in self.elements)
 
     def find(self, variables: Variables) -> None:
-        """Check that a testbed has the trajectories; `Problem` checks the parameters.
+        """Check that a testbed has the variables of the trajectories; `Problem` checks those of the parameters.
 
         Raises:
-            ValueError: there is no such variable, or one of another size or with narrower bounds.
+            ValueError: There is no such variable, or one of another size or with narrower bounds.
         """
         for element in self.elements:
             if isinstance(element, Trajectory):
                 element.find(variables)
 
     def point(self, plan: Mapping[str, Any], time: float) -> Point:
-        """Return the point of the search that a plan is.
+        """Return a plan as a point of the search.
 
         Args:
-            plan: address -> value, as the DPS takes it; a trajectory is shifted so that it begins at ``time``.
-            time: the time of the decision in seconds.
+            plan: Address -> value, as the DPS takes it; a trajectory is shifted so that it begins at ``time``.
+            time: The time of the decision in seconds.
 
         Raises:
-            ValueError: the plan lacks an element or has others, or a value lies outside its range.
+            ValueError: The plan lacks an element or has others, or a value lies outside its range.
         """
         wrong = set(plan) ^ set(self.addresses)
         if wrong:
@@ -86,12 +86,12 @@ class DecisionSpace:
         return tuple(point)
 
     def values(self, point: Point, plan: Mapping[str, Any], time: float) -> dict[str, Any]:
-        """Return what a point of the search sets, address -> value as the DPS takes it.
+        """Return the values that a point of the search sets, address -> value as the DPS takes it.
 
         Args:
-            point: one value per parameter.
-            plan: the plan in use, address -> value; where the rate of a trajectory is limited, it goes on from there.
-            time: the time of the decision in seconds, at which a trajectory begins.
+            point: One value per parameter.
+            plan: The plan in use, address -> value; a trajectory with limited rate continues from its value.
+            time: The time of the decision in seconds, at which a trajectory begins.
         """
         values = {}
         for element, part in zip(self.elements, self._parts, strict=True):

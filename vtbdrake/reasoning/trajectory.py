@@ -31,19 +31,19 @@ class Trajectory:
     DPS takes it: the time at which the plan begins, and n knots of m entries. It may be a command (``u.plan``) or any
     other element of the DPS. A search varies one `Parameter` per knot and entry; the reasoner sets t_begin.
 
-    The limits hold at every instant of the plan, not only at the knots: `limited` changes a candidate as far as they
-    require. Where the rate is limited, the plan also begins at the value of the plan in use. (Its rate there may
-    differ from that of the plan in use, whatever the acceleration limit.)
+    The limits hold at every instant of the plan, not only at the knots: `limited` changes a candidate to keep them. If
+    the rate is limited, the plan also begins at the value of the plan in use. (The rate may jump there, whatever the
+    acceleration limit.)
 
     Attributes:
-        address: of the plan.
-        knots: their number n.
-        duration: of the plan in seconds, usually the horizon. Afterwards the last value is held.
-        order: ``zero``, ``linear``, ``cubic`` or ``bspline``, see `Spline`.
-        size: entries m of a knot.
-        lower, upper: limits of the value, scalars or one per entry, in its unit.
-        rate: the largest change per second, positive, likewise.
-        acceleration: the largest change per second of that change, positive, likewise.
+        address: Address of the plan.
+        knots: Number n of knots.
+        duration: Duration of the plan in seconds, usually the horizon. Afterwards the last value is held.
+        order: Kind of the spline: ``zero``, ``linear``, ``cubic`` or ``bspline``, see `Spline`.
+        size: Number m of entries of a knot.
+        lower, upper: Limits of the value, scalars or one per entry, in its unit.
+        rate: Limit of the first derivative by time, positive, a scalar or one per entry.
+        acceleration: Limit of the second derivative by time, positive, a scalar or one per entry.
 
     Raises:
         ValueError: a limit is ill-formed or cannot be kept by splines of this order, or see `Spline`.
@@ -101,7 +101,7 @@ class Trajectory:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return what a search varies: n m parameters, knot by knot."""
+        """Return the n m parameters of a search, knot by knot."""
         ranges = self._limits[:2].T.tolist() * self.spline.knots
         return tuple(Parameter(f"{self.address}[{1 + k}]", *ends) for k, ends in enumerate(ranges))
 
@@ -124,7 +124,7 @@ class Trajectory:
         """Check that the testbed has this plan.
 
         Raises:
-            ValueError: there is no such variable, it has another size, or its bounds are narrower than the limits.
+            ValueError: There is no such variable, it has another size, or its bounds are narrower than the limits.
         """
         shape = (1 + self.spline.knots * self.size,)
         variable = variables[self.address]
@@ -140,7 +140,7 @@ class Trajectory:
         """Return a plan [t_begin, knots] as numbers.
 
         Raises:
-            ValueError: it has another size, or is not finite.
+            ValueError: It has another size, or is not finite.
         """
         count = 1 + self.spline.knots * self.size
         numbers = np.asarray(plan, dtype=float)
@@ -152,8 +152,8 @@ class Trajectory:
         """Return the whole plan [t_begin, knots].
 
         Args:
-            knots: shape (n m,) or (n, m).
-            begin: t_begin in seconds.
+            knots: Shape (n m,) or (n, m).
+            begin: Time t_begin in seconds.
         """
         return np.concatenate(([float(begin)], self._matrix(knots).ravel()))
 
@@ -161,9 +161,9 @@ class Trajectory:
         """Return the trajectory, or a derivative, at some times.
 
         Args:
-            knots: shape (n m,) or (n, m).
-            times: shape (p,), in seconds since t_begin.
-            derivative: 0 to 3.
+            knots: Shape (n m,) or (n, m).
+            times: Shape (p,), in seconds since t_begin.
+            derivative: Order of the derivative, 0 to 3.
 
         Returns:
             Shape (p, m).
@@ -177,8 +177,8 @@ class Trajectory:
         at the `Spline.sites`.
 
         Args:
-            knots: shape (n m,) or (n, m).
-            dt: in seconds.
+            knots: Shape (n m,) or (n, m).
+            dt: Shift in seconds.
 
         Returns:
             Knots in the shape of those given.
@@ -194,8 +194,8 @@ class Trajectory:
         the limits.
 
         Args:
-            knots: shape (n m,) or (n, m).
-            start: the value at which it begins, a scalar or shape (m,); where it was decided, if left out.
+            knots: Shape (n m,) or (n, m).
+            start: The value at which the trajectory begins, a scalar or shape (m,); None: that of the first knot.
 
         Returns:
             Knots in the shape of those given.
@@ -229,7 +229,7 @@ class Trajectory:
         """Return by how much a trajectory exceeds its limits, by ``lower``, ``upper``, ``rate`` and ``acceleration``.
 
         Args:
-            knots: shape (n m,) or (n, m).
+            knots: Shape (n m,) or (n, m).
         """
         beyond = {name: float(value.max()) for name, value in self._beyond(self._matrix(knots)).items()}
         return {name: value for name, value in beyond.items() if value > 0.0}

@@ -58,7 +58,7 @@ class Measure:
 
     Attributes:
         f: The function. It gets the quality variables in the order of ``of``, floats or arrays.
-        of: sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
+        of: Sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
             DPS's or the simulation's; ``time`` is the simulation's clock.
         reading: How the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
             time, by the trapezoidal rule). All mean the samples up to where the rollout ends: at t_m, or earlier where

@@ -37,11 +37,11 @@ class RolloutRunner:
     """Runs the rollouts of one task on one testbed, one after another; every thread needs its own.
 
     Args:
-        task: what the rollouts have in common.
-        testbed: built from the task's scenario; several runners may share one. Left out, it is built.
+        task: What the rollouts have in common.
+        testbed: Built from the task's scenario; several runners may share one. Left out, it is built.
 
     Raises:
-        ValueError: the testbed draws, or the task asks for an address that the testbed does not have, or (a
+        ValueError: The testbed draws, or the task asks for an address that the testbed does not have, or (a
             `MotionError`) for a motion that depends on what is varied along it.
     """
 
@@ -88,16 +88,16 @@ class RolloutRunner:
         """Run one rollout from s0.
 
         Args:
-            parameters: address -> value, set in s0.
-            start: s0; that of the task if left out. Several rollouts from the same object prepare it once.
-            cutoff: ends the rollout early.
-            cancel: stops the rollout when it is set.
+            parameters: Address -> value, set in s0.
+            start: S0; that of the task if left out. Several rollouts from the same object prepare it once.
+            cutoff: Ends the rollout early.
+            cancel: Stops the rollout when it is set.
 
         Raises:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
             StartError: ``start`` does not fit the testbed.
             CancelledError: ``cancel`` was set, or the deadline of ``cutoff`` has passed.
-            MotionError: the motion along which the task's rollouts go depends on what is varied.
+            MotionError: The motion along which the task's rollouts go depends on what is varied.
         """
         begin = time.perf_counter()
         self._begin(start)
@@ -143,11 +143,11 @@ class RolloutRunner:
         """Simulate from s0 with ``parameters`` set in it, and pause at every sample time, which is yielded.
 
         Args:
-            parameters: address -> value, set in s0.
-            start: s0; that of the task if left out.
+            parameters: Address -> value, set in s0.
+            start: S0; that of the task if left out.
 
         Raises:
-            SimulationError: the simulation cannot go on.
+            SimulationError: The simulation cannot go on.
             StartError: ``start`` does not fit the testbed.
         """
         self._begin(start)
@@ -168,14 +168,14 @@ class RolloutRunner:
         """Return s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
 
         Args:
-            parameters: address -> value, set in s0.
-            t: in seconds from t0.
-            start: s0; that of the task if left out.
+            parameters: Address -> value, set in s0.
+            t: In seconds from t0.
+            start: S0; that of the task if left out.
 
         Raises:
             ValueError: ``t`` is not a sample time.
             StartError: ``start`` does not fit the testbed.
-            RuntimeError: the simulation fails before.
+            RuntimeError: The simulation fails before.
         """
         self._begin(start)
         last = int(np.argmin(np.abs(self._times - t)))
@@ -371,7 +371,7 @@ class _Samples:
         """Check that integrals are finite, as all their samples are.
 
         Raises:
-            QualityError: one has overflowed.
+            QualityError: One has overflowed.
         """
         times = np.array(self._times)
         for measure, samples in zip(self._runner._measures, self._samples, strict=True):
@@ -479,7 +479,7 @@ class Testbeds:
 
     Args:
         known: a testbed that is there already, and stays.
-        kept: how many others are kept; the one that was not used for longest goes first.
+        kept: How many others are kept; the one that was not used for longest goes first.
     """
 
     def __init__(self, known: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
@@ -539,9 +539,9 @@ class Runners:
         """Return this thread's runner of ``task``, with ``fields`` (name -> value) set in its scenario.
 
         Raises:
-            ScenarioError: there is no such field, or the scenario refuses its value.
-            BuildError: no testbed can be built with these fields for another reason.
-            SnapshotError: the task starts from a snapshot, which is of the scenario as it was.
+            ScenarioError: There is no such field, or the scenario refuses its value.
+            BuildError: No testbed can be built with these fields for another reason.
+            SnapshotError: The task starts from a snapshot, which is of the scenario as it was.
         """
         mine: OrderedDict[Hashable, tuple[RolloutTask, RolloutRunner]]
         mine = self._threads.__dict__.setdefault("runners", OrderedDict())
@@ -590,7 +590,7 @@ class Runners:
         Args:
             task: The rollout.
             point: Address, or scenario field with its prefix -> value.
-            start: s0; that of the task if left out.
+            start: S0; that of the task if left out.
             cutoff: Ends the rollout early.
             cancel: An event that ends the rollout when it is set.
             begin: Called when the testbed has been built, before the rollout.

@@ -32,24 +32,24 @@ class RolloutResult:
     """The outcome of one rollout.
 
     Attributes:
-        parameters: what was set in s0, by address.
-        end: why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
+        parameters: What was set in s0, by address.
+        end: Why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
             the testbed asked for the end), ``pruned`` or ``stalled`` (see `Pruning`) or ``failed``.
-        message: the reason of a failure, termination or pruning.
+        message: The reason of a failure, termination or pruning.
         t_star: t* in seconds from t0, equation (16); of a quality that is read at the end or as an integral the end, of
             one that is read at its worst the time of that. NaN if the rollout failed or had no quality.
-        h: f'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
+        h: F'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
         value: h in the user's terms: the cost, if f is one, else h. Of a pruned rollout, the best that it could still
             have reached.
-        measures: what else was asked to be measured, in its order; empty if the rollout failed.
+        measures: What else was asked to be measured, in its order; empty if the rollout failed.
         threshold: f_m, that of f': of a cost, 1 / (1 + the threshold of the cost).
         exceedances: G1, equation (14): the sample times at which f' exceeded f_m, in seconds from t0; all of it only if
             the rollout was asked to run on.
-        times: sample times from t0, in seconds, shape (n,).
-        quality: the quality trajectory f' at ``times``, equation (13), shape (n,); of a cost, 1 / (1 + cost).
-        record: by address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
-        state: s(t*) if it was asked for.
-        wall_time: seconds it took.
+        times: Sample times from t0, in seconds, shape (n,).
+        quality: The quality trajectory f' at ``times``, equation (13), shape (n,); of a cost, 1 / (1 + cost).
+        record: By address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
+        state: S(t*) if it was asked for.
+        wall_time: Seconds it took.
     """
 
     parameters: Mapping[str, Any]
@@ -120,23 +120,23 @@ class RolloutTask:
     """A rollout s(t) = Gamma(s0, t), equation (7), up to what is set in s0.
 
     Attributes:
-        scenario: builds the testbed.
+        scenario: Builds the testbed.
         horizon: t_m in seconds from t0.
         quality: f and its variables; None for a rollout that only records.
-        threshold: the first sample of f above it, strictly, ends the rollout; or, of a cost, the first one below it.
+        threshold: The first sample of f above it, strictly, ends the rollout; or, of a cost, the first one below it.
             None: never. Only for a quality that is read at its best.
-        sample_period: in seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
+        sample_period: In seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
             error control is part of the trajectory.
-        record: addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
-        run_on: simulate to t_m although the threshold was exceeded.
+        record: Addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
+        run_on: Simulate to t_m although the threshold was exceeded.
         start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults. Of a running
             simulation with error control take it by `AddressedDiagram.fork`, or its future will differ a little.
-        keep_state: return s(t*), at the price of a second simulation up to t* where that is not the end.
-        measures: what else is sampled and read as one number each: further objectives, constraints.
-        catch: what f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
+        keep_state: Return s(t*), at the price of a second simulation up to t* where that is not the end.
+        measures: What else is sampled and read as one number each: further objectives, constraints.
+        catch: What f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
             diverges. Otherwise it is raised, and ends the others.
-        pruning: when a rollout that is of no more use ends; None: never.
-        motion: the rollouts go along recorded motions, see `RecordedMotion`; None: each is simulated as a whole.
+        pruning: When a rollout that is of no more use ends; None: never.
+        motion: The rollouts go along recorded motions, see `RecordedMotion`; None: each is simulated as a whole.
     """
 
     scenario: Scenario
@@ -238,7 +238,7 @@ class RolloutTask:
         advanced to the one would take another step, of 1e-16 s, to the other.
 
         Args:
-            t0: when rollouts begin, in seconds.
+            t0: When rollouts begin, in seconds.
             timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
         """
         times = t0 + self.sample_times()

@@ -351,7 +351,7 @@ class Solver(ABC):
 
 
 def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
-    """Return what a solver asks for; None if it is still thinking after ``seconds``: then it can only be closed.
+    """Return the points that a solver asks for; None if it has not answered after ``seconds``: it must be closed then.
 
     Raises:
         Exception: Any error of the method.
@@ -360,14 +360,14 @@ def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
         return solver.ask()
     answer: SimpleQueue[list[Point] | BaseException] = SimpleQueue()
 
-    def think() -> None:
+    def ask() -> None:
         try:
             answer.put(solver.ask())
         except BaseException as error:
             answer.put(error)
 
     # A daemon thread does not keep the program from ending if the solver never answers.
-    threading.Thread(target=think, name=f"{solver.name} thinks", daemon=True).start()
+    threading.Thread(target=ask, name=f"solver {solver.name}", daemon=True).start()
     try:
         points = answer.get(timeout=max(0.0, seconds))
     except Empty:

@@ -32,14 +32,14 @@ ROLLOUTS, TIME, METHOD = "rollouts", "time", "method"
 # Candidate 0 as a point of the search: it sets nothing, so that the DPS goes on with the plan in use.
 KEEP: Point = ()
 
-# With pruning, so many candidates are tried before the best one so far is the one to beat. It does not depend on the
-# number of workers: a decision is the same with any.
+# With pruning, the value to beat is updated after this many candidates. The number does not depend on the number of
+# workers, so that a decision is the same with any.
 _ROUND = 8
 
-# A method that asks so often in a row for known candidates only has nothing more to try.
+# The decision ends after this many batches in a row with known candidates only.
 _KNOWN_BATCHES = 50
 
-# A decision is late if it took so many times its wall time.
+# A decision is late if it took more than this many times its budget of wall time.
 _LATE = 1.5
 
 
@@ -51,16 +51,16 @@ class _BudgetSpentError(Exception):
         self.end = end
 
 
-class Thinking:
-    """One decision under way.
+class DecisionRun:
+    """One decision of a reasoner.
 
     Args:
-        reasoner: whose decision it is.
-        budget: how much it may take.
-        starts: where the rollouts begin, one per sample of the belief.
-        held: address -> value of the plan in use.
-        given: a plan as a point of the search, or None.
-        begin: when the decision was asked for, by `time.monotonic`.
+        reasoner: The reasoner that decides.
+        budget: How much the decision may take.
+        starts: Where the rollouts begin, one per sample of the belief.
+        held: Address -> value of the plan in use.
+        given: The user's plan as a point of the search, or None.
+        begin: When the decision was requested, by `time.monotonic`.
     """
 
     def __init__(
@@ -92,14 +92,14 @@ class Thinking:
         self._proposed: dict[Point, None] = {KEEP: None}
 
     def decision(self) -> Decision:
-        """Think until the budget is spent or the method has finished."""
+        """Try candidates until the budget is spent or the method has finished."""
         try:
-            end, message = METHOD, self._think()
+            end, message = METHOD, self._search()
         except _BudgetSpentError as spent:
             end, message = spent.end, str(spent)
         return self._conclude(end, message)
 
-    def _think(self) -> str:
+    def _search(self) -> str:
         """Try candidates; return how the method ended."""
         reasoner, rollouts = self._reasoner, self._budget.rollouts
         start = self._given or self._in_use()
@@ -111,7 +111,7 @@ class Thinking:
         affordable = None if rollouts is None else rollouts // reasoner.samples - taken
         known: list[Evaluation] = []
         if reasoner.task.pruning is not None or (affordable is not None and affordable <= 0):
-            # Otherwise, they keep the workers busy together with the first batch of the method.
+            # Otherwise they run beside the first batch of the method, which keeps the workers busy.
             known, first = self._try(first)[1:], []
         if affordable is not None and affordable <= 0:
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
@@ -129,24 +129,24 @@ class Thinking:
             return None
 
     def _values(self, point: Point) -> dict[str, Any]:
-        """Return what a candidate sets, address -> value."""
+        """Return the values that a candidate sets, address -> value."""
         if point not in self._planned:
             self._planned[point] = self._reasoner.space.values(point, self._held, self._time)
         return self._planned[point]
 
     def _iterate(self, solver: Solver, first: Sequence[Point], known: Sequence[Evaluation]) -> str:
-        """Try what a method asks for; return how it ended.
+        """Try the candidates that a method asks for; return how it ended.
 
         Args:
-            solver: the method.
-            first: what is tried together with its first batch; the first of it is not its own.
-            known: evaluations that it is told with its first batch.
+            solver: The method.
+            first: Points to try beside the first batch: `KEEP`, which the method is not told, and perhaps a plan.
+            known: Evaluations to tell the method with its first batch.
         """
         silent, rollouts = 0, self._budget.rollouts
         while silent < _KNOWN_BATCHES:
             asked = ask_within(solver, self._deadline - time.monotonic())
             if asked is None:
-                raise _BudgetSpentError(TIME, f"{self._time_spent()}, while {solver.name} was thinking")
+                raise _BudgetSpentError(TIME, f"{self._time_spent()}, before {solver.name} proposed more candidates")
             points = [self._problem.point(point) for point in asked]
             before = self._count
             evaluations = self._try([*first, *points])
@@ -181,7 +181,7 @@ class Thinking:
             starts = [self._starts[sample] for _, sample in now]
             self._take(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), now)
         if self._same is not None:
-            # To set what is set already changes nothing.
+            # Setting the plan in use once more changes nothing.
             kept = {sample: result for (point, sample), result in self._results.items() if point == KEEP}
             self._results |= {(self._same, sample): result for sample, result in kept.items()}
         if any(key not in self._results for key in now):
@@ -200,11 +200,11 @@ class Thinking:
             results.close()  # type: ignore[attr-defined]
 
     def _cutoff(self) -> dict[str, Cutoff]:
-        """Return the argument that ends rollouts early, for an executor that has one."""
+        """Return the argument ``cutoff`` for an executor that can end rollouts early; else none."""
         if not self._reasoner.executor.cancels:
             return {}
         best, risk = self._evaluator.best, self._problem.risk
-        # Under another risk, a sample that is worse may belong to a candidate that is better.
+        # Under any other risk, a better candidate may have a worse sample.
         comparable = self._reasoner.samples == 1 or isinstance(risk, Worst)
         known = nan if best is None or not comparable else self._evaluator.in_user_terms(best)[0]
         return {"cutoff": Cutoff(deadline=self._deadline, to_beat=known)}
@@ -302,14 +302,14 @@ def _warnings(
     elapsed: float,
     budget: Budget,
 ) -> Iterator[str]:
-    """Yield what speaks against a decision.
+    """Yield reasons not to trust a decision.
 
     Args:
-        candidates: all.
-        ranked: the eligible ones, from the best to the worst.
-        results: all rollouts that have finished.
-        elapsed: the wall time of the decision, in seconds.
-        budget: how much it might take.
+        candidates: All candidates.
+        ranked: The eligible ones, from the best to the worst.
+        results: All rollouts that have finished.
+        elapsed: The wall time of the decision, in seconds.
+        budget: Budget of the decision.
     """
     failures = [result.message for result in results if result.failed]
     if failures:
