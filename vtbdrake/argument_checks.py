@@ -23,6 +23,13 @@ def as_whole(name: str, value: Any) -> int:
     return int(value)
 
 
+def as_flag(name: str, value: Any) -> bool:
+    """Return ``value``; raise a ValueError if it is neither True nor False (the text "no" would count as true)."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} is True or False, not {value!r}")
+    return value
+
+
 def as_addresses(name: str, values: Any) -> tuple[str, ...]:
     """Return one address, or several, as a tuple.
 

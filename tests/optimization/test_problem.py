@@ -204,6 +204,9 @@ def test_a_problem_that_makes_no_sense_is_refused(changes, message):
         (lambda p: p.sweep(points=3, executor="threads", workers=1.5), "workers is a whole number, not 1.5"),
         (lambda p: p.rollout([1.0], condition=1), "no condition 1: it has 1"),
         (lambda p: p.rollout([1.0], condition=-1), "no condition -1"),
+        (lambda p: p.rollout([1.0], condition=None), "the number of a condition is a number, not None"),
+        (lambda p: p.rollout(["1.0"]), r"takes a number in \[0, 8\], not '1.0'"),
+        (lambda p: p.state([5.0], t=np.nan), "nan s is not a sample time"),
         (lambda p: p.boundary(resolution="1", coarse=1.0), "the resolution is a number, not '1'"),
     ],
 )

@@ -20,7 +20,16 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from tests.testbeds import ACROBOT
-from vtbdrake.state import AddressError, Variable, VariableError, Variables, collect, continuous_state, parameter
+from vtbdrake.state import (
+    AddressError,
+    Variable,
+    VariableError,
+    Variables,
+    collect,
+    continuous_state,
+    parameter,
+    snapshot,
+)
 
 
 @pytest.fixture
@@ -159,6 +168,9 @@ def test_an_entry_of_an_array_is_a_variable(world):
         ("plant.box.mass", np.nan, "must be finite"),
         ("plant.box.mass", [1.0, 2.0], r"has shape \(\), but the value given has \(2,\)"),
         ("plant.box.mass", "heavy", "takes numbers"),
+        ("plant.box.mass", "5", r"takes numbers of shape \(\), not '5'"),
+        ("plant.box.mass", None, "takes numbers .* not None"),
+        ("plant.box.mass", np.array(2.0 + 1.0j), "takes numbers"),
         ("plant.box.friction", -0.1, "must lie in"),
         ("plant.box.pitch", 0.1, "is derived"),
         ("plant.box.inertia", [1.0, 1.0, 3.0, 0.0, 0.0, 0.0], "is not that of any rigid body"),
@@ -171,6 +183,23 @@ def test_nonsense_is_refused_and_changes_nothing(world, address, value, message)
     with pytest.raises(VariableError, match=message):
         variables[address].set(context, value)
     np.testing.assert_array_equal(variables[address].get(context), before)
+
+
+@pytest.mark.parametrize(
+    ("address", "value"),
+    [
+        ("plant.box.inertia", [1.0, 1.0, 3.0, 0.0, 0.0, 0.0]),
+        ("plant.box.inertia[2]", 1e3),
+        ("plant.box.locked", 0.5),
+        ("plant.box.friction_by_geometry", np.full((4, 2), [0.1, 0.9])),
+    ],
+)
+def test_of_several_values_all_are_set_or_none(world, address, value):
+    diagram, _, variables, context = world
+    before = snapshot.take(diagram, context, variables)
+    with pytest.raises(VariableError, match=address.partition("[")[0]):
+        variables.write(context, {"plant.box.mass": 7.0, "plant.box.pose": np.full(6, 0.3), address: value})
+    assert not before.compare(snapshot.take(diagram, context, variables))
 
 
 def test_inertia_of_nothing_is_refused(world):

@@ -141,12 +141,18 @@ def test_what_is_spelt_right_at_every_level_is_read(tmp_path):
         ({"period": [0.1]}, "AcrobotScenario.period takes a value of type float"),
         ({"simulator_config": SimulatorConfig(integration_scheme="magic")}, "integration_scheme is one of"),
         ({"simulator_config": SimulatorConfig(start_time=1.0)}, "start_time must be 0, not 1.0 s"),
+        ({"simulator_config": None}, "simulator_config is a SimulatorConfig of Drake, not None"),
     ],
 )
 def test_a_value_of_another_type_is_refused_at_build(values, message):
     with pytest.raises(ScenarioError, match=message):
         AcrobotScenario(**values).build()
     AcrobotScenario(period=np.float64(0.02)).validate()
+
+
+def test_a_failed_assertion_of_drake_does_not_end_the_process():
+    with pytest.raises(RuntimeError, match=r"AcrobotScenario\(time_step=-0.1\) cannot be built: .* 'time_step >= 0'"):
+        AcrobotScenario(time_step=-0.1).build()
 
 
 def test_a_context_of_another_build_is_refused():

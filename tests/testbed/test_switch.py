@@ -293,6 +293,7 @@ def test_a_testbed_of_drakes_systems_keeps_autodiff():
         ({"mode": "real", "sense": "sim"}, "either the mode"),
         ({"sense": {"joints": "real"}}, "T_sense has no signal 'joints'; it has: joint_state"),
         ({"sense": "twin"}, "goes to one of sim, real, not to 'twin'"),
+        ({"sense": ["joint_state"]}, r"T_sense takes one position .*, or {signal: position}, not \['joint_state'\]"),
         ({"act": {"torque": "off"}}, "goes to one of sim, real, twin, not to 'off'"),
     ],
 )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_number
+from vtbdrake.argument_checks import all_of, as_flag, as_number
 from vtbdrake.rollout.runner import FIELD
 from vtbdrake.state import Variable, Variables
 
@@ -58,8 +58,10 @@ class Parameter(_Addressed):
     log: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        kind = int if self.integer else float
         _check_address(self.address)
+        for flag in ("integer", "log"):
+            as_flag(f"{flag} of {self.address}", getattr(self, flag))
+        kind = int if self.integer else float
         for end in ("lower", "upper"):
             as_number(f"the {end} end of {self.address}", getattr(self, end))
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
@@ -98,9 +100,9 @@ class Parameter(_Addressed):
             ValueError: It is no number, lies outside the range, or is not whole for an integer.
         """
         try:
-            number = float(value)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{self.address} takes a number in {self.range_text}, not {value!r}") from error
+            number = as_number(self.address, value)
+        except ValueError:
+            raise ValueError(f"{self.address} takes a number in {self.range_text}, not {value!r}") from None
         if not self.lower <= number <= self.upper:
             raise ValueError(f"{self.address} = {number:g} lies outside its range {self.range_text}")
         if self.integer and not number.is_integer():
@@ -167,6 +169,10 @@ class Choice(_Addressed):
         for option in self.options:
             if not isinstance(option, bool | int | float | str):
                 raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")
+            if option != option:
+                raise ValueError(
+                    f"the options of {address} are compared with values, which NaN never equals: leave it out"
+                )
         if len(set(self.options)) < max(2, len(self.options)):
             raise ValueError(f"{address} needs at least two different options, not {list(self.options)}")
 

@@ -263,10 +263,10 @@ class Problem:
         return chosen if condition is None else {**self._condition(condition), **chosen}
 
     def _condition(self, number: int) -> Condition:
-        count = len(self.conditions)
-        if not 0 <= as_whole("the number of a condition", number) < count:
+        count, index = len(self.conditions), as_whole("the number of a condition", number)
+        if not 0 <= index < count:
             raise ValueError(f"the problem has no condition {number}: it has {count}, counted from 0")
-        return self.conditions[number]
+        return self.conditions[index]
 
     def rollout(
         self,
@@ -285,9 +285,10 @@ class Problem:
             run_on: Simulate to t_m although the threshold was exceeded.
         """
         task = replace(self.task, record=record, run_on=run_on, keep_state=True)
-        parameters = self.values(point, condition=condition)
+        chosen = self._condition(condition)
+        parameters = {**chosen, **self.values(point)}
         result = replace(self._runner(task, parameters).run(split(parameters)[1]), parameters=parameters)
-        return ProblemRollout(**vars(result), problem=self, condition=self.conditions[condition])
+        return ProblemRollout(**vars(result), problem=self, condition=chosen)
 
     def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
         """Return s(t) = Gamma'(s^0, t), equation (10), at a sample time t in seconds."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.argument_checks import as_addresses, as_flag, as_number
 
 # (times, samples, True if larger samples are better) -> (time, number)
 Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[float, float]]
@@ -139,6 +139,7 @@ class Quality(Measure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        as_flag(f"minimize of the quality {self.name}", self.minimize)
         object.__setattr__(self, "upper", as_number("the most that a quality can be", self.upper))
         if isnan(self.upper) or self.upper <= 0.0:
             raise QualityError(f"the most that a quality can be is positive, not {self.upper}")

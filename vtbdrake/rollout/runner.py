@@ -179,7 +179,7 @@ class RolloutRunner:
         """
         self._begin(start)
         last = int(np.argmin(np.abs(self._times - t)))
-        if abs(self._times[last] - t) > 1e-9:
+        if not abs(self._times[last] - t) <= 1e-9:
             raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
         try:
             with Interruptible() as interruptible:

@@ -158,16 +158,19 @@ def _variable(
 
 
 def _joint_lock(plant: MultibodyPlant, joint: Joint, address: str) -> Variable:
-    def write(context: Context, value: np.ndarray) -> None:
+    def refuse(value: np.ndarray) -> None:
         if float(value) not in (0.0, 1.0):
             raise VariableError(f"{address} is 0 (free) or 1 (locked), but the value given is {float(value):g}")
+
+    def write(context: Context, value: np.ndarray) -> None:
         if value:
             joint.Lock(context)  # This sets the joint's velocity to zero, as Drake requires.
         else:
             joint.Unlock(context)
 
     # Written last: locking stops the joint, and a locked joint takes no velocity.
-    return _variable(plant, address, A, (), "1", joint.is_locked, write, bounds=(0.0, 1.0), carried_by=address, order=1)
+    return _variable(plant, address, A, (), "1", joint.is_locked, write, bounds=(0.0, 1.0), carried_by=address, order=1,
+                     refuse=refuse)  # fmt: skip
 
 
 def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Iterator[Variable]:
@@ -190,23 +193,25 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
         mass, com = M_BBo_B.get_mass(), M_BBo_B.get_com()
         if mass <= 0.0:
             raise VariableError(f"{address}.inertia cannot be set while {address}.mass is zero: set the mass first")
+        body.SetSpatialInertiaInBodyFrame(context, make_inertia(mass, com, value))
+
+    def make_inertia(mass: float, com: np.ndarray, value: np.ndarray) -> SpatialInertia:
         try:
-            G_BBcm_B = UnitInertia(*(value / mass))
-            M_new = SpatialInertia(mass, com, G_BBcm_B.ShiftFromCenterOfMass(com))
+            return SpatialInertia(mass, com, UnitInertia(*(value / mass)).ShiftFromCenterOfMass(com))
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise VariableError(
                 f"{address}.inertia {value.tolist()} is not that of any rigid body: its principal moments must be "
                 f"positive and none larger than the sum of the others ({reason})"
             ) from None
-        body.SetSpatialInertiaInBodyFrame(context, M_new)
 
     variable = partial(_variable, plant)
     yield variable(f"{address}.mass", A, (), "kg", body.get_mass, lambda context, m: body.SetMass(context, float(m)),
                    bounds=(0.0, inf), order=-3)  # fmt: skip
     yield variable(f"{address}.center_of_mass", A, (3,), "m", lambda context: inertia(context).get_com(), write_com,
                    order=-2)  # fmt: skip
-    yield variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1)
+    yield variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1,
+                   refuse=lambda value: make_inertia(1.0, np.zeros(3), value))  # fmt: skip
 
 
 def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:
@@ -293,9 +298,11 @@ def _friction(
         frictions = [inspector.GetProximityProperties(geometry).GetProperty(*_FRICTION) for geometry in geometries]
         return np.array([[friction.static_friction(), friction.dynamic_friction()] for friction in frictions])
 
-    def write(root: Context, value: np.ndarray) -> None:
+    def refuse(value: np.ndarray) -> None:
         if (value[:, 0] < value[:, 1]).any():
             raise VariableError(f"{by_geometry} is [static, dynamic] of each geometry, the dynamic one not larger")
+
+    def write(root: Context, value: np.ndarray) -> None:
         inspector = inspect(root)
         changed = [ProximityProperties(inspector.GetProximityProperties(geometry)) for geometry in geometries]
         context = scene_graph.GetMyMutableContextFromRoot(root)
@@ -310,4 +317,14 @@ def _friction(
     yield Variable(
         first, A, (), "1", lambda root: read(root)[0, 1], write_all, bounds=(0.0, inf), carried_by=by_geometry
     )
-    yield Variable(by_geometry, A, (len(geometries), 2), "1", read, write, bounds=(0.0, inf), carried_by=by_geometry)
+    yield Variable(
+        by_geometry,
+        A,
+        (len(geometries), 2),
+        "1",
+        read,
+        write,
+        bounds=(0.0, inf),
+        carried_by=by_geometry,
+        refuse=refuse,
+    )

@@ -53,6 +53,8 @@ class Variable:
     carried_by: str = ""
     order: int = 0  # variables of a lower order are written first, as writing them changes others
     place: Place | None = None  # where the value lies as it is; None if it is computed from what lies somewhere
+    # raises a VariableError for an array that is finite, within the bounds, and no value all the same
+    refuse: Callable[[np.ndarray], object] | None = None
 
     def __repr__(self) -> str:
         return f"Variable({self.address!r}, kind={self.kind!r}, shape={self.shape}, unit={self.unit!r})"
@@ -78,15 +80,19 @@ class Variable:
         """Return ``value`` as an array of the variable's shape.
 
         Raises:
-            VariableError: The variable is derived, or the value has another shape, is not finite, or lies
-                outside the bounds.
+            VariableError: The variable is derived, or the value is no number, has another shape, is not finite, lies
+                outside the bounds, or is impossible in another way.
         """
         if self.write is None:
             raise VariableError(f"{self.address} is derived from other variables and cannot be set")
         try:
-            array = np.asarray(value, dtype=float)
+            array = np.asarray(value)
+            # Not a text, although "5" could be converted, nor None, which would be NaN.
+            if array.dtype.kind not in "biuf":
+                raise TypeError(array.dtype)
         except (TypeError, ValueError) as error:
             raise VariableError(f"{self.address} takes numbers of shape {self.shape}, not {value!r}") from error
+        array = array.astype(float)
         if array.shape != self.shape:
             raise VariableError(f"{self.address} has shape {self.shape}, but the value given has {array.shape}")
         if not np.isfinite(array).all():
@@ -96,6 +102,8 @@ class Variable:
             raise VariableError(
                 f"{self.address} must lie in {self.bounds_text()} {self.unit}, but the value given is {value!r}"
             )
+        if self.refuse is not None:
+            self.refuse(array)
         return array
 
     def bounds_text(self) -> str:
@@ -213,12 +221,12 @@ class Variables(Mapping[str, Variable]):
             else:
                 array = whole.setdefault(entry[1], np.array(self[entry[1]].get(context)))
                 array.flat[int(entry[2])] = float(value)
+        for address, array in whole.items():
+            if address not in checked:
+                self[address].check(array)
         for variable in sorted(map(self.__getitem__, whole), key=lambda variable: variable.order):
-            if variable.address in checked:
-                assert variable.write is not None
-                variable.write(context, checked[variable.address])
-            else:
-                variable.set(context, whole[variable.address])
+            assert variable.write is not None
+            variable.write(context, whole[variable.address])
 
     def complement(self, addresses: Sequence[str]) -> list[str]:
         """Return the addresses of all that is held constant when ``addresses`` are varied, equation (9)."""
@@ -296,5 +304,6 @@ def _entry(variable: Variable, index: int) -> Variable:
         write=None if variable.derived else write,
         bounds=(bound(0), bound(1)),
         carried_by=variable.carried_by,
+        refuse=None,  # The whole array is checked when it is written.
         place=variable.place and replace(variable.place, start=variable.place.start + index),
     )

@@ -114,6 +114,8 @@ class Scenario(ABC):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ScenarioError(f"{name}.{key} must be finite, not {value}")
         config = self.simulator_config
+        if not isinstance(config, SimulatorConfig):
+            raise ScenarioError(f"{name}.simulator_config is a SimulatorConfig of Drake, not {config!r}")
         known = GetIntegrationSchemes()
         if config.integration_scheme not in known:
             raise ScenarioError(
@@ -161,13 +163,17 @@ class Scenario(ABC):
         Raises:
             ScenarioError: A field has a value with which no testbed can be built.
             SignalError: The signals of DPS and world do not match.
+            RuntimeError: Drake rejects what is built; a failed assertion in it, which would end the process, too.
         """
         self.validate()
         own = copy.deepcopy(self)  # The caller may change this one afterwards.
         builder = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)
-        builder.set_dps(own.make_dps())
-        own.add_world(builder)
-        return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
+        try:
+            builder.set_dps(own.make_dps())
+            own.add_world(builder)
+            return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
+        except SystemExit as error:
+            raise RuntimeError(f"{self!r} cannot be built: {error}") from error
 
     def mental(self) -> Scenario:
         """Return the scenario that a robot of this one simulates when it reasons; by default this scenario itself.

@@ -117,12 +117,10 @@ class Selector:
     def variable(self) -> Variable:
         """Return the position as an element of s: 0 is sim, 1 is real, 2 is twin."""
 
-        def write(context: Context, value: np.ndarray) -> None:
-            index = float(value)
-            if not index.is_integer():
+        def refuse(value: np.ndarray) -> None:
+            if not float(value).is_integer():
                 known = ", ".join(f"{i} ({p})" for i, p in enumerate(self.positions))
-                raise VariableError(f"{self.name} is one of {known}, not {index:g}")
-            self.set(context, self.positions[int(index)])
+                raise VariableError(f"{self.name} is one of {known}, not {float(value):g}")
 
         return Variable(
             self.name,
@@ -130,8 +128,9 @@ class Selector:
             (),
             "1",
             lambda context: float(self.positions.index(self.get(context))),
-            write,
+            lambda context, value: self.set(context, self.positions[int(value)]),
             bounds=(0.0, len(self.positions) - 1.0),
+            refuse=refuse,
         )
 
 

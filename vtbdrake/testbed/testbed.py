@@ -136,6 +136,8 @@ def wanted_positions(
         ("T_act", act, interface.act, ACT_POSITIONS),
     ):
         names = [signal.name for signal in signals]
+        if not isinstance(given, str | Mapping | None):
+            raise ValueError(f"{side} takes one position for all signals, or {{signal: position}}, not {given!r}")
         by_signal = dict.fromkeys(names, given) if isinstance(given, str) else dict(given or {})
         for name, position in by_signal.items():
             if name not in names:
