@@ -471,6 +471,42 @@ def test_run_begins_with_the_newest_of_what_has_waited(pace):
     assert clock.now() - begin < 1.5 * PERIOD  # A paced loop has its message, and does not wait for another one.
 
 
+@pytest.mark.parametrize("alive", [True, False])
+@pytest.mark.parametrize("between_runs", [True, False])
+def test_values_that_waited_in_a_pause_are_not_acted_on(between_runs, alive):
+    class Hub(ScriptedBridge):
+        """Dates back what waited; a new value comes 0.02 s after the pause, if the machine is alive."""
+
+        paused = None
+
+        def note_pause(self, since, signals):
+            assert set(signals) == {"position", "speed"}
+            self.paused, self.fresh = since, self._clock.now() + 0.02
+            return True
+
+        def poll(self, timeout=0.0):
+            count = super().poll(timeout)
+            if self.paused is not None and not (alive and self._clock.now() >= self.fresh):
+                for received in self.sensed.values():
+                    received.arrived = self.paused
+            return count
+
+    scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
+    bridge = Hub(scenario.interface(), clock, still)
+    guards = Guards(scenario.interface(), PERIOD, max_missed=np.inf)
+    runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock, guards=guards)
+    runtime.cycle()
+    runtime.switch("real")
+    runtime.run(cycles=3)
+    assert bridge.paused is None
+    begin = clock.now()
+    clock.advance(5.0)
+    runtime.run(cycles=1) if between_runs else runtime.cycle()
+    assert bridge.paused == pytest.approx(begin, abs=2 * PERIOD)
+    assert [fault.kind for fault in guards.latched] == ([] if alive else ["stale", "stale"])
+    assert clock.now() - begin < 5.0 + (0.03 if alive else 0.2)
+
+
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])
 @pytest.mark.parametrize("asleep", [False, True])
 def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, asleep):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -274,6 +276,33 @@ def test_poll_takes_a_limited_number_of_messages(hub: Hub) -> None:
             counts.append(arm.poll(1.0))
         assert max(counts) <= 10
         assert arm.sensed["position"].count == 35
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_values_that_waited_in_a_pause_are_dated_back(closed: bool) -> None:
+    with Hub(port=0) as hub, closing(bridge(hub.url)) as arm:
+        arm.open()
+        peer, sensed = Peer(hub.url), arm.sensed
+        in_step(arm, peer)
+        since = time.monotonic()
+        for utime in range(2, 500):  # More than the socket holds; the hub keeps the others.
+            peer.lcm.publish("IIWA_STATUS", status(utime).encode())
+        peer.hear(499)
+        if closed:
+            os.kill(hub.pid, signal.SIGKILL)
+        assert arm.note_pause(since, ["position"])
+        if closed:
+            assert wait(arm, lambda: not arm.connected)
+        else:
+            assert wait(arm, lambda: sensed["position"].count == 499)
+            assert sensed["torque"].arrived > since
+        assert sensed["position"].arrived <= since
+
+        def heard_again() -> bool:
+            peer.lcm.publish("IIWA_STATUS", status(500 + int(1e6 * time.monotonic())).encode())
+            return sensed["position"].arrived > since
+
+        assert closed or wait(arm, heard_again)
 
 
 def test_copy_of_an_own_message_is_foreign(hub: Hub) -> None:

@@ -62,6 +62,21 @@ class Bridge(ABC):
         A bridge that has lost its connection tries to connect again here.
         """
 
+    def note_pause(self, since: float, signals: Collection[str]) -> bool:
+        """Take note that `poll` was not called for a while: what waits now may be as old as the pause.
+
+        Values that waited count as arrived when the pause began. By default nothing is done, because the messages of a
+        bridge need not wait.
+
+        Args:
+            since: When everything that had arrived was read last, on the clock of `ReceivedSignal.arrived`, in seconds.
+            signals: Names of the sensor signals whose values would be too old if they had arrived then.
+
+        Returns:
+            Whether values are dated back: newer ones may have to be waited for.
+        """
+        return False
+
     @abstractmethod
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         """Send actuator commands.

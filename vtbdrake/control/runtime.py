@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 
 _LOG_PERIOD = 1.0  # s, for messages that could be logged in every cycle
 _MOST_POLLS = 100  # of what has waited while the loop was held up
+_WAIT = 0.1  # s, for newer samples after a pause
 
 
 class Runtime(Stepped):
@@ -120,6 +121,8 @@ class Runtime(Stepped):
         self.pace = pace
         self._patience = patience * period
         self._watchers = list(watchers)
+        self._read_at = self.clock.now()  # when all that had arrived was read
+        self._shortest_age = min((monitor.max_age for monitor in self.guards.monitors.values()), default=inf)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
         self._foreign = bridge.foreign
@@ -145,7 +148,8 @@ class Runtime(Stepped):
     ) -> None:
         """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
 
-        What has arrived since the last run is read before the first cycle, which gets the newest values.
+        What has arrived since the last run is read before the first cycle, which gets the newest values. If values that
+        have waited may be older than their signal's ``max_age``, newer ones are waited for (``max_age`` or 0.1 s).
 
         Args:
             cycles: Number of cycles.
@@ -201,7 +205,8 @@ class Runtime(Stepped):
         paced = self.bridge.sensed[self.pace]
         count, limit = paced.count, self.clock.now() + self._patience
         while paced.count == count:
-            left = limit - self.clock.now()
+            self._read_at = self.clock.now()
+            left = limit - self._read_at
             if left <= 0.0:
                 break
             self.bridge.poll(left)
@@ -233,9 +238,11 @@ class Runtime(Stepped):
         begin = self.clock.now()
         if poll:
             self.bridge.poll()
-        if lateness > self.period or self.statistics.run:
+        if begin - self._read_at > self._shortest_age:
+            self._catch_up(_WAIT)
+        elif lateness > self.period or self.statistics.run:
             self._read_backlog()
-        now = self.clock.now()
+        now = self._read_at = self.clock.now()
         self._serve()
         self.take_commands()
         self.feed()
@@ -272,13 +279,29 @@ class Runtime(Stepped):
 
     def _read_waiting(self) -> bool:
         """Receive all that has waited since the last run, and return whether it begins a cycle of a paced loop."""
-        if self.pace is None:
-            self._read_backlog()
-            return False
-        paced = self.bridge.sensed[self.pace]
-        count = paced.count
+        count = 0 if self.pace is None else self.bridge.sensed[self.pace].count
+        self._catch_up(inf)
+        self._read_at = self.clock.now()
+        return self.pace is not None and self.bridge.sensed[self.pace].count != count
+
+    def _catch_up(self, patience: float) -> None:
+        """Receive all that has waited in a pause; where that may be too old, wait for newer values.
+
+        Args:
+            patience: The longest wait, in seconds; nothing is waited for longer than its ``max_age`` or `_WAIT`.
+        """
+        begin, ages = self.clock.now(), {name: monitor.max_age for name, monitor in self.guards.monitors.items()}
+        old = [name for name, age in ages.items() if begin - self._read_at > age]
+        dated_back = bool(old) and self.bridge.note_pause(self._read_at, old)
         self._read_backlog()
-        return paced.count != count
+        limits = {name: begin + min(max(ages[name], _WAIT), patience) for name in old if name in self.watched}
+        while dated_back and any(
+            now < limit and self.bridge.sensed[name].age(now) > ages[name]
+            for now in [self.clock.now()]
+            for name, limit in limits.items()
+        ):
+            self.clock.wait_until(self.clock.now() + self.period)
+            self.bridge.poll()
 
     def _read_backlog(self) -> None:
         """Receive all that has waited while the loop did not run: what has just arrived is taken for new."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Any
 
 from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
@@ -21,6 +22,9 @@ _log = logging.getLogger(__name__)
 
 _HUB = "tcpq://"
 _PRIVATE = ("memq://", "file://")
+
+MARK_CHANNEL = "VTB_MARK"
+"""What a bridge publishes here comes back to it from the hub behind all messages that have waited there."""
 
 FOREIGN_TIMEOUT = 1.0
 """Seconds for which a foreign actuator command prevents a switch to the real machine."""
@@ -41,6 +45,9 @@ class LcmBridge(Bridge):
     the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` ahead of what the quickest message so far and the
     time that has passed here let expect, unless the bus was lost in between. A sender that was restarted, or whose
     clock was set, is accepted after ``reorder_window`` seconds in which no message has continued its old time.
+
+    After a pause (`note_pause`) a hub, and the socket to it, may still hold old messages, or the hub may have closed
+    the connection behind them. So the bridge publishes a mark; values that arrive before it is back are dated back.
 
     Limiting actuator commands is the guards' business, but one that is not finite or not within its signal's limits is
     never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
@@ -122,6 +129,10 @@ class LcmBridge(Bridge):
             handlers |= {map.channel: self._foreign.take for map in act}
         if url.startswith(_HUB):
             handlers[STATUS_CHANNEL] = self._foreign.take_status
+            handlers[MARK_CHANNEL] = self._take_mark
+        self._paused: tuple[float, frozenset[str]] | None = None  # since when, and the signals; until the mark is back
+        self._mark = b""
+        self._mark_sent: int | None = None  # on which connection
         self.link = LcmLink(url, handlers, connect_timeout=connect_timeout, reconnected=self._expect_gap)
 
     @property
@@ -156,7 +167,36 @@ class LcmBridge(Bridge):
         self.link.close()
 
     def poll(self, timeout: float = 0.0) -> int:
-        return self.link.take(timeout, self._burst)
+        count = self.link.take(timeout, self._burst)
+        if self._paused is not None:
+            self._date_back(*self._paused)
+            if self._mark_sent != self.link.reconnections:
+                self._send_mark()
+        return count
+
+    def note_pause(self, since: float, signals: Collection[str]) -> bool:
+        """Date values back until all that has waited at the hub is read; on other buses nothing is done."""
+        if not self.url.startswith(_HUB):
+            return False
+        before, others = self._paused or (since, frozenset())
+        self._paused = min(before, since), others.union(signals)
+        self._send_mark()
+        return True
+
+    def _send_mark(self) -> None:
+        self._mark = os.urandom(8)
+        sent = self.link.publish((MARK_CHANNEL, self._mark))
+        self._mark_sent = self.link.reconnections if sent else None
+
+    def _take_mark(self, _: str, data: bytes) -> None:
+        if self._paused is not None and data == self._mark:
+            self._date_back(*self._paused)
+            self._paused = None
+
+    def _date_back(self, since: float, signals: Collection[str]) -> None:
+        for received in map(self.sensed.__getitem__, signals):
+            if received.arrived > since:
+                received.arrived, received.sent = since, nan  # The two no longer tell how long the message took.
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
         """Send actuator commands.
