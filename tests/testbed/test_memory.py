@@ -3,6 +3,7 @@
 import gc
 import importlib
 import pkgutil
+import weakref
 
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
@@ -50,3 +51,14 @@ def test_a_dropped_testbed_is_freed(make):
     assert _plants().keys() > before.keys()
     del testbed
     assert _plants().keys() == before.keys()
+
+
+@pytest.mark.parametrize("address", ["real.act.torque", "real.sense.joint_state", "plant.state", "dps.torque"])
+def test_a_context_that_was_read_is_freed(address):
+    testbed = PendulumScenario().build()
+    context = testbed.default_context()
+    testbed.read(context, address)
+    reference = weakref.ref(context)
+    del context
+    gc.collect()
+    assert reference() is None

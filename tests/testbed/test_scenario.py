@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state import AddressError
@@ -175,6 +176,24 @@ def test_a_context_of_another_build_is_refused():
         for context in (foreign, testbed.plant.GetMyContextFromRoot(own)):
             with pytest.raises(ValueError, match="no context of this testbed, but of another one"):
                 use(context)
+
+
+def test_a_testbed_works_inside_another_diagram():
+    testbed, builder = PendulumScenario().build(), DiagramBuilder()
+    builder.AddSystem(testbed.diagram)
+    outer = builder.Build()
+    context = outer.CreateDefaultContext()
+    testbed.write(context, {"sim.sys.Pendulum.theta.position": 0.3, "u.angle": 0.1})
+    np.testing.assert_array_equal(testbed.read(context, "plant.state"), [0.3, 0.0])
+    np.testing.assert_array_equal(testbed.read(context, "real.sense.joint_state"), [np.nan, np.nan])
+    with pytest.raises(ValueError, match="nothing feeds real.sense.joint_state"):
+        testbed.switch(context, "real")
+    own = testbed.diagram.GetMyMutableContextFromRoot(context)
+    testbed.diagram.GetInputPort("real.sense.joint_state").FixValue(own, [7.0, 0.0])
+    testbed.switch(context, "real")
+    np.testing.assert_array_equal(testbed.read(context, "dps.error.sum"), [-6.9])
+    with pytest.raises(ValueError, match="simulate that diagram"):
+        testbed.simulator(context)
 
 
 def test_values_that_are_no_mapping_are_refused():

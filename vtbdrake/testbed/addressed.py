@@ -110,20 +110,26 @@ class AddressedDiagram:
         Raises:
             ValueError: It is another diagram's, or that of a part.
         """
+        self._own_context(context)
+
+    def _own_context(self, context: Context) -> Context:
+        """Return ``context``, or the part of it that belongs to this diagram in one that holds it."""
         try:
-            self._validate(context)
+            return self._validated(context)
         except (RuntimeError, TypeError) as error:
             raise ValueError(
                 "this is no context of this testbed, but of another one (or another build, or of a part), or none at "
                 "all: make one with default_context(); a snapshot takes a state from one testbed to another"
             ) from error
 
-    def _validate(self, context: Context) -> None:
+    def _validated(self, context: Context) -> Context:
         try:
             # pydrake keeps a context alive for ever if it is the result of GetMyContextFromRoot on itself.
             self.diagram.ValidateContext(context)
         except (RuntimeError, TypeError):
-            self.diagram.ValidateContext(self.diagram.GetMyContextFromRoot(context))
+            context = self.diagram.GetMyContextFromRoot(context)
+            self.diagram.ValidateContext(context)
+        return context
 
     def simulator(self, context: Context | None = None, *, restored: bool = False) -> Simulator:
         """Return a new Drake Simulator with the integrator of ``simulator_config``.
@@ -134,11 +140,14 @@ class AddressedDiagram:
                 state, do not happen again.
 
         Raises:
-            ValueError: ``context`` belongs to another diagram.
+            ValueError: ``context`` belongs to another diagram, or to one that holds this one.
         """
         if context is None:
             context = self.default_context()
-        self.check_context(context)
+        if self._own_context(context) is not context:
+            raise ValueError(
+                "the context belongs to a diagram that holds this testbed's: simulate that diagram, by Simulator(...)"
+            )
         self.attach(context)
         kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
         simulator = kind(self.diagram, context)
@@ -164,10 +173,11 @@ class AddressedDiagram:
         equal, to the last bit, to a rollout from the snapshot (``Problem(start=...)``), or to a simulation by
         ``simulator(context, restored=True)`` of a restored context, if it is advanced to the same instants: where a
         call of AdvanceTo ends, a step ends. For a rollout these are `RolloutTask.instants`. With a discrete plant or
-        fixed steps, a plain snapshot does.
+        fixed steps, a plain snapshot does. Values that are fixed at input ports are no state, and stay behind.
 
         Args:
-            simulator: One of this testbed; between two calls of its AdvanceTo.
+            simulator: One of this testbed; between two calls of its AdvanceTo. (After AdvancePendingEvents, the updates
+                of the present instant would happen again, on both sides.)
 
         Raises:
             ValueError: It is no Simulator, or one of another Diagram.
@@ -235,14 +245,31 @@ class AddressedDiagram:
         if address in self._variables:
             return self._variables[address].get
         if address in self._ports:
-            return _port_reader(*self._ports[address])
+            system, output = self._ports[address]
+            return _port_reader(output, self._own_context if system is self.diagram else system.GetMyContextFromRoot)
         if address in self._inputs:
-            return _input_reader(self.diagram, self._inputs[address])
+            return self._input_reader(self._inputs[address])
         raise AddressError(f"there is no variable and no port {address!r}{suggestion(address, self.addresses())}")
 
     def addresses(self) -> list[str]:
         """Return the addresses of everything that can be read: variables, output ports, and what the machine sends."""
         return [*self._variables, *self._ports, *self._inputs]
+
+    def _input_reader(self, port: InputPort) -> Callable[[Context], Any]:
+        if port.get_data_type() == PortDataType.kVectorValued:
+            nothing = np.full(port.size(), np.nan)
+
+            def read_vector(context: Context) -> np.ndarray:
+                own = self._own_context(context)
+                return np.array(port.Eval(own) if port.HasValue(own) else nothing)
+
+            return read_vector
+
+        def read(context: Context) -> Any:
+            value = self.diagram.EvalAbstractInput(self._own_context(context), port.get_index())
+            return None if value is None else value.Clone().get_value()
+
+        return read
 
     @cached_property
     def _ports(self) -> dict[str, tuple[System, OutputPort]]:
@@ -347,18 +374,7 @@ def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:
     return found
 
 
-def _port_reader(system: System, port: OutputPort) -> Callable[[Context], Any]:
+def _port_reader(port: OutputPort, own: Callable[[Context], Context]) -> Callable[[Context], Any]:
     if port.get_data_type() == PortDataType.kVectorValued:
-        return lambda context: np.array(port.Eval(system.GetMyContextFromRoot(context)))
-    return lambda context: port.EvalAbstract(system.GetMyContextFromRoot(context)).Clone().get_value()
-
-
-def _input_reader(diagram: Diagram, port: InputPort) -> Callable[[Context], Any]:
-    if port.get_data_type() == PortDataType.kVectorValued:
-        return lambda context: np.array(port.Eval(context)) if port.HasValue(context) else np.full(port.size(), np.nan)
-
-    def read(context: Context) -> Any:
-        value = diagram.EvalAbstractInput(context, port.get_index())
-        return None if value is None else value.Clone().get_value()
-
-    return read
+        return lambda context: np.array(port.Eval(own(context)))
+    return lambda context: port.EvalAbstract(own(context)).Clone().get_value()

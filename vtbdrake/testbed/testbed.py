@@ -232,17 +232,17 @@ class VirtualTestbed(AddressedDiagram):
             ValueError: A mode, position or signal is unknown, or a sensor signal that would become real has no value,
                 or its value is NaN or does not fit. Then no switch has been thrown.
         """
-        self.check_context(context)
+        own = self._own_context(context)
         senses, acts = wanted_positions(self.interface, mode, sense, act)
         for name, position in senses.items():
             if position == REAL:
                 port = self.diagram.GetInputPort(f"real.sense.{name}")
-                if not port.HasValue(context):
+                if not port.HasValue(own):
                     raise ValueError(
                         f"nothing feeds real.sense.{name}: fix a value on that input port, or start a bridge, before "
                         "its switch is thrown to real"
                     )
-                self._signals[name].check_value(port.Eval(context))
+                self._signals[name].check_value(port.Eval(own))
         for selectors, positions in ((self._sense, senses), (self._act, acts)):
             for name, position in positions.items():
                 selectors[name].set(context, position)
