@@ -175,8 +175,8 @@ def test_the_steps_of_a_logarithmic_range_are_ratios():
 @pytest.mark.parametrize(
     ("parameter", "resolution", "coarse", "message"),
     [
-        (Parameter("m", 1.0, 10.0, log=True), 0.5, 2.0, "are ratios of neighbouring values: it takes 1 < resolution"),
-        (Parameter("m", 1.0, 10.0, log=True), 2.0, 20.0, "<= coarse <= 10, the ratio"),
+        (Parameter("m", 1.0, 10.0, log=True), 0.5, 2.0, "are ratios of neighbouring values, 1 < resolution"),
+        (Parameter("m", 1.0, 10.0, log=True), 2.0, 20.0, "<= coarse <= 10 .the ratio"),
         (Parameter("m", 1, 10, integer=True), 0.5, 2.0, "the resolution of m, an integer, is a whole number, not 0.5"),
         (Parameter("m", 1, 10, integer=True, log=True), 2.0, 4.0, "leave log out"),
     ],

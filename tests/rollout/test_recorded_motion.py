@@ -98,7 +98,7 @@ def test_a_motion_that_depends_is_refused_with_its_way():
     [
         ("sim.sys.Acrobot.lower_link.mass", "belongs to the plant"),
         ("dps.feedback.gain", "by way of dps.feedback"),
-        ("dps.memory.total", "changes while time runs"),
+        ("dps.memory.total", "is a dynamic state"),
     ],
 )
 def test_what_moves_or_is_forgotten_is_refused(address, reason):
@@ -114,7 +114,7 @@ def test_continuous_state_is_refused(scenario):
 
 def test_a_hidden_way_is_found_while_it_runs():
     runner = RolloutRunner(along(make(WatchedScenario(leaky=True))))
-    with pytest.raises(MotionError, match="no connection shows how"):
+    with pytest.raises(MotionError, match="no connection leads there"):
         runner.run({PLACE: [1.0, 0.0, 0.0]})
 
 
@@ -148,14 +148,14 @@ def test_a_study_finds_the_same_optimum():
 
 
 def test_the_check_finds_a_short_memory():
-    assert not [f for f in problem(motion=RecordedMotion(MEMORY)).check().findings if "remembers" in f]
-    assert [f for f in problem(motion=RecordedMotion(0.02)).check().findings if "remembers" in f]
+    assert not [f for f in problem(motion=RecordedMotion(MEMORY)).check().findings if "longer memory" in f]
+    assert [f for f in problem(motion=RecordedMotion(0.02)).check().findings if "longer memory" in f]
 
 
 def test_the_check_finds_a_filter_that_never_forgets():
     quality = Quality(seen, of=["dps.memory.total"])
     findings = problem(quality=quality, motion=RecordedMotion(MEMORY)).check().findings
-    assert [f for f in findings if "remembers more than memory=" in f]
+    assert [f for f in findings if "a longer memory than memory=" in f]
 
 
 def test_a_field_of_the_scenario_is_refused():

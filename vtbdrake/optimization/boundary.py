@@ -155,7 +155,7 @@ def _listed(values: Sequence[float], unit: str) -> str:
 
 
 def why_no_boundary(sweep: Sweep) -> str:
-    """Return why the rollouts of a sweep show no boundary; empty if they do."""
+    """Return why a sweep has no boundary; empty if it has one."""
     if len(sweep.parameters) != 1:
         return f"a boundary is that of one parameter, but the sweep has {len(sweep.parameters)}"
     if not sweep.complete:
@@ -180,10 +180,10 @@ def why_never_unsafe(*, finite_threshold: bool, minimize: Sequence[bool], constr
 
 
 def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | None = None) -> Boundary:
-    """Return the boundary that the rollouts of a sweep over one parameter show.
+    """Return the boundary that the rollouts of a sweep over one parameter determine.
 
     Args:
-        sweep: One rollout for each value and condition; `why_no_boundary` of it is empty.
+        sweep: A sweep for which `why_no_boundary` is empty.
         chances: Chances of the repeated values.
         repeated: The rollouts with jitter that ``chances`` count.
     """
@@ -220,7 +220,10 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
 
 
 def _interval(outcomes: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Return the largest value up to which none was unsafe and the smallest at which all were, of (value, share)."""
+    """Return the largest value up to which no rollout was unsafe, and the smallest at which all were.
+
+    ``outcomes`` are pairs (value, share of unsafe rollouts), sorted.
+    """
     lower = -inf
     for value, share in outcomes:
         if share > 0.0:
@@ -261,16 +264,15 @@ class Refinement:
                 )
             if not 1.0 < resolution <= coarse <= upper / lower:
                 raise ValueError(
-                    f"in a logarithmic range, resolution and coarse are ratios of neighbouring values: it takes 1 < "
-                    f"resolution <= coarse <= {upper / lower:g}, the ratio of the range's ends, not {resolution:g} and "
-                    f"{coarse:g}"
+                    "in a logarithmic range, resolution and coarse are ratios of neighbouring values, 1 < resolution "
+                    f"<= coarse <= {upper / lower:g} (the ratio of the range's ends), not {resolution:g} and {coarse:g}"
                 )
             width, fine, ratio = log(upper / lower), log(resolution), log(coarse) / log(resolution)
         else:
             if not 0.0 < resolution <= coarse <= upper - lower:
                 raise ValueError(
-                    f"it takes 0 < resolution <= coarse <= {upper - lower:g}, the width of the range, not a resolution "
-                    f"of {resolution:g} and a coarse step of {coarse:g}"
+                    f"the steps must satisfy 0 < resolution <= coarse <= {upper - lower:g} (the width of the range), "
+                    f"unlike a resolution of {resolution:g} and a coarse step of {coarse:g}"
                 )
             width, fine, ratio = upper - lower, resolution, coarse / resolution
             if parameter.integer:
@@ -377,7 +379,7 @@ def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) ->
         repeats = 0 if parameter.integer or parameter.is_field else _REPEATS
     repeats, jitter = as_whole("the number of repeats", repeats), as_number("the jitter", jitter)
     if repeats < 0 or not 0.0 < jitter <= 0.5:
-        raise ValueError(f"it takes repeats >= 0 and 0 < jitter <= 0.5, not {repeats} and {jitter:g}")
+        raise ValueError(f"repeats >= 0 and 0 < jitter <= 0.5 are required, not {repeats} and {jitter:g}")
     if repeats and parameter.integer:
         raise ValueError(f"{parameter.address} is an integer, which cannot be jittered: leave repeats out")
     return repeats, jitter
@@ -442,7 +444,7 @@ class _Search:
         return make_sweep(self._problem, keys, finished).unsafe
 
     def boundary(self) -> Boundary:
-        """Return the boundary that the rollouts so far show."""
+        """Return the boundary that the rollouts so far determine."""
         value = self._refinement.value
         chances = [Chance(value(i), c, *self._counts[i, c]) for i, c in self._chances]
         return boundary_of(

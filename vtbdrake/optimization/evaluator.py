@@ -34,12 +34,12 @@ class Evaluator:
         problem: The problem to evaluate.
         known: The outcomes known so far; ``run`` adds to them.
         run: Function that runs the rollouts of the given keys.
-        racing: Drop a point as soon as it can no longer be better than the best one, whatever the conditions that have
-            not run would give. The winner is never dropped: the risk does not fall when a quality rises, and a quality
-            is at most `Quality.upper` (a cost at least 0). Under the mean, say, a quality without ``upper`` can be
-            anything, and no point is dropped for its value.
-        budget: How many rollouts the points may take together; only as many points run side by side as it allows to
-            finish.
+        racing: Whether to drop a point as soon as it can no longer be better than the best one, whatever the results
+            under its other conditions. The winner is never dropped: the risk does not fall when a quality rises, and a
+            quality is at most `Quality.upper` (a cost at least 0). Without ``upper``, the mean of a quality has no
+            bound, for example, and no point is dropped for its value.
+        budget: Number of rollouts that the points may take together; no more points run side by side than can finish
+            within it.
 
     Raises:
         ValueError: Racing, but several qualities.
@@ -64,9 +64,9 @@ class Evaluator:
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
-        # Not the known ones, of which a resumed study has more.
+        # Independent of the known ones, of which a resumed study has more.
         self._needed: set[RolloutKey] = set()
-        # The number of rollouts that each point has needed since it was last told.
+        # The number of rollouts that each point has needed since its last evaluation.
         self._untold: Counter[Point] = Counter()
 
     def evaluate(self, points: Sequence[Point]) -> list[Evaluation]:
@@ -105,7 +105,7 @@ class Evaluator:
     def _race(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
         """Evaluate points in rounds, and drop those that have lost.
 
-        Only the conditions of the rounds so far count: an interrupted study may know more.
+        Only the conditions of the rounds so far count, although an interrupted study may know more.
         """
         if self.best is None and len(points) > 1:
             self._find_incumbent(points)
@@ -122,7 +122,7 @@ class Evaluator:
         return evaluations
 
     def _find_incumbent(self, points: Sequence[Point]) -> None:
-        """Run the best point of the first condition under all others, as the point to beat."""
+        """Determine the first point to beat: run the best point of the first condition under all others."""
         first = list(self._conditions)[:1]
         self._complete([(point, condition) for point in points for condition in first])
         leads = [point for point in points if self.evaluation(point, first).feasible]
@@ -132,7 +132,7 @@ class Evaluator:
             self._remember(self.evaluation(leader))
 
     def _order(self) -> list[int]:
-        """Return the conditions, those first in which the best point is worst: they distinguish most."""
+        """Return the conditions, the worst ones of the best point first: they tell points apart best."""
         if self.best is None:
             return list(self._conditions)
         h = [self._known[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
@@ -151,8 +151,8 @@ class Evaluator:
 
         Args:
             point: The point s^0.
-            conditions: The numbers of those that count; None: all. The others, and the unknown ones, count as the best
-                possible.
+            conditions: Numbers of the conditions that count; None: all. For the others, and for conditions that have
+                not run, the best possible outcome is assumed.
         """
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
@@ -184,7 +184,7 @@ class Evaluator:
 
 
 class Gradients:
-    """Derivatives of a problem's first quality, over all conditions, by its parameters.
+    """Derivatives of a problem's first quality, over all conditions, with respect to its parameters.
 
     A gradient takes one simulation with AutoDiffXd per condition, for any number of parameters.
 

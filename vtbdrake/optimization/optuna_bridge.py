@@ -71,7 +71,7 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
-        StudyError: The storage cannot be opened, has no study ``name``, or that varies other parameters.
+        StudyError: The storage cannot be opened or has no study ``name``, or that study varies other parameters.
         ValueError: A point lies outside its range.
     """
     optuna = import_optuna("an import from Optuna")
@@ -107,14 +107,14 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
         raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
     found = []
     with quiet(), warnings.catch_warnings():
-        # The warning comes with every target, also with one of the right sign.
+        # Optuna warns about every target, also if its sign is right.
         warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes the importances")
         exported = to_optuna(study, optuna.storages.InMemoryStorage(), name="importances")
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         for k, (name, direction) in enumerate(zip(study.names, study.directions, strict=True)):
             if len({value[k] for value in values}) == 1:
                 raise ValueError(f"{name} is {values[0][k]:g} at all points, so no parameter is important")
-            # Of a target it takes the small values as the good ones.
+            # The evaluator takes small values of the target for good ones.
             sign = 1.0 if direction == "minimize" else -1.0
             found.append(
                 optuna.importance.get_param_importances(
@@ -139,8 +139,8 @@ def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseS
     except SQLAlchemyError as error:
         reason = str(error).partition("\n")[0]
         raise StudyError(
-            f"Optuna cannot open the storage {storage!r} ({reason}): give it an URL such as 'sqlite:///study.db' in a "
-            "folder that exists, or a storage of Optuna's"
+            f"Optuna cannot open the storage {storage!r} ({reason}): give a URL such as 'sqlite:///study.db' in a "
+            "folder that exists, or one of Optuna's storages"
         ) from error
     return opened
 

@@ -21,7 +21,7 @@ class _Addressed:
 
     @property
     def is_field(self) -> bool:
-        """Return whether it is a field of the scenario."""
+        """Return whether the parameter is a field of the scenario."""
         return self.address.startswith(FIELD)
 
     def _variable(self, variables: Variables) -> Variable:
@@ -30,7 +30,7 @@ class _Addressed:
             raise ValueError(f"{self.address} is derived from other variables and cannot be varied")
         if variable.shape:
             raise ValueError(
-                f"{self.address} has shape {variable.shape}; a parameter is one number: {self.address}[0], say"
+                f"{self.address} has shape {variable.shape}, but a parameter is one number, such as {self.address}[0]"
             )
         return variable
 
@@ -43,8 +43,8 @@ class Parameter(_Addressed):
         address: Address of the variable; or ``scenario.<field>`` for a field, which needs another Diagram (gravity,
             geometry).
         lower, upper: The range, in the variable's unit.
-        integer: Only whole numbers, both ends included.
-        log: Searched on a logarithmic scale.
+        integer: Whether only whole numbers are values, both ends included.
+        log: Whether to search on a logarithmic scale.
 
     Raises:
         ValueError: The range is empty, reversed or not finite, an integer has ends that are not whole, or the lower end
@@ -80,7 +80,7 @@ class Parameter(_Addressed):
 
     @property
     def is_continuous(self) -> bool:
-        """Return whether all numbers of the range are values, as gradients need it."""
+        """Return whether all numbers of the range are values; gradients require it."""
         return not self.integer
 
     @property
@@ -97,7 +97,7 @@ class Parameter(_Addressed):
         """Check a value, and return it as a number of the range.
 
         Raises:
-            ValueError: It is no number, lies outside the range, or is not whole for an integer.
+            ValueError: The value is no number, lies outside the range, or is not whole for an integer.
         """
         try:
             number = as_number(self.address, value)
@@ -134,7 +134,7 @@ class Parameter(_Addressed):
         """Return the variable that is varied.
 
         Raises:
-            ValueError: There is none, it is derived or an array, or the range exceeds its bounds.
+            ValueError: There is no such variable, it is derived or an array, or the range exceeds its bounds.
         """
         variable = self._variable(variables)
         lower, upper = (float(np.asarray(bound)) for bound in variable.bounds)
@@ -192,7 +192,7 @@ class Choice(_Addressed):
         """Return the option that equals a value.
 
         Raises:
-            ValueError: There is none.
+            ValueError: No option equals the value.
         """
         for option in self.options:
             if option == value and isinstance(option, bool) == isinstance(value, bool):
@@ -212,7 +212,7 @@ class Choice(_Addressed):
         """Return the variable that is varied.
 
         Raises:
-            ValueError: There is none, it is derived or an array, or it refuses an option.
+            ValueError: There is no such variable, it is derived or an array, or it refuses an option.
         """
         variable = self._variable(variables)
         for option in self.options:

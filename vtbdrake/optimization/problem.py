@@ -104,9 +104,9 @@ class Problem:
     Args:
         scenario: Builds the testbed; its defaults are s0.
         parameters: The parameters s^0, equation (8): the elements of s0, and the fields of the scenario
-            (``scenario.gravity``), to be varied. All else is held constant (9).
-        quality: The quality f and its quality variables, equations (11) and (12); or a cost. Several have a Pareto
-            front.
+            (``scenario.gravity``), to be varied. Everything else is held constant (9).
+        quality: The quality f and its quality variables, equations (11) and (12); or a cost. Several qualities have a
+            Pareto front.
         horizon: The horizon t_m in seconds.
         threshold: The threshold f_m; a rollout ends when f exceeds it strictly, or when a cost falls below it. None:
             never.
@@ -115,13 +115,13 @@ class Problem:
             frictions or the seeds of sensors; every point runs under each, so that all points have the same noise
             (common random numbers).
         risk: How the qualities under several conditions become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
-        constraints: What every rollout must keep, under every condition.
-        start: s0 from a snapshot instead of the defaults. Take that of a running simulation with error control by
+        constraints: Constraints that every rollout must keep, under every condition.
+        start: Snapshot with s0 instead of the defaults. For a running simulation with error control take it by
             ``testbed.fork(simulator)``: a plain ``testbed.snapshot(context)`` lacks the integrator's memory of its last
-            step, so that the forecast differs a little from what follows.
-        motion: The motion of the testbed does not depend on the parameters (the pose of a camera that looks on, say):
-            it is simulated once for each condition, and candidates are judged along it, with the same result, see
-            `RecordedMotion`.
+            step, so that the forecast differs a little from the future of that simulation.
+        motion: Declares that the motion of the testbed does not depend on the parameters (for example the pose of a
+            camera that observes): the motion is simulated once for each condition, and candidates are simulated along
+            it, with the same result; see `RecordedMotion`.
 
     Raises:
         ValueError: An address does not exist, a range exceeds its variable's bounds, a condition sets a parameter, the
@@ -165,7 +165,7 @@ class Problem:
             threshold=threshold,
             sample_period=sample_period,
             start=start,
-            motion=self._along(motion),
+            motion=self._with_varied(motion),
         )
         if self.task.threshold is not None and len(self.objectives) > 1:
             raise ValueError("a threshold ends a rollout for the sake of one quality, but the problem has several")
@@ -195,7 +195,7 @@ class Problem:
         rows |= {"conditions": f"{len(self.conditions)} ({self.risk!r})"} if len(self.conditions) > 1 else {}
         return summary_html(f"Problem of {type(self.scenario).__name__}", rows)
 
-    def _along(self, motion: RecordedMotion | None) -> RecordedMotion | None:
+    def _with_varied(self, motion: RecordedMotion | None) -> RecordedMotion | None:
         if motion is None:
             return None
         for parameter in self.parameters:
@@ -235,7 +235,7 @@ class Problem:
         fields, _ = split(values)
         if fields and self.task.start is not None:
             raise ValueError(
-                f"{', '.join(fields)} cannot change where s0 is a snapshot, which is of the scenario as it was"
+                f"{', '.join(fields)} cannot be set: s0 is a snapshot (start=) of the scenario; leave start out"
             )
         return self.scenario.with_fields(fields) if fields else self.scenario
 
@@ -254,7 +254,7 @@ class Problem:
         return checked_point(self.parameters, point)
 
     def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
-        """Return what a point sets in s0, address -> value, and what a condition sets if its number is given.
+        """Return the values that a point sets in s0, address -> value, and those of a condition if it is given.
 
         Raises:
             ValueError: As in `point`, or there is no such condition.
@@ -282,7 +282,7 @@ class Problem:
             point: The point s^0, as values in the order of the parameters or by address.
             condition: The number of the condition.
             record: Addresses and ports (``path.port``) to record at the sample times.
-            run_on: Simulate to t_m although the threshold was exceeded.
+            run_on: Whether to simulate to t_m although the threshold was exceeded.
         """
         task = replace(self.task, record=record, run_on=run_on, keep_state=True)
         chosen = self._condition(condition)
@@ -316,9 +316,9 @@ class Problem:
     def check(self) -> Check:
         """Find obstacles to parallel rollouts: memory outside the Context, values that cannot be sent to workers.
 
-        It takes about a second: the first part of a rollout is simulated four times, with equal results: twice in a
-        row, beside another rollout on the same Diagram, and in another process. Print what it returns. With ``motion``,
-        whole rollouts at the ends of the ranges are compared with those along the motion, too.
+        The first part of a rollout is simulated four times, which takes about a second: twice in a row, beside another
+        rollout on the same Diagram, and in another process. The results must be equal. With ``motion``, whole rollouts
+        at the ends of the ranges are compared with those along the motion, too. Print the returned findings.
 
         Raises:
             QualityError: f raises, is negative or NaN.
@@ -329,17 +329,17 @@ class Problem:
         points = [{**split(self.conditions[k])[1], **ends[k]} for k in (0, -1)]
         with Interruptible():
             found = check_rollouts(self.task, self.testbed, points)
-        travelling = []
+        findings = list(found.findings)
         for values in (*self.conditions, *({p.address: end} for p in self.parameters for end in p.ends)):
             try:
                 pack(values)
             except WorkerError as error:
-                travelling.append(str(error))
+                findings.append(str(error))
         if self.task.motion is not None:
-            travelling += self._forgetting()
-        return replace(found, findings=(*found.findings, *travelling))
+            findings += self._check_memory()
+        return replace(found, findings=tuple(findings))
 
-    def _forgetting(self) -> list[str]:
+    def _check_memory(self) -> list[str]:
         """Return a sentence if rollouts along the motion differ from whole ones at the ends of the ranges."""
         assert self.task.motion is not None
         for k in (0, -1):
@@ -349,7 +349,7 @@ class Problem:
             if not along.identical(whole):
                 return [
                     f"a rollout along the recorded motion ends with {along}, and the whole one with {whole}: what "
-                    f"follows the parameters remembers more than memory={self.task.motion.memory:g} s"
+                    f"depends on the parameters has a longer memory than memory={self.task.motion.memory:g} s"
                 ]
         return []
 
@@ -373,8 +373,8 @@ class Problem:
                 ``concurrent.futures`` executor, or a client of Dask; see `make_executor`.
             workers: The number of threads or processes; by default the number of cores.
             record: Addresses and ports to record at the sample times.
-            run_on: Simulate to t_m although the threshold was exceeded; gives all of G1.
-            progress: Show a progress bar.
+            run_on: Whether to simulate to t_m although the threshold was exceeded; then all of G1 is known.
+            progress: Whether to show a progress bar.
 
         Raises:
             ValueError: A point lies outside the range of a parameter, or the executor is unknown.
@@ -423,15 +423,16 @@ class Problem:
             coarse: Step of the coarse grid, likewise.
             repeats: The number of rollouts with jitter for each value close to the boundary and each condition. By
                 default 5, and 0 for integers and for fields of the scenario, where each takes another Diagram.
-            jitter: How far the parameter is moved at most in these, as a fraction of its range (on its own scale).
+            jitter: The largest displacement of the parameter in these rollouts, as a fraction of its range (on its own
+                scale).
             executor: See `sweep`.
             workers: See `sweep`.
-            progress: Show a progress bar.
+            progress: Whether to show a progress bar.
 
         Raises:
             ValueError: There is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
                 (which is a goal, not a danger), or the steps do not fit the range.
-            KeyboardInterrupt: It was interrupted, before there is an answer.
+            KeyboardInterrupt: The search was interrupted.
         """
         return search_boundary(
             self,
@@ -467,12 +468,13 @@ class Problem:
                 problem, or that of the file.
             seed: Seed of the solver; 0 by default, or that of the file.
             options: Options of the solver.
-            allow_changed_code: Go on although the functions of the problem, or the Python code of its testbed, have
-                changed. The file notes the changes (`Study.record`, ``changes``). Its rollouts stay, but those in which
-                a quality function failed run again.
+            allow_changed_code: Whether to go on although the functions of the problem, or the Python code of its
+                testbed, have changed. The file records the changes (`Study.record`, ``changes``). Its rollouts stay,
+                but those in which a quality function failed run again.
 
         Raises:
-            StudyError: The file is no study, is damaged, of another version, problem, solver or seed, or of other code.
+            StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed or
+                code.
         """
         from vtbdrake.optimization.study import Study
 

@@ -1,4 +1,4 @@
-"""Risks: how the qualities of a decision under several conditions become one number."""
+"""Risks: how the qualities of a point under several conditions become one number."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 class Risk(ABC):
-    """A function of the qualities h of one decision under n conditions, shape (n,); larger is better.
+    """A function of the qualities h of one point under n conditions, shape (n,); larger is better.
 
-    It must not fall when one of them rises: racing relies on it.
+    The function must not fall when one of the qualities rises: racing relies on it.
     """
 
     @abstractmethod
@@ -57,10 +57,7 @@ class _Level(Risk):
 
 @dataclass(frozen=True)
 class Quantile(_Level):
-    """The value that all but a share ``level`` of the conditions reach: of n sorted h, the one at ceil(level n).
-
-    ``level`` in (0, 1]; 0.5 is the (lower) median.
-    """
+    """The quantile ``level``, in (0, 1]: of n sorted h, the one at ceil(level n); 0.5 is the (lower) median."""
 
     def __call__(self, h: np.ndarray) -> float:
         # 0.28 * 25 is a little above 7 in floating point, and means 7.
@@ -72,7 +69,7 @@ class Quantile(_Level):
 class CVaR(_Level):
     """The conditional value at risk: the mean of the worst share ``level`` of the conditions.
 
-    Where ``level`` n is not whole, the last counts with the rest of the share (Rockafellar and Uryasev, 2002).
+    If ``level`` n is not whole, the last of them has the rest as its weight (Rockafellar and Uryasev, 2002).
     ``level`` in (0, 1]; 1 is the mean.
     """
 

@@ -1,4 +1,4 @@
-"""A study: problem (18) solved, recorded rollout by rollout, interrupted and resumed at will."""
+"""Studies: solutions of problem (18) that record every rollout, so that they can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Study:
     `Problem.study` begins a study, or resumes the one in a file. `open` opens a file for reading and for giving points,
     also while another process runs the study. Properties read the file each time.
 
-    Which points are examined depends on the problem, the solver, the seed and the budget that the solver was made for,
-    and not on the executor. To resume a study, a new solver is told the recorded evaluations, so that it continues as
-    if it had not been interrupted. For a larger budget, a new solver starts from the beginning; the points that it asks
-    for again are known, and take no rollouts.
+    The points that are examined depend on the problem, the solver, the seed and the budget for which the solver was
+    made, not on the executor. To resume a study, a new solver is told the recorded evaluations, so that it continues as
+    if it had not been interrupted. For a larger budget, a new solver starts from the beginning; points that it asks for
+    again are known, and take no rollouts.
 
     Attributes:
         reason: Why the last run in this process ended: ``budget``, ``time``, ``target``, ``solver``, ``stopped``,
@@ -61,7 +61,7 @@ class Study:
         """Open a study file for reading and for giving points.
 
         Raises:
-            StudyError: There is none, it is damaged, or of another version.
+            StudyError: The file does not exist, is damaged, or is of another version.
         """
         return cls(StudyFile(path))
 
@@ -160,16 +160,18 @@ class Study:
         callbacks: Sequence[Callback] = (),
         progress: bool = True,
     ) -> Self:
-        """Run rollouts until the budget is spent, the target is reached, or the solver is finished. Ctrl-C keeps all.
+        """Run rollouts until the budget is spent, the target is reached, or the solver has ended.
+
+        Ctrl-C ends the run; finished rollouts are kept.
 
         Args:
-            rollouts: How many the study has in the end, those of former runs included. With racing, a rest that is
-                smaller than one point under all conditions is left; `message` says so.
+            rollouts: Number of rollouts that the study has in the end, those of former runs included. With racing, a
+                rest that is smaller than one point under all conditions is left; `message` says so.
             seconds: The wall time of this run.
             target: The run ends as soon as a point is at least as good: a quality as large, a cost as small. With
-                several workers, others may be finished by then.
-            racing: Drop points that can no longer win before all their conditions have run (see `Evaluator`). By
-                default, if there are several conditions and one quality.
+                several workers, other points may be finished by then.
+            racing: Whether to drop points that can no longer win before all their conditions have run (see
+                `Evaluator`). By default, if there are several conditions and one quality.
             executor: See `Problem.sweep`.
             workers: See `Problem.sweep`.
             time_limit: Wall time in seconds; a rollout that takes longer fails.
@@ -178,11 +180,11 @@ class Study:
             callbacks: Functions of the study and a trial, called in this thread for every trial that is recorded for
                 the first time, batch by batch. One may set attributes, add points, or `stop` the run; an exception ends
                 the run.
-            progress: Show a progress bar: rollouts per second, the best so far, the time left. Without a terminal or a
-                notebook, log it every half minute instead, at the level INFO.
+            progress: Whether to show a progress bar: rollouts per second, the best so far, the time left. Without a
+                terminal or a notebook, progress is logged every half minute instead, at the level INFO.
 
         Raises:
-            ValueError: There is no budget at all, or an invalid one; an executor or solver is unknown.
+            ValueError: No budget is given, or an invalid one; or an executor or solver is unknown.
             StudyError: Another process runs the study, or it was opened without its problem.
             QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``. Finished rollouts are kept.
         """
@@ -247,7 +249,7 @@ class Study:
     # -- points and attributes given by hand
 
     def add(self, *points: Any) -> None:
-        """Give points by hand, each a mapping address -> value or values in the order of the parameters.
+        """Add points by hand, each a mapping address -> value or values in the order of the parameters.
 
         They are evaluated before the next points of the solver, in the process that runs the study, and the solver
         learns from them.
@@ -261,7 +263,7 @@ class Study:
         """Replace a point of the `queue`.
 
         Raises:
-            StudyError: No point of that number waits: it was evaluated, removed, or never given.
+            StudyError: The queue has no point of that number: it was evaluated, removed, or never added.
             ValueError: As in `add`.
         """
         self._file.change_queue(
@@ -272,15 +274,15 @@ class Study:
         """Remove a point from the `queue`.
 
         Raises:
-            StudyError: No point of that number waits: it was evaluated, removed, or never given.
+            StudyError: The queue has no point of that number: it was evaluated, removed, or never added.
         """
         self._file.change_queue(as_whole("the number of a point in the queue", number), None)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
-        """Set an attribute of the study, or of a point: for example an operator or a remark. It changes no result.
+        """Set an attribute of the study, or of a point: for example an operator or a remark. No result changes.
 
         Args:
-            key: Its name; an attribute of the same name is replaced.
+            key: Name of the attribute; one of the same name is replaced.
             value: A number, a word, or lists and dicts of these.
             point: As in `add`; None for the study itself.
 
@@ -393,8 +395,8 @@ class Study:
     def to_dict(self) -> dict[str, list[Any]]:
         """Return columns by name, one entry per trial.
 
-        The columns are the parameters by address, the qualities, the violations of the constraints, how the trial came
-        about, and its attributes (None if it does not have one).
+        The columns are the parameters by address, the qualities, the violations of the constraints, the origin of the
+        trial (solver or user, method, batch), and its attributes (None if it does not have one).
         """
         trials = self.trials
         columns: dict[str, list[Any]] = {d.address: [t.parameters[d.address] for t in trials] for d in self.parameters}
@@ -460,7 +462,7 @@ class Study:
     # -- pictures and exports
 
     def plot_history(self) -> Figure:
-        """Plot the values in the order of the study, and the best so far."""
+        """Plot the values of the trials in their order, and the best so far."""
         from vtbdrake.visualization import study_plots
 
         return study_plots.plot_history(self)
@@ -478,7 +480,7 @@ class Study:
         return study_plots.plot_slices(self)
 
     def plot_importances(self) -> Figure:
-        """Plot how much each parameter decides about whether a point is good; needs the extra ``optuna``."""
+        """Plot the importance of each parameter for the quality; needs the extra ``optuna``."""
         from vtbdrake.visualization import study_plots
 
         return study_plots.plot_importances(self)
@@ -509,10 +511,10 @@ class Study:
         return to_optuna(self, storage, name=name)
 
     def import_optuna(self, storage: str | BaseStorage, name: str) -> int:
-        """Give the points of a study in Optuna's storage, as `add` does, whether evaluated or only enqueued there.
+        """Add the points of a study in Optuna's storage, as `add` does, whether evaluated or only enqueued there.
 
-        They are evaluated by rollouts of this problem: a value from elsewhere tells nothing about it. Points that are
-        evaluated already, or wait in the queue, are left out, so that importing an export of `to_optuna` costs nothing.
+        They are evaluated by rollouts of this problem; values in Optuna's storage are ignored. Points that have been
+        evaluated, or wait in the queue, are left out, so that importing an export of `to_optuna` costs nothing.
 
         Args:
             storage: A URL or a storage of Optuna's, see `to_optuna`.

@@ -50,7 +50,7 @@ RolloutKey = tuple[Point, int]
 
 
 class StudyError(ValueError):
-    """A study file that is no study, is damaged, of another version or of another problem, or cannot be used."""
+    """A file is no study, is damaged, belongs to another version or problem, or cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Trial(PointValues):
-    """A point s^0 of a study, and how good it is."""
+    """A point s^0 of a study with its values."""
 
     parameters: Mapping[str, Any]  # the point, address -> value
     # one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a simulation
@@ -107,11 +107,11 @@ class StudyFile:
     An existing file can also be read in a read-only folder, as long as no other process runs the study.
 
     Args:
-        path: None keeps the study in memory.
-        meta: What a new study is about; None opens an existing one.
+        path: Path of the file; None keeps the study in memory.
+        meta: Description of a new study, see `meta`; None opens an existing one.
 
     Raises:
-        StudyError: There is none, it is damaged, or of another version.
+        StudyError: The file does not exist, is damaged, or is of another version.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, *, meta: Mapping[str, Any] | None = None) -> None:
@@ -256,11 +256,6 @@ class StudyFile:
         """Return the description of the study by name: the problem, the solver, the seed and so on."""
         return {key: json.loads(value) for key, value, _ in self._rows("meta")}
 
-    def set(self, key: str, value: Any) -> None:
-        """Set one entry of `meta`."""
-        with self._transaction():
-            self._set({key: value})
-
     def _set(self, values: Mapping[str, Any]) -> None:
         self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
 
@@ -312,7 +307,7 @@ class StudyFile:
         return self._number("SELECT count(*) FROM rollouts")
 
     def told(self) -> int:
-        """Return the number of batches that the solver was told of."""
+        """Return the number of batches whose evaluations the solver was told."""
         return self._get("told", 0)
 
     def save_trials(self, batch: int, trials: Mapping[int, Trial], *, complete: bool) -> None:
@@ -321,8 +316,8 @@ class StudyFile:
         Args:
             batch: The number of the batch.
             trials: Position -> trial.
-            complete: Whether the solver was told of the batch. Then the trials replace all that an interrupted run has
-                recorded of it.
+            complete: Whether the solver was told the evaluations of the batch. Then the trials replace those of the
+                batch that an interrupted run has recorded.
         """
         with self._transaction():
             first = self._get("first_position", 0)
@@ -345,7 +340,7 @@ class StudyFile:
             self._insert("trials", rows, instead="REPLACE")
 
     def begin_anew(self, *, budget: int | None, racing: bool) -> None:
-        """Have a new solver told from the start, as the budget or the racing is another; trials so far stay."""
+        """Prepare the file for a new solver, with another budget or racing; the trials so far stay."""
         with self._transaction():
             self._withdraw()
             self._set({"budget": budget, "racing": racing})
@@ -446,7 +441,7 @@ class StudyFile:
         """Replace a point of the queue, or remove it if ``point`` is None.
 
         Raises:
-            StudyError: No point of that number waits.
+            StudyError: The queue has no point of that number.
         """
         with self._transaction():
             if not self._rows("given", "WHERE number = ? AND batch IS NULL", (number,)):
@@ -484,7 +479,7 @@ def _now() -> str:
 
 
 def encode(point: Point) -> str:
-    """Return a point as text; exact, as JSON writes the shortest digits that lead back to the same number."""
+    """Return a point as text, from which `decode` restores the same numbers exactly."""
     return json.dumps(list(point))
 
 

@@ -41,7 +41,7 @@ class _RunEnd(Exception):  # noqa: N818
 
 
 class StudyRun:
-    """One run of a study in its file. The solver is first told the recorded evaluations, batch by batch.
+    """One run of a study. The solver is first told the recorded evaluations, batch by batch.
 
     Args:
         file: The file of the study; this process has claimed it.
@@ -51,8 +51,7 @@ class StudyRun:
         racing: See `Evaluator`.
         catch: Whether a failed quality function fails its rollout only; see `RolloutTask`.
         progress: Show a progress bar in a terminal or a notebook, and log the progress elsewhere.
-        after_batch: Called with the number of every batch that is recorded for the first time; returns whether the
-            run is to end.
+        after_batch: Called with the number of every batch that is recorded for the first time; True ends the run.
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class StudyRun:
         self._target: float | None = None
 
     def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
-        """Run, and return why it ended, in a word and in a sentence."""
+        """Run the study; return the reason of the end, in a word and in a sentence."""
         self._limit = inf if rollouts is None else rollouts
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         if target is not None:
@@ -126,7 +125,7 @@ class StudyRun:
             if not self._one_batch(batch):
                 return self._end_of_solver()
             if batch >= self._told and self._after_batch(batch):
-                return STOPPED, "it was told to stop"
+                return STOPPED, "stop() was called"
             if batch >= self._new_from:
                 silent = 0 if len(self._known) > before else silent + 1
             self._show_best()

@@ -1,4 +1,4 @@
-"""Sweeps: a rollout at every point, under every condition; to be read, plotted, saved and asked for the boundary."""
+"""Sweeps: a rollout at every point, under every condition."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class Sweep:
     def best(self) -> tuple[dict[str, float], float]:
         """Return (s^0*, h(s^0*)), equation (18), over the points examined: the best that keeps all constraints.
 
-        The problem's risk aggregates several conditions, as in `Study.best`. Of a cost, its value takes the place of h.
+        The problem's risk aggregates several conditions, as in `Study.best`. For a cost, h is the cost.
 
         Raises:
             ValueError: There are several qualities; no point has finished all its conditions and keeps the constraints;
@@ -167,8 +167,8 @@ class Sweep:
         A rollout is safe if it did not exceed the threshold, kept all constraints and did not fail.
 
         Raises:
-            ValueError: The sweep has several parameters or no rollouts, was interrupted, or has nothing by which a
-                rollout could be unsafe.
+            ValueError: The sweep has several parameters or no rollouts, was interrupted, or has neither a threshold nor
+                a constraint.
         """
         from vtbdrake.optimization.boundary import boundary_of, why_no_boundary
 

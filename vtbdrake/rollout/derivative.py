@@ -25,19 +25,19 @@ _NUDGE = 1e-6
 
 
 class DerivativeError(ValueError):
-    """A testbed or a problem through which no derivative can be taken."""
+    """A testbed or a problem has no derivative that can be computed."""
 
 
 class DerivativeRunner:
-    """Runs rollouts and their derivatives: the number that the quality is read as, by the parameters.
+    """Runs rollouts, and computes the derivatives of their quality with respect to the parameters.
 
     The simulation runs once with AutoDiffXd, at fixed steps: with error control the steps would depend on the
-    parameters, and the derivatives would be garbage. At the sample times the state and its derivatives ds/dp are
-    known; f is evaluated at s +- e ds/dp, so that f may be any function in Python.
+    parameters, and the derivatives would be wrong. At the sample times the state and its derivatives ds/dp are known; f
+    is evaluated at s +- e ds/dp, so that f may be any function in Python.
 
     Args:
-        task: The rollout. Its threshold is ignored.
-        testbed: Built from the task's scenario, of systems that convert to AutoDiffXd.
+        task: The task. Its threshold is ignored.
+        testbed: A testbed of the task's scenario, whose systems convert to AutoDiffXd.
 
     Raises:
         DerivativeError: A system does not convert, or the integrator controls its error.
@@ -75,10 +75,10 @@ class DerivativeRunner:
 
         Args:
             parameters: Address -> value, set in s0.
-            by: The n addresses of the parameters of the derivatives.
+            by: Addresses of the n parameters with respect to which the derivatives are taken.
 
         Returns:
-            The number that the quality is read as, and its derivatives, shape (n,).
+            The reading of the quality, and its derivatives, shape (n,).
 
         Raises:
             DerivativeError: A parameter is not part of the numeric groups of the context.

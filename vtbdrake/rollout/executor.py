@@ -45,11 +45,11 @@ def cores() -> int:
 class Executor(ABC):
     """Runs rollouts of a task. It may be used for several tasks and is closed at the end (it is a context manager).
 
-    What a rollout needs is kept from call to call, so that a call with a single point costs little more than its
-    rollout. A task is known by its identity: hand in the same object each time.
+    Testbeds and runners are kept from call to call, so that a call with a single point costs little more than its
+    rollout. Tasks are compared by identity: pass the same object each time.
 
     Attributes:
-        cancels: Whether it takes a `Cutoff`.
+        cancels: Whether `run` accepts a `Cutoff`.
     """
 
     cancels: bool = True
@@ -66,11 +66,11 @@ class Executor(ABC):
         the scenario refuses, is raised, and ends the others.
 
         Args:
-            task: What the rollouts have in common.
-            points: One per rollout.
-            start: Where the rollouts begin, instead of the task's own s0: one start for all, or one for each point.
-                It is the cheap way to begin elsewhere: nothing is built, and only the start is sent to the workers.
-            cutoff: Ends rollouts early. Those that its deadline cancels are not yielded.
+            task: The data that all rollouts share.
+            points: One point per rollout.
+            start: Where the rollouts begin instead of the task's own s0: one start for all, or one for each point. No
+                testbed is built for a start, and only the start is sent to the workers.
+            cutoff: When to end rollouts early. Rollouts cancelled by its deadline are not yielded.
 
         Raises:
             ValueError: There is a ``cutoff``, and the executor cannot cancel rollouts (see ``cancels``).
@@ -93,8 +93,8 @@ class SerialExecutor(Executor):
     """One rollout after another, in this thread.
 
     Args:
-        testbed: Is used where it is the task's; others are built.
-        kept: How many testbeds are kept, for points with different scenario fields.
+        testbed: A testbed to use for tasks of its scenario; others are built.
+        kept: Number of testbeds that are kept, for points with different scenario fields.
     """
 
     def __init__(self, testbed: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
@@ -131,12 +131,12 @@ class _Job:
 class ThreadExecutor(Executor):
     """Threads that share one Diagram, each with its own Context.
 
-    The fastest where all systems are Drake's: a system in Python makes the threads wait for each other.
+    The fastest executor if all systems are in C++: systems in Python make the threads wait for each other.
 
     Args:
-        workers: How many threads; the number of cores if left out.
-        testbed: Is used where it is the task's; others are built.
-        kept: How many testbeds are kept, for points with different scenario fields.
+        workers: Number of threads; by default the number of cores.
+        testbed: A testbed to use for tasks of its scenario; others are built.
+        kept: Number of testbeds that are kept, for points with different scenario fields.
     """
 
     def __init__(self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, kept: int = KEPT) -> None:
@@ -226,9 +226,9 @@ def run_rollouts(
     progress: bool = True,
     description: str = "rollouts",
 ) -> list[RolloutResult | None]:
-    """Return one result per point, in the order of ``points``, and show a progress bar.
+    """Run the rollouts with a progress bar; return one result per point, in the order of ``points``.
 
-    Ctrl-C ends the running rollouts and starts no more; the list then has None where there is no result.
+    Ctrl-C ends the running rollouts and starts no more; a point without a result has None.
 
     Raises:
         QualityError: f raises, is negative or NaN.

@@ -1,4 +1,4 @@
-"""When a rollout ends before its horizon because it is of no more use."""
+"""Pruning: when a rollout ends before its horizon because it cannot win any more."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from math import inf, isnan, nan
 from vtbdrake.argument_checks import as_addresses, as_number
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 
-# How a rollout ends: it cannot win any more; it has gained nothing for too long.
+# How a rollout ends: it cannot win any more; its quality has not improved for too long.
 PRUNED, STALLED = "pruned", "stalled"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cutoff:
-    """What is known only when rollouts are begun, and ends them early.
+    """Limits that end rollouts early, known only when the rollouts begin.
 
     Attributes:
-        deadline: When, by `time.monotonic`, which all processes of a computer share. A rollout that is not finished
-            then is cancelled at its next sample, and has no result.
+        deadline: A time of `time.monotonic`, which all processes of a computer share. A rollout that is not finished
+            by then is cancelled at its next sample, and has no result.
         to_beat: A value of the task's quality, in the user's terms. A rollout of a task with `Pruning` ends when it
-            can no longer be better. NaN: none.
+            can no longer be better. NaN: no such value.
     """
 
     deadline: float = inf
@@ -38,17 +38,17 @@ class Cutoff:
 class Pruning:
     """When the rollout of a candidate that cannot win any more ends.
 
-    It ends as ``pruned`` when it has violated a constraint that is read as ``worst``, or when its quality can no longer
-    be better than `Cutoff.to_beat`, as far as is known without an assumption, or from ``bound``. Neither changes which
-    candidate is the best. It ends as ``stalled``, with the value that it has reached, when nothing was gained for
-    ``patience`` seconds. This is an assumption: that nothing would be gained later.
+    The rollout ends as ``pruned`` when it has violated a constraint with the reading ``worst``, or when its quality can
+    no longer be better than `Cutoff.to_beat`, by its bounds. Neither changes which candidate is the best. The rollout
+    ends as ``stalled``, with the value reached so far, when its quality has not improved for ``patience`` seconds; it
+    is assumed, and not known, that the quality would not improve later.
 
     Attributes:
         bound: Function (remaining time in seconds, values of ``of``...) that returns the best f (or the lowest cost)
             that is still possible, now and later. It must be optimistic. None: `Quality.upper`, or 0 for a cost.
         of: Addresses of variables or vector output ports.
-        patience: Seconds of simulated time; for qualities that are read as ``best``.
-        gain: What counts as gained, in the unit of the quality: more than this over the last gain.
+        patience: Simulated time in seconds; for qualities with the reading ``best``.
+        gain: The least improvement that restarts the patience, in the unit of the quality.
 
     Raises:
         ValueError: A number is out of range, or ``of`` and ``bound`` do not go together.
@@ -74,13 +74,13 @@ class Pruning:
 
 
 class Prospect:
-    """What one rollout can still reach, from sample to sample.
+    """The best value that one rollout can still reach, updated at each sample.
 
     Args:
-        pruning: When it ends.
-        quality: f.
-        measures: What else is measured; the constraints among them count.
-        horizon: t_m in seconds.
+        pruning: When to end the rollout.
+        quality: Quality f.
+        measures: The task's other measures; a violated constraint among them ends the rollout.
+        horizon: Horizon t_m in seconds.
         to_beat: See `Cutoff`.
 
     Attributes:
@@ -106,7 +106,7 @@ class Prospect:
         self.reachable = nan
 
     def take(self, t: float, samples: Sequence[float], values: Sequence[object]) -> tuple[str, str] | None:
-        """Return how and why the rollout ends early with these samples; None if it goes on, or is over anyway.
+        """Return how and why the rollout ends early at these samples; None if it goes on, or ends at its horizon.
 
         Args:
             t: Time of the sample in seconds from t0.
@@ -134,11 +134,11 @@ class Prospect:
         if reachable <= self._to_beat:
             return PRUNED, f"it can reach {self.reachable:g} at best, and {self._sign * self._to_beat:g} is known"
         if t - self._gained[0] > self._pruning.patience:
-            return STALLED, f"nothing was gained for {self._pruning.patience:g} s"
+            return STALLED, f"the quality has not improved for {self._pruning.patience:g} s"
         return None
 
     def _reachable(self, t: float, f: float, values: Sequence[object]) -> float:
-        """Return the best reading of f that is still possible; larger is better."""
+        """Return the best reading of f (of a cost, negated) that is still possible."""
         left = self._horizon - t
         ahead = 0.0 if self._quality.minimize else self._quality.upper
         if self._pruning.bound is not None:

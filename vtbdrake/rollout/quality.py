@@ -38,7 +38,7 @@ READINGS: dict[str, Reading] = {"best": _best, "worst": _worst, "end": _end, "in
 
 
 def check_reading(reading: str) -> str:
-    """Return ``reading``; raise a ValueError if it is unknown.
+    """Return ``reading`` if it is known.
 
     Raises:
         ValueError: It is unknown.
@@ -49,7 +49,7 @@ def check_reading(reading: str) -> str:
 
 
 class QualityError(ValueError):
-    """A quality function that raises, or returns a value that is not a quality."""
+    """A quality function raises, or returns a value that is not a quality."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,11 +58,11 @@ class Measure:
 
     Attributes:
         f: The function. It gets the quality variables in the order of ``of``, floats or arrays.
-        of: Sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the testbed, the
-            DPS's or the simulation's; ``time`` is the simulation's clock.
+        of: The selection sigma_q, equation (11): addresses of variables or vector output ports (``path.port``) of the
+            testbed, in the DPS or in the simulated world; ``time`` is the simulation's clock.
         reading: How the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
-            time, by the trapezoidal rule). All mean the samples up to where the rollout ends: at t_m, or earlier where
-            a threshold is exceeded or a system of the testbed asks for the end; an integral is then one over less time.
+            time, by the trapezoidal rule). All readings use the samples up to the end of the rollout: at t_m, or
+            earlier if a threshold is exceeded or a system of the testbed terminates the simulation.
     """
 
     f: Callable[..., float]
@@ -96,7 +96,7 @@ class Measure:
         """Return f of the quality variables.
 
         Args:
-            values: Those of the quality variables, in the order of ``of``.
+            values: Values of the quality variables, in the order of ``of``.
             time: Time of the sample, in seconds, for error messages.
 
         Raises:
@@ -119,19 +119,18 @@ class Measure:
 
     @abstractmethod
     def read(self, times: np.ndarray, samples: np.ndarray) -> float:
-        """Return the number that the samples, shape (n,), at ``times`` are read as."""
+        """Return the reading of the samples, shape (n,), at ``times``."""
 
 
 @dataclass(frozen=True, repr=False)
 class Quality(Measure):
     """f(q(t)) >= 0, equation (12): larger is better. Or, with ``minimize``, a cost c >= 0: smaller is better.
 
-    With a cost the f of equations (12) to (18) is 1 / (1 + c), so that they hold as they stand; what is reported is
-    the cost.
+    For a cost, the f of equations (12) to (18) is 1 / (1 + c), so that they hold unchanged; the cost is reported.
 
     Attributes:
-        minimize: f is a cost.
-        upper: The most that f can be, if that is known: it lets racing drop a candidate that can no longer win.
+        minimize: Whether f is a cost.
+        upper: An upper bound of f, if one is known; racing needs it to drop a candidate that can no longer win.
     """
 
     minimize: bool = field(default=False, kw_only=True)
@@ -178,7 +177,7 @@ class Constraint(Measure):
 
     Attributes:
         at_most, at_least: The limits, in the unit of f; one of them or both.
-        reading: See `Measure`; ``worst`` means at every sample time up to where the rollout ends, ``best`` at one.
+        reading: See `Measure`; ``worst``: the condition holds at every sample time, ``best``: at one at least.
     """
 
     reading: str = field(default="worst", kw_only=True)
@@ -206,7 +205,7 @@ class Constraint(Measure):
 def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = False) -> np.ndarray:
     """Return which samples exceed the threshold, strictly: f above it or, with ``minimize``, the cost below it.
 
-    A cost is compared itself, and not as 1 / (1 + cost), where small costs that differ are equal to the last bit.
+    Costs are compared directly: 1 / (1 + cost) rounds different small costs to the same number.
     """
     samples = np.asarray(samples, dtype=float)
     if threshold is None:

@@ -1,4 +1,4 @@
-"""Rollouts along a recorded motion: the world is simulated once for all candidates that do not move it."""
+"""Rollouts along a recorded motion: the world is simulated once for all candidates that do not affect its motion."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ _BETWEEN = 0.382
 
 
 class MotionError(ValueError):
-    """A motion that cannot be recorded, or that depends on what is varied along it."""
+    """A motion cannot be recorded, or depends on the varied variables."""
 
 
 @dataclass(frozen=True)
 class RecordedMotion:
-    """The motion of the testbed does not depend on what is varied: it is simulated once, and recorded.
+    """A declaration that the motion of the testbed does not depend on the varied variables.
 
-    A camera that looks on, say, and what perceives its images. Each candidate is then simulated only in a window of
-    ``memory`` seconds before each sample of f, from the recorded state. If what depends on the varied variables, the
-    followers, has forgotten after ``memory`` seconds what was before, then the result equals that of the whole
-    rollout, to the last bit. So images that nothing reads are not rendered, and the world between the samples is not
-    simulated. The gain is about the sample period over the memory.
+    For example, the pose of a camera that observes, or the parameters of a detector of its images, are varied. The
+    motion is simulated once, and recorded. Each candidate is then simulated only in a window of ``memory`` seconds
+    before each sample of f, from the recorded state. The systems that depend on the varied variables are called
+    followers. If their state does not depend on anything more than ``memory`` seconds ago, the result equals that of
+    the whole rollout, to the last bit. So images that nothing reads are not rendered, and the world between the samples
+    is not simulated. A candidate takes about memory / sample period of the time of a whole rollout.
 
-    What follows is found from the connections of the Diagram. If the plant or an actuator follows, the motion is
-    refused. At each sample, the state of all systems that do not follow is compared with the recorded one.
-    `Problem.check` compares whole rollouts with those along the motion, and finds a memory that is too short. The
-    testbed must have no continuous state: a discrete plant continues exactly from a recorded state, an integrator with
-    error control does not. What fails only between the windows (a camera that is inside a link for a moment) is not
-    noticed.
+    The followers are found from the connections of the Diagram. If the plant or an actuator is one, the motion is
+    refused. At each sample, the state of all other systems is compared with the recorded one. `Problem.check` compares
+    whole rollouts with those along the motion, and finds a memory that is too short. The testbed must have no
+    continuous state: a discrete plant continues exactly from a recorded state, an integrator with error control does
+    not. A failure between the windows (a camera that is inside a link for a moment) is not noticed.
 
     Attributes:
-        memory: In seconds. Of a camera of period T and a detector of latency D that samples its images s seconds after
-            they were taken, it is T + s + D at most, and less where f is sampled right after a result. A filter never
-            forgets: read f before it.
-        varied: Addresses of the variables that are varied, parameters of systems that are no part of the motion; a
-            `Problem` sets them to those of its parameters.
+        memory: Memory of the followers in seconds. For a camera of period T and a detector of latency D that samples
+            its images s seconds after they were taken, it is T + s + D at most, and less if f is sampled right after a
+            result. The memory of a filter is infinite: f must use its input.
+        varied: Addresses of the varied variables, which are parameters of followers; a `Problem` sets them to those of
+            its parameters.
 
     Raises:
         ValueError: The memory is not a positive time.
@@ -71,28 +71,28 @@ class Recording:
     """One recorded motion, at the sample times.
 
     Attributes:
-        starts: The state at the beginning of the window of each sample; None where the rollout goes on from the sample
-            before, which is not longer ago.
-        worlds: The numbers of all that does not follow, at each sample.
+        starts: The state at the beginning of the window of each sample; None if the window begins before the previous
+            sample, so that the rollout goes on from there.
+        worlds: The numbers of all systems that are not followers, at each sample.
     """
 
     starts: list[FlatState | None] = field(default_factory=list)
     worlds: list[np.ndarray] = field(default_factory=list)
 
 
-# Testbed -> what a motion depends on beside what is set in s0 -> what is set in s0 -> its recording.
+# Testbed -> memory, followers and samples -> values set in s0 -> the recording.
 _RECORDINGS: WeakKeyDictionary[VirtualTestbed, dict[Hashable, dict[Hashable, Recording]]] = WeakKeyDictionary()
 
 
 class MotionPlayer:
-    """Sets contexts of a testbed to recorded states, and compares them with these.
+    """Sets contexts of a testbed to recorded states, and compares them with recorded states.
 
     Args:
-        motion: What is varied, and for how long it is remembered.
+        motion: The varied variables, and the memory of their followers.
         testbed: The testbed of the rollouts.
 
     Raises:
-        MotionError: The motion depends on what is varied, or cannot be continued exactly from a recorded state.
+        MotionError: The motion depends on the varied variables, or cannot be continued exactly from a recorded state.
     """
 
     def __init__(self, motion: RecordedMotion, testbed: VirtualTestbed) -> None:
@@ -123,8 +123,8 @@ class MotionPlayer:
                 )
             if variables[address].kind != A:
                 raise MotionError(
-                    f"{address} changes while time runs, so that it is forgotten: along a recorded motion, vary "
-                    "parameters (of kind 'a')"
+                    f"{address} is a dynamic state, whose initial value has no effect later: along a recorded motion, "
+                    "vary parameters (of kind 'a')"
                 )
             sources[owner] = address
         found = followers(self._testbed.diagram, sources)
@@ -132,8 +132,8 @@ class MotionPlayer:
             if is_plant(systems[path]) or path.startswith(T_ACT):
                 way = chain(found, path)
                 raise MotionError(
-                    f"the motion depends on {sources[way[0]]}, by way of {' -> '.join(way)}: let the DPS move by "
-                    "sensors that do not depend on it, or leave out motion="
+                    f"the motion depends on {sources[way[0]]}, by way of {' -> '.join(way)}: let the DPS control the "
+                    "motion by sensors that do not depend on it, or leave out motion="
                 )
         return found
 
@@ -142,7 +142,7 @@ class MotionPlayer:
         return next((path for path in self._paths if address.startswith(f"{path}.")), "")
 
     def fixed(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those of the values set in s0 on which the motion may depend: not the parameters of what follows."""
+        """Return the values set in s0 on which the motion may depend: all but the parameters of followers."""
         variables = self._testbed.variables()
         return {
             address: value
@@ -151,7 +151,7 @@ class MotionPlayer:
         }
 
     def begins(self, instants: np.ndarray) -> list[float | None]:
-        """Return when the window of each sample begins, in seconds; None if the rollout goes on from the one before.
+        """Return when the window of each sample begins, in seconds; None if that is before the previous sample.
 
         Args:
             instants: The simulator's time at each sample, shape (n,).
@@ -167,7 +167,7 @@ class MotionPlayer:
         return found
 
     def recordings(self, instants: np.ndarray) -> dict[Hashable, Recording]:
-        """Return the recordings from default starts with samples at these instants, so far, to be added to.
+        """Return the recordings from default starts with samples at these instants; the caller adds new ones.
 
         Args:
             instants: The simulator's time at each sample, shape (n,).
@@ -180,7 +180,7 @@ class MotionPlayer:
         return self._state.take(context)
 
     def world(self, context: Context) -> np.ndarray:
-        """Return the numbers of all that does not follow, shape (n,)."""
+        """Return the numbers of all systems that are not followers, shape (n,)."""
         return self._world.take(context).numbers
 
     def put(self, context: Context, time: float, start: FlatState) -> None:
@@ -189,7 +189,7 @@ class MotionPlayer:
         self._state.put(context, start)
 
     def check(self, context: Context, recorded: np.ndarray) -> None:
-        """Compare what does not follow with the recorded numbers.
+        """Compare the systems that are not followers with the recorded numbers.
 
         Raises:
             MotionError: They differ.
@@ -199,7 +199,7 @@ class MotionPlayer:
             return
         index = int(np.flatnonzero((here != recorded) & ~(np.isnan(here) & np.isnan(recorded)))[0])
         raise MotionError(
-            f"the motion depends on {', '.join(self.motion.varied)}, though no connection shows how: at "
+            f"the motion depends on {', '.join(self.motion.varied)}, although no connection leads there: at "
             f"t = {context.get_time():g} s, {self._world.name_at(index)} is not as recorded. A system has memory "
             "outside the Context, see Problem.check"
         )

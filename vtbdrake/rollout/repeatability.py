@@ -62,10 +62,10 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
     Args:
         task: Task of the rollouts.
         testbed: Testbed of the task's scenario, on which the rollouts run.
-        points: Address -> value; the first is repeated, the last runs beside it. None sets a field of the scenario.
+        points: Address -> value, without fields of the scenario; the first is repeated, the last runs beside it.
 
     Raises:
-        QualityError: The quality is wrong, so that nothing can be compared.
+        QualityError: f raises, is negative or NaN, so that nothing can be compared.
     """
     point, other = points[0], points[-1]
     reference = list(_within(_BUDGET, _trace(RolloutRunner(task, testbed), point)))
@@ -78,12 +78,12 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
         changed = [name for name, value in _attributes(testbed).items() if before.get(name) != value]
         findings += _compare(task, reference, beside, changed, "a rollout that runs beside another one")
     short = replace(task, horizon=max(float(reference[-1][0]), task.sample_period), keep_state=False)
-    travelling = list(_unsendable(task))
-    if not travelling:
-        travelling = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
+    sending = list(_unsendable(task))
+    if not sending:
+        sending = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
     end, sample = reference[-1]
     failure = next((measured for measured in sample[""] if isinstance(measured, str)), "")
-    return Check((*findings, *travelling), float(end), failure)
+    return Check((*findings, *sending), float(end), failure)
 
 
 def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:

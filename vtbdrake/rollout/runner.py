@@ -1,4 +1,4 @@
-"""Gamma: simulates one testbed again and again, from any s0, with identical results."""
+"""Gamma: runs rollouts of one testbed from any s0; equal rollouts have identical results."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from vtbdrake.testbed.interrupt import Interruptible
 
 
 class SimulationError(Exception):
-    """A simulation that cannot continue; it becomes the outcome of its rollout."""
+    """A simulation cannot continue; the error becomes the outcome of its rollout."""
 
 
 class CancelledError(Exception):
-    """A rollout that was told to stop; it has no outcome."""
+    """A rollout was cancelled; it has no outcome."""
 
 
 class RolloutRunner:
     """Runs the rollouts of one task on one testbed, one after another; every thread needs its own.
 
     Args:
-        task: What the rollouts have in common.
-        testbed: Built from the task's scenario; several runners may share one. Left out, it is built.
+        task: The data that all rollouts share.
+        testbed: A testbed of the task's scenario, which several runners may share; None: a new one is built.
 
     Raises:
-        ValueError: The testbed draws, or the task asks for an address that the testbed does not have, or (a
-            `MotionError`) for a motion that depends on what is varied along it.
+        ValueError: The testbed draws into a Meshcat, the task names an address that the testbed does not have, or (a
+            `MotionError`) its recorded motion depends on the varied variables.
     """
 
     def __init__(self, task: RolloutTask, testbed: VirtualTestbed | None = None) -> None:
@@ -50,7 +50,7 @@ class RolloutRunner:
         self.testbed = testbed if testbed is not None else task.scenario.build()
         if not same_scenario(self.testbed, task):
             raise ValueError(
-                "the testbed was built from another scenario than the task's; leave it out, and it is built"
+                "the testbed was built from another scenario than the task's: leave it out, and a new one is built"
             )
         if self.testbed.visualized:
             raise ValueError("a rollout does not draw: build the scenario without meshcat")
@@ -89,15 +89,16 @@ class RolloutRunner:
 
         Args:
             parameters: Address -> value, set in s0.
-            start: S0; that of the task if left out. Several rollouts from the same object prepare it once.
-            cutoff: Ends the rollout early.
-            cancel: Stops the rollout when it is set.
+            start: Where the rollout begins instead of the task's s0. Several rollouts from the same object prepare the
+                start once.
+            cutoff: When to end the rollout early.
+            cancel: An event that stops the rollout.
 
         Raises:
             QualityError: f raises, is negative or NaN, and the task does not catch that.
             StartError: ``start`` does not fit the testbed.
             CancelledError: ``cancel`` was set, or the deadline of ``cutoff`` has passed.
-            MotionError: The motion along which the task's rollouts go depends on what is varied.
+            MotionError: The recorded motion of the task depends on the varied variables.
         """
         begin = time.perf_counter()
         self._begin(start)
@@ -140,11 +141,11 @@ class RolloutRunner:
             return samples.result(dict(parameters), end, message, begin)
 
     def simulate(self, parameters: Mapping[str, Any], *, start: Start | None = None) -> Iterator[float]:
-        """Simulate from s0 with ``parameters`` set in it, and pause at every sample time, which is yielded.
+        """Simulate from s0, and yield every sample time when the simulation has reached it.
 
         Args:
             parameters: Address -> value, set in s0.
-            start: S0; that of the task if left out.
+            start: Where the rollout begins instead of the task's s0.
 
         Raises:
             SimulationError: The simulation cannot go on.
@@ -169,13 +170,13 @@ class RolloutRunner:
 
         Args:
             parameters: Address -> value, set in s0.
-            t: In seconds from t0.
-            start: S0; that of the task if left out.
+            t: Time in seconds from t0.
+            start: Where the rollout begins instead of the task's s0.
 
         Raises:
             ValueError: ``t`` is not a sample time.
             StartError: ``start`` does not fit the testbed.
-            RuntimeError: The simulation fails before.
+            RuntimeError: The simulation fails before ``t``.
         """
         self._begin(start)
         last = int(np.argmin(np.abs(self._times - t)))
@@ -194,7 +195,7 @@ class RolloutRunner:
         return self.testbed.snapshot(self._context)
 
     def _begin(self, start: Start | None) -> None:
-        """Let the next rollouts begin at ``start``."""
+        """Set where the next rollouts begin."""
         if start is not self._beginning.start:
             try:
                 self._beginning.set(start)
@@ -211,10 +212,10 @@ class RolloutRunner:
             self._recordings = self._player.recordings(self._instants) if by_default else {}
 
     def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
-        """Return the motion, with the parameters of all that follows as they are in s0; it is recorded at first.
+        """Return the recorded motion, in which the parameters of the followers are as in s0; record it if necessary.
 
-        From default starts it is recorded once for all tasks on this testbed with the same samples. What fails or ends
-        it early does the same to the rollouts along it, which go on by themselves from there.
+        From default starts a motion is recorded once for all tasks on this testbed with the same samples. If it fails
+        or ends early, the rollouts along it are simulated from there on, and do the same.
         """
         if self._player is None:
             return Recording()
@@ -371,7 +372,7 @@ class _Samples:
         """Check that integrals are finite, as all their samples are.
 
         Raises:
-            QualityError: One has overflowed.
+            QualityError: An integral has overflowed.
         """
         times = np.array(self._times)
         for measure, samples in zip(self._runner._measures, self._samples, strict=True):
@@ -422,8 +423,8 @@ class _Samples:
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
         runner = self._runner
-        # A rollout that failed after t* has gone on since: simulate it again up to t*. Along a motion, what follows
-        # knows only what f needs.
+        # After t*, a rollout may have gone on and failed: simulate it again up to t*. Along a recorded motion, the
+        # followers have only the state that f needs.
         at_end = runner.task.motion is None and t_star == self._times[-1] and runner.context.get_time() == self._clock
         if at_end:
             return runner.testbed.snapshot(runner.context)
@@ -460,7 +461,7 @@ _RUNNERS = 16
 
 
 class BuildError(Exception):
-    """A testbed that cannot be built with some values of its scenario's fields: the outcome of the rollout."""
+    """No testbed can be built with some values of its scenario's fields; the error is the outcome of the rollout."""
 
 
 def split(point: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -478,8 +479,8 @@ class Testbeds:
     """The testbeds last used, built once per distinct scenario and shared by threads.
 
     Args:
-        known: a testbed that is there already, and stays.
-        kept: How many others are kept; the one that was not used for longest goes first.
+        known: A testbed that exists already and is never dropped.
+        kept: Number of other testbeds that are kept; the least recently used one is dropped first.
     """
 
     def __init__(self, known: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
@@ -491,7 +492,7 @@ class Testbeds:
         self._lock = threading.Lock()
 
     def get(self, scenario: Scenario) -> VirtualTestbed:
-        """Return the testbed of ``scenario``. A thread that asks for one that another thread builds waits for it."""
+        """Return the testbed of ``scenario``; wait if another thread is building it."""
         key = _key(scenario.record())
         if self._known is not None and self._known.scenario is not None and key == _key(self._known.scenario.record()):
             return self._known
@@ -541,7 +542,7 @@ class Runners:
         Raises:
             ScenarioError: There is no such field, or the scenario refuses its value.
             BuildError: No testbed can be built with these fields for another reason.
-            SnapshotError: The task starts from a snapshot, which is of the scenario as it was.
+            SnapshotError: The task starts from a snapshot of the scenario without these fields.
         """
         mine: OrderedDict[Hashable, tuple[RolloutTask, RolloutRunner]]
         mine = self._threads.__dict__.setdefault("runners", OrderedDict())
@@ -588,11 +589,11 @@ class Runners:
         are an error.
 
         Args:
-            task: The rollout.
+            task: The task of the rollout.
             point: Address, or scenario field with its prefix -> value.
-            start: S0; that of the task if left out.
-            cutoff: Ends the rollout early.
-            cancel: An event that ends the rollout when it is set.
+            start: Where the rollout begins instead of the task's s0.
+            cutoff: When to end the rollout early.
+            cancel: An event that stops the rollout.
             begin: Called when the testbed has been built, before the rollout.
         """
         with Interruptible():

@@ -1,4 +1,4 @@
-"""Start: where a rollout begins, as light data for runners and workers that are warm."""
+"""Start: where a rollout begins, as light data for runners and workers whose testbeds are built."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class StartError(ValueError):
 class Start:
     """Where a rollout begins: s0 as plain data that pickles quickly, for testbeds that are built already.
 
-    A runner sets its testbed to a start and builds nothing. The task of the rollouts stays the same, so that warm
-    workers are sent the start alone. What a start does not hold is as in the task's own s0. All switches are thrown to
-    sim, as in every copy of a running robot, and initialization events, which have happened, do not happen again.
+    A runner sets its testbed to a start and builds nothing. The task of the rollouts stays the same, so that only the
+    start is sent to workers. Everything that a start does not hold is as in the task's own s0. All switches are thrown
+    to sim, as in every copy of a running robot, and initialization events, which have happened, do not happen again.
 
     Attributes:
-        time: When the rollout begins, t0, in seconds.
-        contents: Of systems of the testbed, in one of its layouts: ``dps_layout``, ``start_layout`` or
+        time: Time t0 at which the rollout begins, in seconds.
+        contents: Contents of systems of the testbed, in one of its layouts: ``dps_layout``, ``start_layout`` or
             ``whole_layout``.
-        values: Set on top, by address: commands u, say, or a parameter of the world.
+        values: Address -> value to set in addition, for example commands u.
     """
 
     time: float
@@ -74,11 +74,11 @@ class Beginning:
 
     Args:
         testbed: The testbed of the rollouts.
-        default: The task's own s0, for what a start does not hold.
+        default: The task's own s0, for everything that a start does not hold.
         copier: Copies between contexts of the testbed.
 
     Attributes:
-        start: The present one; None is the task's own s0.
+        start: The present start; None is the task's own s0.
         context: Where the next rollout begins.
         hidden: Addresses of the hidden variables that any start so far has set.
     """
@@ -114,7 +114,7 @@ class Beginning:
             self._own = self._testbed.default_context()
         last, self._last = self._last, None
         what = layout, frozenset(start.values)
-        if last != what:  # Otherwise, this start overwrites all that the last one has set.
+        if last != what:  # Otherwise this start overwrites everything that the last one has set.
             self._copier.copy(self._default, self._own)
             self._testbed.switch(self._own, "sim")
         self._own.SetTime(start.time)
@@ -162,7 +162,7 @@ def start_of_each(start: Starts, count: int) -> list[Start | None]:
     starts: list[Start | None] = list(start) if isinstance(start, Sequence) else [start] * count
     for one in starts:
         if not isinstance(one, Start | None):
-            raise StartError(f"a rollout begins at a Start, from Start.of(testbed, context), say, not at {one!r}")
+            raise StartError(f"a rollout begins at a Start, such as Start.of(testbed, context), not at {one!r}")
     if len(starts) != count:
         raise StartError(f"give one start for all rollouts, or one for each of the {count}, not {len(starts)}")
     return starts

@@ -32,24 +32,24 @@ class RolloutResult:
     """The outcome of one rollout.
 
     Attributes:
-        parameters: What was set in s0, by address.
-        end: Why it ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a system of
-            the testbed asked for the end), ``pruned`` or ``stalled`` (see `Pruning`) or ``failed``.
-        message: The reason of a failure, termination or pruning.
-        t_star: t* in seconds from t0, equation (16); of a quality that is read at the end or as an integral the end, of
-            one that is read at its worst the time of that. NaN if the rollout failed or had no quality.
-        h: F'(s^0, t*), equation (17), or how else f' is read, larger is better; NaN as t_star.
-        value: h in the user's terms: the cost, if f is one, else h. Of a pruned rollout, the best that it could still
-            have reached.
-        measures: What else was asked to be measured, in its order; empty if the rollout failed.
-        threshold: f_m, that of f': of a cost, 1 / (1 + the threshold of the cost).
-        exceedances: G1, equation (14): the sample times at which f' exceeded f_m, in seconds from t0; all of it only if
-            the rollout was asked to run on.
+        parameters: Address -> value that was set in s0.
+        end: Why the rollout ended: ``threshold`` (f' exceeded f_m), ``horizon`` (t_m was reached), ``terminated`` (a
+            system of the testbed requested it), ``pruned`` or ``stalled`` (see `Pruning`) or ``failed``.
+        message: The reason for a failure, termination or pruning.
+        t_star: Time t* in seconds from t0, equation (16). For the reading ``worst``, the time of the worst sample; for
+            ``end`` and ``integral``, the end. NaN if the rollout failed or had no quality.
+        h: Quality f'(s^0, t*), equation (17), or its other reading; larger is better. NaN where t_star is.
+        value: The value h in the user's terms: the cost, if f is one, else h. For a pruned rollout, the best that it
+            could still have reached.
+        measures: The values of the task's other measures, in their order; empty if the rollout failed.
+        threshold: Threshold f_m of f'; for a cost, 1 / (1 + the threshold of the cost).
+        exceedances: The set G1, equation (14): the sample times at which f' exceeded f_m, in seconds from t0; complete
+            only with ``run_on``.
         times: Sample times from t0, in seconds, shape (n,).
-        quality: The quality trajectory f' at ``times``, equation (13), shape (n,); of a cost, 1 / (1 + cost).
-        record: By address, the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
-        state: S(t*) if it was asked for.
-        wall_time: Seconds it took.
+        quality: The quality trajectory f' at ``times``, equation (13), shape (n,); for a cost, 1 / (1 + cost).
+        record: Address -> the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
+        state: The state s(t*) with ``keep_state``, else None.
+        wall_time: Wall time in seconds.
     """
 
     parameters: Mapping[str, Any]
@@ -117,26 +117,26 @@ _MOST_SAMPLES = 1e8
 
 @dataclass(frozen=True)
 class RolloutTask:
-    """A rollout s(t) = Gamma(s0, t), equation (7), up to what is set in s0.
+    """A rollout s(t) = Gamma(s0, t), equation (7), without the parameters that are set in s0.
 
     Attributes:
-        scenario: Builds the testbed.
-        horizon: t_m in seconds from t0.
-        quality: f and its variables; None for a rollout that only records.
-        threshold: The first sample of f above it, strictly, ends the rollout; or, of a cost, the first one below it.
-            None: never. Only for a quality that is read at its best.
-        sample_period: In seconds; f is read at its multiples and at t_m. The simulation pauses there, which with
-            error control is part of the trajectory.
-        record: Addresses of variables, and output ports as ``path.port``, to be recorded at the sample times.
-        run_on: Simulate to t_m although the threshold was exceeded.
-        start: s0 from a snapshot, with all switches thrown to sim; None takes the scenario's defaults. Of a running
+        scenario: The scenario that builds the testbed.
+        horizon: Horizon t_m in seconds from t0.
+        quality: Quality f and its variables; None for a rollout that only records.
+        threshold: The first sample of f strictly above the threshold ends the rollout (of a cost, the first one below
+            it). None: never. Only for a quality with the reading ``best``.
+        sample_period: Sample period in seconds; f is sampled at its multiples and at t_m. The simulation pauses there,
+            which with error control changes the trajectory.
+        record: Addresses of variables, and output ports as ``path.port``, to record at the sample times.
+        run_on: Whether to simulate to t_m although the threshold was exceeded.
+        start: Snapshot with s0, with all switches thrown to sim; None takes the scenario's defaults. For a running
             simulation with error control take it by `AddressedDiagram.fork`, or its future will differ a little.
-        keep_state: Return s(t*), at the price of a second simulation up to t* where that is not the end.
-        measures: What else is sampled and read as one number each: further objectives, constraints.
-        catch: What f or a measure raises, or returns that is no quality, fails its rollout, as a simulation does that
-            diverges. Otherwise it is raised, and ends the others.
-        pruning: When a rollout that is of no more use ends; None: never.
-        motion: The rollouts go along recorded motions, see `RecordedMotion`; None: each is simulated as a whole.
+        keep_state: Whether to return s(t*), at the price of a second simulation up to t* if t* is not the end.
+        measures: Further functions that are sampled and read as one number each: objectives and constraints.
+        catch: Whether an error of f or of a measure (it raises, or returns no quality) fails only its rollout.
+            Otherwise the error is raised, and ends the other rollouts.
+        pruning: When to end a rollout that cannot win any more; None: never.
+        motion: Simulate candidates along recorded motions, see `RecordedMotion`; None: simulate each as a whole.
     """
 
     scenario: Scenario
@@ -155,12 +155,9 @@ class RolloutTask:
 
     def __post_init__(self) -> None:
         if not isinstance(self.scenario, Scenario):
-            raise ValueError(
-                f"a scenario is an instance, of a class or from load_scenario(), unlike {self.scenario!r}: "
-                "make one, MyScenario(), say"
-            )
+            raise ValueError(f"a scenario is an instance, MyScenario() or load_scenario(name), not {self.scenario!r}")
         if not isinstance(self.start, Snapshot | None):
-            raise ValueError(f"the start of rollouts is a snapshot, from Snapshot.load(file), say, not {self.start!r}")
+            raise ValueError(f"the start of rollouts is a Snapshot, such as Snapshot.load(file), not {self.start!r}")
         for name, what in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():
             object.__setattr__(self, name, as_number(what, getattr(self, name)))
         object.__setattr__(self, "record", as_addresses("what to record", self.record))
@@ -238,7 +235,7 @@ class RolloutTask:
         advanced to the one would take another step, of 1e-16 s, to the other.
 
         Args:
-            t0: When rollouts begin, in seconds.
+            t0: Time at which rollouts begin, in seconds.
             timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
         """
         times = t0 + self.sample_times()

@@ -247,7 +247,7 @@ def test_an_exception_in_the_solvers_thread_reaches_ask_as_itself(name):
     assert solver.wants_gradient
     # No gradient is told, which only the solver's callback finds out.
     solver.tell([evaluation(p, SPHERE.cost) for p in solver.ask()])
-    with pytest.raises(SolverError, match="was told of no gradient"):
+    with pytest.raises(SolverError, match="needs the gradient of each evaluation"):
         solver.ask()
     assert solver.success is False
 

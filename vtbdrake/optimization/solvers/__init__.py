@@ -1,4 +1,4 @@
-"""Solvers of problem (18), behind one interface: ask for points, and be told how good they are."""
+"""Solvers of problem (18), with one interface: ask and tell."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def known_solvers() -> tuple[str, ...]:
 
 
 def solver_type(method: str | type[Solver]) -> type[Solver]:
-    """Return the class of a solver that is given by its name, or itself.
+    """Return the class of a solver that is given by its name or as a class.
 
     Raises:
         SolverError: There is no such solver.
@@ -70,12 +70,12 @@ def make_solver(
     Args:
         name: One of `known_solvers`, or a class of your own, derived from `Solver`.
         space: The parameters.
-        objectives: How many values an evaluation has.
-        constraints: How many violations an evaluation has.
+        objectives: Number of values of an evaluation.
+        constraints: Number of violations of an evaluation.
         seed: Seed of the solver's random numbers, in [0, 2^32).
         budget: The largest number of evaluations; None: until the solver converges, if it does.
         start: Where a local method starts; None: in the middle of the ranges.
-        options: Options of the solver, as its class says.
+        options: Options of the solver, see its class.
 
     Raises:
         SolverError: There is no such solver or option, or the solver cannot solve such a problem.

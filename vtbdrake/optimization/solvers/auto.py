@@ -37,12 +37,12 @@ class Auto(Solver):
     * whole and categorical parameters only, with no more combinations than the budget (256 without one), and one
       objective: a grid;
     * several objectives, or a categorical parameter: Bayesian optimization to the end;
-    * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most, and a local search from
-      its best point, for a third of what is left at most. Then CMA-ES from the best point; where less than ten
-      generations of it are left, what is left goes to Bayesian optimization instead;
+    * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most; a local search from its
+      best point, for at most a third of the remaining budget; then CMA-ES from the best point. If the budget left for
+      CMA-ES is less than ten generations, Bayesian optimization gets all of it;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
-    Bayesian optimization asks for 4 points at a time; with less than 100 evaluations in all, for fewer.
+    Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations.
 
     CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
@@ -223,10 +223,10 @@ class Auto(Solver):
         """Begin a method.
 
         Args:
-            method: Its name, for the user.
-            solver: Runs it.
-            generation: Points per generation of a method that may stall; None: it cannot.
-            limit: The number of points after which it ends.
+            method: Name of the method, for the user.
+            solver: The solver that runs it.
+            generation: Points per generation of a method that may stall; None if it cannot.
+            limit: The number of points after which the method ends.
         """
         self._method = method
         self._held = None

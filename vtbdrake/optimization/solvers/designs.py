@@ -21,7 +21,7 @@ class Design(Solver):
     Args:
         search: What is searched.
         name: Name in the catalogue.
-        as_budgeted: Whether it goes on until the budget is spent; otherwise it ends with its points.
+        as_budgeted: Whether the design goes on until the budget is spent; otherwise it ends with its points.
     """
 
     takes_start = False
@@ -202,7 +202,7 @@ def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
 
 
 def _fair_count(search: Search) -> int:
-    """Return how many values each continuous parameter has if the user names no number."""
+    """Return the default number of values of each continuous parameter."""
     if search.budget is None:
         return 11
     continuous = sum(parameter.is_continuous for parameter in search.space)

@@ -35,17 +35,17 @@ from vtbdrake.optimization.solvers.solver import Search, SolverError
 class Algorithm(NamedTuple):
     """The properties of an algorithm of NLopt."""
 
-    # It takes constraints. LD_MMA takes them too, and so does LD_AUGLAG_EQ, which uses it inside; but on smooth
-    # functions of two variables under a linear constraint they report success far from the optimum.
+    # Whether the algorithm takes constraints. LD_MMA, and LD_AUGLAG_EQ, which uses it, would take them, but report
+    # success far from the optimum on smooth functions of two variables under a linear constraint.
     constraints: bool = False
-    # It needs at least two parameters: PRAXIS circles on one, and NEWUOA refuses it.
+    # Whether it needs at least two parameters: PRAXIS does not end with one, and NEWUOA refuses one.
     several: bool = False
-    # NLopt seeds its random numbers from the clock, and Drake cannot seed them.
+    # Whether its random numbers are seeded from the clock: Drake cannot seed those of NLopt.
     clock: bool = False
-    # It ends at a number of evaluations only, and reports success there.
+    # Whether it ends only at a number of evaluations, and reports success there.
     until_limit: bool = False
-    # It does not survive an exception in its callback: it never ends, or crashes the process. Once closed, it gets
-    # the same value everywhere instead, and runs to its end or to its limit of calls: the budget, or `LIMIT`.
+    # Whether it does not survive an exception in its callback: it never ends, or crashes the process. Once closed, it
+    # gets the same value everywhere instead, and runs to its end or to its limit of calls: the budget, or `LIMIT`.
     fragile: bool = False
 
 
@@ -116,8 +116,8 @@ class ProgramSolver(BlockingSolver):
     The result is the best point evaluated, not the x that the solver returns. ``success`` is True only if the solver
     converged by its own criterion, at a point whose simulation did not fail.
 
-    The constraints are tightened by twice ``feasibility``, the tolerance to which the solver keeps them: so the optimum
-    keeps them exactly.
+    The constraints are tightened by twice ``feasibility``, the tolerance to which the solver keeps them, so that the
+    optimum keeps them exactly.
 
     Args:
         search: Continuous parameters, one objective.
@@ -128,7 +128,7 @@ class ProgramSolver(BlockingSolver):
         step: Step of the differences, as a part of each parameter's range; by default 1e-5 (central) or 1e-7 (forward).
             At an end of the range they are taken inwards. Where a neighbour's simulation fails, the derivative in its
             direction counts as 0.
-        tolerance: Of convergence, in the solver's own sense (optimality of SNOPT and IPOPT, change of x in NLopt).
+        tolerance: Tolerance of convergence (optimality in SNOPT and IPOPT, change of x in NLopt).
         feasibility: Tolerance of the constraints, in their units.
         solver_options: Further options of the solver, by its own names.
     """
@@ -255,7 +255,7 @@ class ProgramSolver(BlockingSolver):
             return derivatives
         if self.wants_gradient:
             if evaluation.gradient is None:
-                raise SolverError(f"{self.name} was told of no gradient; choose gradient='central'")
+                raise SolverError(f"{self.name} needs the gradient of each evaluation; choose gradient='central'")
             derivatives[0] = -np.array(evaluation.gradient) * self.search.slope(evaluation.point)
             return derivatives
         values = np.concatenate([[cost], violations])

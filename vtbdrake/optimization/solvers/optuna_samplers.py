@@ -31,14 +31,14 @@ ONE_OBJECTIVE = frozenset({"QMC"})
 class OptunaSolver(Solver):
     """A sampler of Optuna: continuous, whole and categorical parameters, several objectives, constraints.
 
-    It asks until its budget is spent. A failed simulation is a failed trial, without a value. Points given by
-    hand are added to the study from which it learns.
+    The sampler asks until its budget is spent. A failed simulation is a failed trial, without a value. Points given by
+    hand are added to the study from which the sampler learns.
 
     Args:
         search: What is searched.
         name: Name in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
-        batch: How many points it asks for at a time; by default 4 for TPE, a population for NSGA, 1 for GP, 16 for QMC.
-            Another batch is another search.
+        batch: Number of points asked for at a time, on which the search depends; by default 4 for TPE, a population for
+            NSGA, 1 for GP, 16 for QMC.
         sampler_options: Further options of Optuna's sampler (``n_startup_trials``, ``population_size``, ...).
 
     Raises:

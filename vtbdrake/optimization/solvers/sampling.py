@@ -1,7 +1,7 @@
 """Sampling-based predictive control as solvers: predictive sampling, the cross-entropy method, MPPI.
 
-All three draw each batch from a normal distribution over the unit cube, N(mu, diag(sigma)^2), and move mu to where the
-points are good. They need few points per batch, no derivatives, and take noise and discontinuities.
+All three draw each batch from a normal distribution over the unit cube, N(mu, diag(sigma)^2), and move mu towards good
+points. They need few points per batch and no derivatives, and tolerate noise and discontinuities.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vtbdrake.optimization.solvers.solver import (
 class SamplingSolver(Solver):
     """A normal distribution over the unit cube, from which each batch is drawn; the first point of a batch is mu.
 
-    A batch does not depend on the budget: a larger one continues the same sequence. It ends with the budget only.
+    The batches do not depend on the budget: a larger budget continues the same sequence. Only the budget ends it.
 
     Args:
         search: n numbers, one objective; mu begins at its start.
@@ -71,7 +71,7 @@ class SamplingSolver(Solver):
 
         Args:
             U: The batch in the unit cube, shape (N, n).
-            evaluations: Those of the batch, N; at least one did not fail.
+            evaluations: The N evaluations of the batch, of which at least one did not fail.
         """
 
 
@@ -84,7 +84,7 @@ class PredictiveSampling(SamplingSolver):
         search: See `SamplingSolver`.
         name: See `SamplingSolver`.
         population: See `SamplingSolver`.
-        sigma: See `SamplingSolver`; it stays the same.
+        sigma: See `SamplingSolver`; constant.
 
     Howell, T. et al. (2022): Predictive Sampling: Real-time Behaviour Synthesis with MuJoCo, arXiv:2212.00541.
     """
@@ -114,7 +114,7 @@ class Cem(SamplingSolver):
         population: See `SamplingSolver`.
         sigma: The first standard deviation, as a part of the ranges.
         elites: The part K / N of a batch that is elite, in (0, 1]; at least 2 points.
-        smoothing: A, in (0, 1]; less is slower and more careful.
+        smoothing: The weight a, in (0, 1]; with a smaller one the distribution adapts more slowly.
         sigma_min: The least standard deviation, as a part of the ranges.
 
     Rubinstein, R. Y. and Kroese, D. P. (2004): The Cross-Entropy Method, Springer. Kobilarov, M. (2012): Cross-entropy
@@ -171,8 +171,9 @@ class Mppi(SamplingSolver):
         search: See `SamplingSolver`.
         name: See `SamplingSolver`.
         population: See `SamplingSolver`.
-        sigma: See `SamplingSolver`; it stays the same.
-        temperature: Lambda, in standard deviations of the batch's costs; above 0. Towards 0 only the best point counts.
+        sigma: See `SamplingSolver`; constant.
+        temperature: Temperature lambda, in standard deviations of the batch's costs; above 0. Towards 0 only the best
+            point counts.
 
     Williams, G. et al. (2017): Information theoretic MPC for model-based reinforcement learning, ICRA.
     """

@@ -23,7 +23,7 @@ SEEDS = 2**32
 
 
 class SolverError(ValueError):
-    """A solver that is unknown, or cannot solve the problem."""
+    """A solver is unknown, or cannot solve the problem."""
 
 
 class PointValues:
@@ -118,8 +118,8 @@ class Search:
 
     Attributes:
         space: The n parameters.
-        objectives: How many values an evaluation has.
-        constraints: How many violations an evaluation has.
+        objectives: Number of values of an evaluation.
+        constraints: Number of violations of an evaluation.
         seed: Seed of all random numbers, in [0, 2^32).
         budget: The number of evaluations that may be asked for; None: as many as the method needs.
         start: Where a local method starts; None: in the middle of the ranges.
@@ -164,7 +164,7 @@ class Search:
         return tuple(parameter.from_unit(x) for parameter, x in zip(self.space, u, strict=True))
 
     def unit(self, point: Point) -> np.ndarray:
-        """Return the place of a point in the unit cube, shape (n,)."""
+        """Return a point in the coordinates of the unit cube, shape (n,)."""
         return np.array([parameter.to_unit(value) for parameter, value in zip(self.space, point, strict=True)])
 
     def start_unit(self) -> np.ndarray:
@@ -192,19 +192,19 @@ class Search:
         no_start: bool = False,
         several: bool = False,
     ) -> None:
-        """Check that a method can do this search.
+        """Check that a method can perform this search.
 
         Args:
             name: The method's name, for the message.
-            continuous: It needs continuous parameters.
-            ordered: It needs numbers, continuous or whole.
-            one_objective: It takes one objective only.
-            no_constraints: It takes no constraints.
-            no_start: It does not start at a point.
-            several: It needs at least two parameters.
+            continuous: Whether the method needs continuous parameters.
+            ordered: Whether it needs numbers, continuous or whole.
+            one_objective: Whether it takes one objective only.
+            no_constraints: Whether it takes no constraints.
+            no_start: Whether it does not start at a point.
+            several: Whether it needs at least two parameters.
 
         Raises:
-            SolverError: Names what the method cannot do, and a solver that can.
+            SolverError: The method cannot; the message names a solver that can.
         """
         for parameter in self.space:
             if isinstance(parameter, Choice) and (continuous or ordered):
@@ -240,13 +240,13 @@ class Solver(ABC):
     A subclass implements `_next` and `_learn`.
 
     Attributes:
-        name: As the catalogue spells it.
-        search: What is searched.
-        wants_gradient: Whether `Evaluation.gradient` is to be filled.
-        takes_start: Whether it starts at a point (`Search.start`).
+        name: Name in the catalogue.
+        search: The search to perform.
+        wants_gradient: Whether the solver needs `Evaluation.gradient`.
+        takes_start: Whether the solver starts at a point (`Search.start`).
         reproducible: False for the few algorithms whose library seeds its random numbers from the clock.
-        success: Whether it ended by its own criterion (converged, or its design is complete); None while it works.
-        message: How it ended, in its own words.
+        success: Whether the solver ended by its own criterion (converged, or its design is complete); None before.
+        message: How the solver ended.
     """
 
     wants_gradient: bool = False
@@ -296,7 +296,7 @@ class Solver(ABC):
         """Return the points to be evaluated next; an empty list when the solver has ended.
 
         Raises:
-            SolverError: The solver was not told yet of the points that it asked for before.
+            SolverError: The evaluations of the points asked for before have not been told yet.
             Exception: Any error of the method.
         """
         if self._asked:
@@ -316,8 +316,8 @@ class Solver(ABC):
     def tell(self, evaluations: Sequence[Evaluation]) -> None:
         """Tell the evaluations of the last batch, in its order, and after them any of points given by hand.
 
-        Points given by hand may also be told by themselves, before any `ask`. TPE and its kin learn from them, and so
-        does `auto` when it begins a new method; local methods, designs and CMA-ES ignore them.
+        Points given by hand may also be told alone, before any `ask`. Bayesian optimization and Optuna's samplers learn
+        from them, and so does `auto` when it begins a new method; local methods, designs and CMA-ES ignore them.
 
         Raises:
             SolverError: The batch is incomplete or in another order, or has another number of values or violations than
@@ -346,7 +346,7 @@ class Solver(ABC):
             self._learn(told, given)
 
     def close(self) -> None:
-        """Release what the solver holds; it is not asked again."""
+        """Release the resources of the solver; called after the last `ask`."""
         return
 
 
