@@ -149,6 +149,15 @@ def test_memory_of_a_late_result_is_used_next(gate):
         assert np.array_equal(real.read("estimate"), estimate)
 
 
+def test_missed_results_are_logged_once_per_second(gate, caplog):
+    with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
+        real.run(round(1.5 / PERIOD))
+    messages = [record.getMessage() for record in caplog.records if "no result within" in record.getMessage()]
+    assert len(messages) == 2 and all(f"the slow part {PATH} has no result" in message for message in messages)
+    assert "missed so far: 1)" in messages[0]
+    assert f"{real.counts.missed} missed" in str(real.counts)
+
+
 def test_loop_does_not_wait_for_a_function_that_hangs(gate):
     with loop(function=partial(gated, gate=str(gate)), more={"memory": np.zeros(2), "patience": 20.0}) as real:
         real.run(100)

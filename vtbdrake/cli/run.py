@@ -114,6 +114,8 @@ def run(
     except (BridgeError, RunawayError) as error:
         raise FailedError(one_line(error)) from error
     click.echo(runtime.statistics)
+    for path, counts in runtime.slow_parts.statistics.items():
+        click.echo(f"slow part {path}: {counts}")
     try:
         if statistics is not None:
             write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())

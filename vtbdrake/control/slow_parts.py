@@ -7,6 +7,7 @@ import select
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 from pydrake.systems.framework import Context
@@ -23,6 +24,7 @@ _log = logging.getLogger(__name__)
 
 # Relative to a period: the end of a step is a sum of floating-point numbers, and a result may be due just then.
 _ROUNDING = 1e-6
+_LOG_PERIOD = 1.0  # s, for messages that could be logged with every sample
 
 
 @dataclass
@@ -36,6 +38,12 @@ class SlowStatistics:
     restarts: int = 0  # the number of times its worker was replaced, because it died or did not answer
     # the times from a request to its answer, in seconds on the loop's clock
     took: Histogram = field(default_factory=Histogram)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.results} results in time, {self.missed} missed, {self.late} late, {self.errors} errors, "
+            f"{self.restarts} restarts"
+        )
 
 
 class SlowParts:
@@ -136,6 +144,7 @@ class _Part:
         self._requested_at = 0.0
         self._ready = False
         self._last_failure = ""
+        self._logged_missed = -inf
         self._answers: list[bytes] = []
         name = f"the supervisor of the slow part {path}"
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
@@ -144,8 +153,16 @@ class _Part:
         answers, self._answers = self._answers + self._supervisor.take(), []
         for answer in answers:
             self._handle(*unpack(answer))
-        for tick in [tick for tick in self._waiting if self._part.due(tick) <= end]:
+        overdue = [tick for tick in self._waiting if self._part.due(tick) <= end]
+        for tick in overdue:
             self._miss(tick)
+        if overdue and self._clock.now() - self._logged_missed >= _LOG_PERIOD:
+            self._logged_missed = self._clock.now()
+            reason = "" if self._ready else ": its process is not ready yet"
+            _log.warning(
+                "the slow part %s has no result within its latency of %g s%s (missed so far: %d)",
+                *(self.path, self._part.latency, reason, self.statistics.missed),
+            )
 
     def _handle(self, kind: str, content: Any) -> None:
         self._ready = kind != LOST
