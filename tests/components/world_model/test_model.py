@@ -60,6 +60,42 @@ def test_region_in_space_and_in_the_plane(stand: WorldModel) -> None:
     assert len(stand.find(box=([10.0, 20.0], [30.0, 50.0]))) == inside.sum() > 0
 
 
+SQUARE = [(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)]
+POLYGONS = {
+    "concave": [[(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (7.0, 10.0), (7.0, 3.0), (3.0, 3.0), (3.0, 10.0), (0.0, 10.0)]],
+    "star": [[(5.0 + r * np.cos(k * np.pi / 5), 5.0 + r * np.sin(k * np.pi / 5)) for k, r in enumerate([2, 5] * 5)]],
+    "hole": [SQUARE, [(3.0, 3.0), (7.0, 3.0), (7.0, 7.0), (3.0, 7.0)]],
+    "hole that touches the outline": [SQUARE, [(0.0, 5.0), (4.0, 3.0), (4.0, 7.0)]],
+    "ends with its first corner": [[*SQUARE, SQUARE[0]]],
+}
+
+
+@pytest.mark.parametrize("rings", POLYGONS.values(), ids=POLYGONS)
+def test_polygons_agree_with_shapely(rings: list[list[tuple[float, float]]]) -> None:
+    shapely = pytest.importorskip("shapely")
+    # Places anywhere, and on corners and edges.
+    corners = [[x, y] for x in range(-1, 12) for y in range(-1, 12)]
+    places = np.vstack([np.random.default_rng(5).uniform(-1.0, 11.0, (300, 2)), corners])
+    model = WorldModel(
+        WorldObject(str(k), "tree", position_estimate([*place, 0.0])) for k, place in enumerate(places.tolist())
+    )
+    area = shapely.Polygon(rings[0], rings[1:])
+    expected = [str(k) for k in np.flatnonzero(shapely.distance(area, shapely.points(places)) <= 1e-9)]
+    assert [one.identity for one in model.find(polygon=rings)] == expected
+    assert 50 < len(expected) < len(places) - 50
+
+
+def test_regions_together_and_without_objects(stand: WorldModel) -> None:
+    triangle = [(0.0, 0.0), (60.0, 0.0), (0.0, 60.0)]
+    both = stand.find(near=([10.0, 10.0], 20.0), box=([10.0, 0.0], [100.0, 100.0]), polygon=[triangle])
+    x, y = stand.positions()[:, :2].T
+    expected = (np.hypot(x - 10.0, y - 10.0) <= 20.0) & (x >= 10.0) & (x + y <= 60.0)
+    assert [one.identity for one in both] == [tuple(stand)[k].identity for k in np.flatnonzero(expected)]
+    for model in (WorldModel(), stand):
+        assert model.find(polygon=[[(200.0, 0.0), (300.0, 0.0), (300.0, 9.0)]]) == () == model.find(polygon=[])
+        assert model.find(box=([200.0, 0.0], [300.0, 9.0])) == ()
+
+
 def test_nearest_objects_come_first(stand: WorldModel) -> None:
     distances = np.linalg.norm(stand.positions() - [20.0, 20.0, 0.0], axis=1)
     order = [tuple(stand)[row].identity for row in np.argsort(distances)[:5]]
@@ -176,6 +212,9 @@ def test_what_is_no_object_is_refused(make: object, message: str) -> None:
 def test_status_and_deviation_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="a status is one of tentative, confirmed, revised, retired, not 'confirmd'"):
         WorldModel().find(status="confirmd")
+    for rings in (SQUARE, [SQUARE[:2]], [[(0.0, 0.0), (1.0, np.nan), (1.0, 1.0)]]):
+        with pytest.raises(ValueError, match="a list of rings of at least 3 corners"):
+            WorldModel().find(polygon=rings)
     with pytest.raises(ValueError, match=r"at least 0 m, not -0\.1"):
         position_estimate(np.zeros(3), deviation=-0.1)
 

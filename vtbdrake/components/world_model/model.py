@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,17 @@ from vtbdrake.components.world_model.objects import STATUSES, Quantity, Relation
 from vtbdrake.state.declarations import Codec
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+# What is nearer to the outline of a polygon than this, in m, lies on it.
+_ON_OUTLINE = 1e-9
+
+
+class _Index(NamedTuple):
+    """All objects in their order, and the k-d trees of their positions by the number of coordinates."""
+
+    objects: tuple[WorldObject, ...]
+    trees: dict[int, Any]
 
 
 class WorldModel:
@@ -49,7 +60,7 @@ class WorldModel:
                         f"{one.identity} {relation.kind} {relation.other!r}, which is not an object of the model"
                     )
         self._created = created
-        self._index: Any = None
+        self._index: _Index | None = None
 
     @property
     def created(self) -> int:
@@ -92,9 +103,10 @@ class WorldModel:
         status: str | Iterable[str] | None = None,
         near: tuple[ArrayLike, float] | None = None,
         box: tuple[ArrayLike, ArrayLike] | None = None,
+        polygon: Sequence[ArrayLike] | None = None,
         attributes: Mapping[str, str | tuple[float, float]] | None = None,
     ) -> tuple[WorldObject, ...]:
-        """Return the objects that meet all given conditions.
+        """Return the objects that meet all given conditions; the borders of regions belong to them.
 
         Args:
             kind: Their class.
@@ -102,20 +114,24 @@ class WorldModel:
             near: A point and a distance in m, which is the largest; the point has the shape (2,) or (3,), and the
                 distance is horizontal or in space.
             box: The least and the largest coordinates in m, shapes (2,) or (3,).
+            polygon: An area in the plane as its rings, shapes (n, 2) in m: the outline, then the holes, as the
+                coordinates of a Polygon in GeoJSON. A ring may end with its first corner, or before.
             attributes: By name, the text that an attribute is, or the least and the largest value of its number.
                 Objects without the attribute do not meet the condition.
 
         Raises:
-            ValueError: A point, a box, a status or the condition of an attribute is not one.
+            ValueError: A point, a box, a polygon, a status or the condition of an attribute is not one.
         """
         chosen: Iterable[WorldObject] = self
-        if near is not None:
-            chosen = self._near(*near)
-        if box is not None:
-            low, high = (np.asarray(corner, dtype=float) for corner in box)
-            if low.shape != high.shape or low.shape not in ((2,), (3,)) or not (low <= high).all():
-                raise ValueError(f"a box is its least and its largest coordinates, (2,) or (3,), not {box!r}")
-            chosen = [one for one in chosen if _inside(one.pose.matrix[: low.size, 3], low, high)]
+        if near is not None or box is not None or polygon is not None:
+            index = self._indexed()
+            places = index.trees[3].data
+            rows = np.arange(len(places)) if near is None else self._near(*near)
+            if box is not None:
+                rows = rows[_in_box(places[rows], *box)]
+            if polygon is not None:
+                rows = rows[_in_polygon(places[rows, :2], polygon)]
+            chosen = [index.objects[row] for row in rows]
         statuses = (status,) if isinstance(status, str) else None if status is None else tuple(status)
         for one_status in statuses or ():
             if one_status not in STATUSES:
@@ -134,9 +150,9 @@ class WorldModel:
         count = min(count, len(self))
         if count < 1:
             return ()
-        _, rows = self._tree(3).query(_point(p_WoQ_W, 3), k=count)
-        objects = tuple(self)
-        return tuple(objects[row] for row in np.atleast_1d(rows))
+        index = self._indexed()
+        _, rows = index.trees[3].query(_point(p_WoQ_W, 3), k=count)
+        return tuple(index.objects[row] for row in np.atleast_1d(rows))
 
     def related(self, identity: str, kind: str | None = None) -> tuple[WorldObject, ...]:
         """Return the objects to which an object has a relation (of ``kind``, if given)."""
@@ -169,24 +185,22 @@ class WorldModel:
         left = [one for one in self if one.identity not in gone]
         return WorldModel((_cut(one, gone) for one in left), created=self._created)
 
-    def _near(self, point: ArrayLike, distance: float) -> list[WorldObject]:
+    def _near(self, point: ArrayLike, distance: float) -> Rows:
+        """Return the objects within a distance of a point, by row."""
         size = np.size(point)
         if size not in (2, 3) or not distance >= 0.0:
             raise ValueError(f"near is a point (2,) or (3,) and a distance of at least 0 m, not {(point, distance)!r}")
-        if not self._objects:
-            return []
-        objects = tuple(self)
-        return [objects[row] for row in sorted(self._tree(size).query_ball_point(_point(point, size), distance))]
+        tree = self._indexed().trees[size]
+        return np.array(sorted(tree.query_ball_point(_point(point, size), distance)), dtype=np.intp)
 
-    def _tree(self, size: int) -> Any:
-        """Return the k-d tree of the first ``size`` coordinates."""
+    def _indexed(self) -> _Index:
         if self._index is None:
             from scipy.spatial import cKDTree
 
-            # Both are made at once and assigned in one step: other threads see either none or all.
+            # All is made at once and assigned in one step: other threads see either nothing or everything.
             positions = self.positions()
-            self._index = {2: cKDTree(positions[:, :2]), 3: cKDTree(positions)}
-        return self._index[size]
+            self._index = _Index(tuple(self), {2: cKDTree(positions[:, :2]), 3: cKDTree(positions)})
+        return self._index
 
 
 def _cut(one: WorldObject, gone: set[str]) -> WorldObject:
@@ -202,8 +216,35 @@ def _point(point: ArrayLike, size: int) -> Array:
     return array
 
 
-def _inside(point: Array, low: Array, high: Array) -> bool:
-    return bool((low <= point).all() and (point <= high).all())
+def _in_box(places: Array, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+    """Return which places (n, 3) lie within the least and the largest coordinates, (2,) or (3,)."""
+    least, largest = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    if least.shape != largest.shape or least.shape not in ((2,), (3,)) or not (least <= largest).all():
+        raise ValueError(f"a box is its least and its largest coordinates, (2,) or (3,), not {(low, high)!r}")
+    places = places[:, : least.size]
+    inside: NDArray[np.bool_] = np.all((least <= places) & (places <= largest), axis=1)
+    return inside
+
+
+def _in_polygon(places: Array, rings: Sequence[ArrayLike]) -> NDArray[np.bool_]:
+    """Return which places (n, 2) lie within rings (k, 2), or on them.
+
+    A place is inside if a ray from it along x crosses the rings an odd number of times: holes need no direction.
+    """
+    inside, on = np.zeros((2, len(places)), dtype=bool)
+    x, y = places.T
+    for ring in rings:
+        corners = np.asarray(ring, dtype=float)
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
+            raise ValueError(f"a polygon is a list of rings of at least 3 corners, (n, 2) in m, not {rings!r}")
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            side = b - a
+            length2 = max(float(side @ side), 1e-300)
+            nearest = a + np.clip((places - a) @ side / length2, 0.0, 1.0)[:, np.newaxis] * side
+            on |= np.hypot(*(places - nearest).T) <= _ON_OUTLINE
+            if a[1] != b[1]:
+                inside ^= ((a[1] > y) != (b[1] > y)) & (x < a[0] + (y - a[1]) / side[1] * side[0])
+    return inside | on
 
 
 def _condition(name: str, wanted: str | tuple[float, float]) -> str | tuple[float, float]:
