@@ -43,7 +43,9 @@ class Scene:
     ellipsoids: Array = field(default_factory=lambda: np.zeros((0, 7)))
     height: Callable[[Array], Array] = flat
 
-    def scan(self, eye: Array, *, noise: float = 0.0, turn: float = 0.0, seed: int = 0) -> tuple[Array, Array]:
+    def scan(
+        self, eye: Array, *, noise: float = 0.0, turn: float = 0.0, seed: int = 0, rows: int = 16
+    ) -> tuple[Array, Array]:
         """Return the points that are hit, (n, 3), and by which trunk (k and above: an ellipsoid; -1: the ground), (n,).
 
         Args:
@@ -51,9 +53,10 @@ class Scene:
             noise: Standard deviation of the ranges in m.
             turn: By what the rays are turned about z, in rad.
             seed: Of the noise.
+            rows: How many rows of rays there are.
         """
         c, s = np.cos(turn), np.sin(turn)
-        rays = raster() @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        rays = raster(rows) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         ranges, hit = self._ground(eye, rays), np.full(len(rays), -1)
         leans = np.zeros_like(self.places) if self.leans is None else self.leans
         shapes = [

@@ -68,6 +68,21 @@ def test_round_rocks_are_where_they_lie():
     assert np.median(errors) < 0.1
 
 
+@pytest.mark.parametrize("away", [6.0, 9.0, 13.0])
+def test_low_rounded_tops_do_not_displace_the_middle(away):
+    # Many rows meet a near rock, few a far one: the error must not depend on it.
+    bearings = 2.0 * np.pi * np.arange(16) / 16
+    places = EYE[:2] + away * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    shapes = np.tile([0.0, 0.4, 0.4, 0.4, 0.0], (16, 1))
+    scene = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.column_stack([places, shapes]))
+    points, _ = scene.scan(EYE, rows=64)
+    rocks = detect_rocks(points, RockDetector(elevation_step=np.pi / 6 / 64), p_HoLo_H=EYE)
+    which, truth = pairs(rocks.positions, places, within=0.3)
+    assert len(which) == 16
+    too_far = np.hypot(*(rocks.positions[which] - EYE[:2]).T) - away
+    assert np.abs(too_far).mean() < 0.03
+
+
 def test_small_rocks_are_found_on_even_ground():
     scene = plain(2, count=20, height=flat)
     # Half a metre wide, and a hand's breadth over the ground.

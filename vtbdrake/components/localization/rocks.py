@@ -1,11 +1,12 @@
 """Rocks on a plain from the points of one scan: where their middles are, and how wide they are.
 
 A rock is a cluster of points that stands out of the ground, bulges towards the scanner as a circle does, and ends on
-both sides where nothing nearer hides it. A scan shows only the side that faces the scanner. If its outline is taken for
-a circle of the diameter w that is seen, its points lie w pi / 8 in front of its middle on average. Rocks are no
-circles: their outlines are taken to be longer or shorter in the other direction by a share of w, which gives most of
-the covariance. And what the rows of rays meet may be little more than the top, so that a rock may be wider on the
-ground by about the distance of two rows.
+both sides where nothing nearer hides it. A scan shows only the side that faces the scanner. If each row of rays meets
+half a circle, the points of a row that is w wide lie w pi / 8 in front of the middle on average, and the variance of
+their places across the view is w^2 / 12. A rock is narrower towards its top, so its widest row would place its middle
+too far: the variance over all points tells how wide their rows are. Rocks are no circles: their outlines are taken to
+be longer or shorter in the other direction by a share of the width, which gives most of the covariance. And what the
+rows meet may be little more than the top, so that a rock may be wider on the ground by about the distance of two rows.
 """
 
 from __future__ import annotations
@@ -95,7 +96,11 @@ def _outlines(clusters: Clusters, detector: RockDetector, origin: Array) -> Land
     # The edges are half a step beyond the outer rays. The sine is radius / distance of the middle.
     sine = np.sin(np.minimum(0.5 * (left - right + step), 1.0))
     radius = mean * sine / (1.0 - 0.25 * pi * sine)
-    width, distance = 2.0 * radius, mean + 0.25 * pi * radius
+    lateral = clusters.distances * clusters.azimuths
+    centred = lateral - (clusters.sums(lateral) / clusters.counts)[clusters.owners]
+    # Each ray stands for a step. The radius of the rows is sqrt(3) times the deviation.
+    variance = clusters.sums(centred**2) / clusters.counts + (step * mean) ** 2 / 12.0
+    width, distance = 2.0 * radius, mean + 0.25 * pi * np.sqrt(3.0 * variance)
     hidden = clusters.hidden_edges(detector, gap=detector.cell + 4.0 * detector.range_noise)
     good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1)
     good &= (width >= detector.least_width) & (width <= detector.largest_width)
