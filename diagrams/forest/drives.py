@@ -3,7 +3,7 @@
 ``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each forest
 once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
 map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the scanner,
-``--simulated`` takes simulated detections (`detections`).
+``--simulated`` takes simulated detections (`detections`), ``--plain`` drives among rocks instead of trees.
 
 What counts, fixed before any of the forests from `SEED` on was driven:
 
@@ -18,10 +18,11 @@ What counts, fixed before any of the forests from `SEED` on was driven:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +38,7 @@ from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUn
 from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.perception import SETTLED
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
 Array = NDArray[np.float64]
@@ -57,6 +58,15 @@ SCANS = 5.0
 """The number of scans per second."""
 DENSITIES = (605.0, 1210.0)
 """The numbers of trees per hectare of the plots that `stand` cites, before roads are cleared."""
+ABUNDANCES = (0.03, 0.1)
+"""The shares of the ground that rocks cover: InSight's to twice Spirit's, see `vtbdrake_diagrams.forest.plain`."""
+SOURCES = {
+    "scanner": "a scanner in a forest (the default)",
+    "stereo": "a pair of cameras instead of a scanner",
+    "simulated": "simulated detections instead of a scanner",
+    "plain": "a scanner on a plain with rocks, instead of a forest",
+}
+"""What units localize by, and what it is."""
 SEED = 600_000
 """The seed of the first forest. No constant of the localization may be chosen by forests from this seed on.
 
@@ -321,16 +331,19 @@ def least_error(errors: MapErrors, places: Array, *, noise: float = 0.02) -> flo
     return float(np.sqrt(2.0 / np.linalg.solve(C, np.ones(len(places))).sum()))
 
 
-def least_error_along(drives: Mapping[int, Drive], errors: MapErrors) -> float:
-    """Return the RMS of `least_error` over drives, by the trees within `REACH` of each; no map lacks any of them.
+def least_error_along(
+    drives: Mapping[int, Drive], errors: MapErrors, *, scenario: Callable[[int], CarrierScenario] | None = None
+) -> float:
+    """Return the RMS of `least_error` over drives, by the landmarks within `REACH` of each; no map lacks any of them.
 
     Args:
-        drives: By the seed of the forest.
+        drives: By the seed of the scenario.
         errors: Those of the map.
+        scenario: Returns the scenario of a seed; by default that of `forest`.
     """
     least = []
     for seed, drive in drives.items():
-        places = forest(seed).truth().positions()[:, :2]
+        places = (scenario or forest)(seed).truth().positions()[:, :2]
         near = cKDTree(drive.truth[:, :2]).query(places)[0] < REACH
         least.append(least_error(errors, places[near]))
     return _rms(least)
@@ -411,8 +424,24 @@ def forest(seed: int, *, range_bias: float = 0.0, perception: str = "scanner") -
     )
     scenario.scanner_errors.bias = range_bias
     scenario.stereo.seed = seed
+    return _begun(scenario, rng)
+
+
+def plain(seed: int, *, range_bias: float = 0.0) -> PlainScenario:
+    """Return the scenario of a drive among rocks, of an abundance within `ABUNDANCES`; see `forest`."""
+    rng = np.random.default_rng([seed, 9])
+    scenario = PlainScenario(seed=seed, abundance=float(rng.uniform(*ABUNDANCES)))
+    scenario.scanner_errors.bias = range_bias
+    return _begun(scenario, rng)
+
+
+_Carrier = TypeVar("_Carrier", bound=CarrierScenario)
+
+
+def _begun(scenario: _Carrier, rng: np.random.Generator) -> _Carrier:
+    """Return the scenario with noise of its own, at a random place on a random route."""
     for errors in (scenario.scanner_errors, scenario.imu_errors, scenario.odometry_errors):
-        errors.seed = seed
+        errors.seed = scenario.seed
     routes = scenario.routes()
     number = int(rng.integers(len(routes)))
     return replace(scenario, route=number, start=float(rng.uniform(0.0, routes[number].length)))
@@ -425,23 +454,27 @@ class Drives:
     Attributes:
         length: Of each, in m.
         range_bias: Of the scanner, in m.
-        is_simulated: Whether detections are simulated, instead of the scanner.
-        perception: What the carrier sees with, if they are not: ``scanner`` or ``stereo``.
+        source: What the unit localizes by, one of `SOURCES`.
     """
 
     length: float = 50.0
     range_bias: float = 0.0
-    is_simulated: bool = False
-    perception: str = "scanner"
+    source: str = "scanner"
+
+    def scenario(self, seed: int) -> CarrierScenario:
+        """Return the scenario of a seed."""
+        if self.source == "plain":
+            return plain(seed, range_bias=self.range_bias)
+        return forest(seed, range_bias=self.range_bias, perception="stereo" if self.source == "stereo" else "scanner")
 
     def __call__(self, seed: int) -> dict[str, Track]:
-        """Return what units with each of the maps say in the forest of a seed."""
-        scenario = forest(seed, range_bias=self.range_bias, perception=self.perception)
+        """Return what units with each of the maps say in the scenario of a seed."""
+        scenario = self.scenario(seed)
         # One thread: matrices are small, and threads that wait for each other take most of the time.
         with threadpool_limits(1):
-            if self.is_simulated:
+            if self.source == "simulated":
                 detector = Detector(range_bias=self.range_bias)
-                drive = simulated_drive(scenario.stand(), seed=seed, length=self.length, detector=detector)
+                drive = simulated_drive(forest(seed).stand(), seed=seed, length=self.length, detector=detector)
             else:
                 drive = recorded_drive(scenario, length=self.length)
             surveys = {name: replace(scenario, map=name) for name in GOALS}
@@ -465,30 +498,31 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--bias", type=float, default=0.0, help="of the scanner's ranges, in m")
     parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
+    parser.set_defaults(source="scanner")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--simulated", action="store_true", help="simulated detections instead of a scanner")
-    source.add_argument("--stereo", action="store_true", help="a pair of cameras instead of a scanner")
+    for name, told in SOURCES.items():
+        source.add_argument(f"--{name}", dest="source", action="store_const", const=name, help=told)
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    if chosen.stereo and chosen.bias:
+    if chosen.source == "stereo" and chosen.bias:
         parser.error("--bias is one of the scanner's ranges: leave it out with --stereo")
-    perception = "stereo" if chosen.stereo else "scanner"
-    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.simulated, perception)
+    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.source)
     found, seeds = [], range(chosen.seed, chosen.seed + chosen.forests)
     for tracks in drives.through(seeds, workers=chosen.workers):
         found.append(tracks)
         told = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
-        print(f"forest {len(found)}: {told}", flush=True)
+        print(f"drive {len(found)}: {told}", flush=True)
     results = scores(found)
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
-    print(f"{len(found)} forests, {path:.0f} m of path, range bias {chosen.bias:g} m")
+    print(f"{len(found)} drives, {path:.0f} m of path, range bias {chosen.bias:g} m")
     tilts = np.concatenate([one["poor"].drive.tilts for one in found])
     if len(tilts):
         roll, pitch = (1e3 * _rms(errors) for errors in tilts.T)
         print(f"the vertical is off by {roll:.1f} mrad in roll and {pitch:.1f} mrad in pitch (RMS)")
-    least = least_error_along({seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}, MAPS["poor"])
-    print(f"least error of an unbiased estimate on a poor map, by all trees within {REACH:g} m: {least:.2f} m")
+    driven = {seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}
+    least = least_error_along(driven, MAPS["poor"], scenario=drives.scenario)
+    print(f"least error of an unbiased estimate on a poor map, by all landmarks within {REACH:g} m: {least:.2f} m")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Tests of the scores of drives, with errors that are drawn from the covariances that are claimed."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +11,20 @@ from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.drives import (
     GOALS,
+    SOURCES,
     STANDING,
     Drive,
+    Drives,
     Track,
     forest,
     localize,
     nees_bounds,
+    plain,
     recorded_drive,
     score,
     simulated_drive,
 )
-from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 from vtbdrake_diagrams.forest.stand import Stand
 
 pytestmark = pytest.mark.one_python
@@ -127,12 +131,24 @@ def test_recorded_cameras_see_trees_where_they_are() -> None:
     assert np.median(distances) < 0.4
 
 
-def test_forests_differ_and_are_reproducible() -> None:
-    one = forest(1)
-    assert one == forest(1) and one != forest(2)
-    assert {forest(seed).stand_kind for seed in range(3)} == {"natural", "clustered"}
+@pytest.mark.parametrize("world", [forest, plain])
+def test_worlds_differ_and_are_reproducible(world: Callable[..., CarrierScenario]) -> None:
+    one = world(1)
+    assert one == world(1) and one != world(2)
     # Nor do two drives share the noise of a sensor: their errors are independent.
     for name in ("scanner_errors", "imu_errors", "odometry_errors"):
-        assert getattr(one, name).seed != getattr(forest(2), name).seed
-    assert one.stereo.seed != forest(2).stereo.seed
-    assert forest(1, range_bias=0.02) == replace(one, scanner_errors=replace(one.scanner_errors, bias=0.02))
+        assert getattr(one, name).seed != getattr(world(2), name).seed
+    assert world(1, range_bias=0.02) == replace(one, scanner_errors=replace(one.scanner_errors, bias=0.02))
+
+
+def test_forests_are_of_both_kinds() -> None:
+    assert {forest(seed).stand_kind for seed in range(3)} == {"natural", "clustered"}
+    assert forest(1).stereo.seed != forest(2).stereo.seed
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_drives_lead_through_the_world_that_is_asked_for(source: str) -> None:
+    scenario = Drives(source=source, range_bias=0.01).scenario(4)
+    assert isinstance(scenario, PlainScenario if source == "plain" else ForestScenario)
+    assert getattr(scenario, "perception", "scanner") == ("stereo" if source == "stereo" else "scanner")
+    assert scenario.scanner_errors.bias == 0.01
