@@ -152,7 +152,7 @@ def test_a_resumed_study_goes_on_as_if_nothing_had_been(tmp_path, solver):
     path = tmp_path / "parts.db"
     first = pendulum_problem().study(path, solver=solver, seed=2)
     # As if it had been interrupted: the budget that the solver is made for is that of the run.
-    first._file.set("budget", 45)
+    first._file.begin_anew(budget=45, racing=False)
     first.run(rollouts=17, executor="serial", progress=False).close()
     with pendulum_problem().study(path) as second:
         assert second.run(rollouts=45, executor="threads", progress=False).reason == whole.reason
@@ -251,7 +251,7 @@ def test_a_killed_study_keeps_every_finished_rollout(tmp_path, executor):
         study.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
         resumed = table(study)
     whole = pendulum_problem().study(solver="cmaes", seed=3)
-    whole._file.set("budget", 100_000)
+    whole._file.begin_anew(budget=100_000, racing=False)
     whole.run(rollouts=counts[-1] + 20, executor="serial", progress=False)
     assert resumed == table(whole)
 
