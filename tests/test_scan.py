@@ -30,6 +30,10 @@ def test_arrays_cannot_be_changed_from_anywhere() -> None:
         made.ranges[0] = 5.0
 
 
+def test_scan_prints_on_one_line() -> None:
+    assert repr(scan(700)) == "Scan(700 returns, complete at 2 s)"
+
+
 def test_copies_share_the_scan() -> None:
     made = scan(3)
     assert copy.deepcopy(made) is made

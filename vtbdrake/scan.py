@@ -63,6 +63,9 @@ class Scan:
         """Return the measured points in L, each at its own firing time, in m, shape (n, 3)."""
         return self.ranges[:, np.newaxis] * self.directions_L
 
+    def __repr__(self) -> str:
+        return f"Scan({len(self.ranges)} returns, complete at {self.stamp:g} s)"
+
     def __deepcopy__(self, memo: object) -> Scan:
         return self
 

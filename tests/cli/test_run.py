@@ -242,7 +242,7 @@ def test_a_stopped_dps_goes_on_with_the_machine_back(hub: Hub) -> None:
         program.communicate(timeout=PATIENCE)
     assert refused.exit_code == 1
     assert "is stale" in refused.stderr
-    assert released.stdout.startswith("over: sensor signal position is stale")
+    assert released.stdout.startswith("this fault is over: sensor signal position is stale")
 
 
 def test_silent_machine_is_given_up(hub: Hub) -> None:

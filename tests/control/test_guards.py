@@ -228,6 +228,18 @@ def test_commands_after_reset_depart_from_fallback() -> None:
     assert loop.cycle({"torque": [2.0, 2.0]}).actuation["torque"] == pytest.approx([1.9, 1.9])
 
 
+def test_reset_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.cycle({}, error=RuntimeError("once"))
+    with caplog.at_level(logging.WARNING, logger="vtbdrake.control.guards"):
+        assert loop.reset() != ()
+        assert caplog.text == ""
+        loop.cycle({"torque": [0.0, 0.0]})
+        assert loop.reset() == loop.reset() == ()
+    assert caplog.text.count("the DPS commands again") == 1
+
+
 def test_fallback_continues_while_dps_raises() -> None:
     loop = Loop(TORQUE)
     for _ in range(3):

@@ -209,6 +209,12 @@ def test_inertia_of_nothing_is_refused(world):
         variables["plant.box.inertia"].set(context, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
+def test_one_string_is_no_sequence_of_addresses(world):
+    _, _, variables, context = world
+    with pytest.raises(ValueError, match="addresses are a sequence"):
+        variables.read(context, "plant.box.mass")
+
+
 def test_an_unknown_address_suggests_the_nearest(world):
     _, _, variables, _ = world
     with pytest.raises(AddressError, match=r"'plant.box.maas'; did you mean plant.box.mass"):

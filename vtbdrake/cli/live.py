@@ -94,7 +94,7 @@ def reset(url: str, timeout: float) -> None:
     with _failures(), LiveClient(url, timeout=timeout) as client:
         released = client.reset()
     for reason in released:
-        click.echo(f"over: {reason}")
+        click.echo(f"this fault is over: {reason}")
     if not released:
         click.echo("no fault had latched")
 

@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from math import inf, isnan
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -259,6 +260,8 @@ class Guards:
         reasons = (*(fault.reason for fault in (*self._causes, *lasting)), *against)
         if not reasons:
             self._accept_steady()
+            if self._latched:
+                _log.warning("the DPS commands again: the guards were reset")
             self._latched = ()
         return reasons
 
@@ -273,7 +276,7 @@ class Guards:
     def _general_faults(self, now: float, error: BaseException | None, missed: int, blocked: str | None) -> list[Fault]:
         faults = []
         if error is not None:
-            faults.append(Fault(now, None, "raised", f"the DPS raised {type(error).__name__}: {error}"))
+            faults.append(Fault(now, None, "raised", f"the DPS raised {_described(error)}"))
         if missed > self._max_missed:
             reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
             faults.append(Fault(now, None, "missed", reason))
@@ -372,3 +375,12 @@ def _reject_unknown(what: str, given: Iterable[str], signals: Iterable[Signal]) 
     names = [signal.name for signal in signals]
     if unknown := sorted(set(given) - set(names)):
         raise ValueError(f"{what} is given for {', '.join(unknown)}, but the signals are {', '.join(names)}")
+
+
+def _described(error: BaseException) -> str:
+    """Return an error as one line, with the line of code that raised it, if that is known."""
+    place = error.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    where = "" if place is None else f" ({Path(place.tb_frame.f_code.co_filename).name}, line {place.tb_lineno})"
+    return f"{type(error).__name__}: {error}{where}"

@@ -196,7 +196,13 @@ class Variables(Mapping[str, Variable]):
         return [*self._listed, *self._by_demand]
 
     def read(self, context: Context, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
-        """Return sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``."""
+        """Return sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``, by address.
+
+        Raises:
+            ValueError: An address does not exist, or there is one string instead of a sequence of addresses.
+        """
+        if isinstance(addresses, str):
+            raise ValueError(f"addresses are a sequence: read(context, [{addresses!r}])")
         return {address: self[address].get(context) for address in addresses}
 
     def write(self, context: Context, values: Mapping[str, ArrayLike]) -> None:

@@ -14,6 +14,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
     AddMultibodyPlantSceneGraph,
@@ -169,6 +170,15 @@ def test_encoders_show_a_constant_rate_sampled() -> None:
     plant.SetVelocities(context, [2.0])
     simulator.AdvanceTo(5.7 * PERIOD)
     assert reading(encoders, simulator) == pytest.approx([0.1 + 2.0 * 5 * PERIOD], abs=1e-6)
+
+
+def test_units_are_those_of_the_joints() -> None:
+    plant = MultibodyPlant(0.001)
+    Parser(plant).AddModelsFromUrl("package://drake/examples/multibody/cart_pole/cart_pole.sdf")
+    plant.Finalize()
+    cart, pole = (plant.GetJointByName(name) for name in ("CartSlider", "PolePin"))
+    assert JointEncoders(plant, [cart, pole], period=PERIOD).variables[0].unit == "m, rad"
+    assert JointTachometers(plant, [pole, cart], period=PERIOD).variables[0].unit == "rad/s, m/s"
 
 
 def test_encoders_refuse_a_floating_base() -> None:

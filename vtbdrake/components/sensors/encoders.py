@@ -74,9 +74,9 @@ class JointEncoders(_JointSensor):
         _check_single(joints, self)
         positions = plant.GetDefaultPositions()  # Before Finalize it raises; position_start would raise SystemExit.
         entries = [joint.position_start() for joint in joints]
-        default = positions[entries]
+        default, unit = positions[entries], _unit(joints)
         super().__init__(
-            "joint_encoders", plant, entries, default=default, period=period, unit="rad", stream=stream, errors=errors
+            "joint_encoders", plant, entries, default=default, period=period, unit=unit, stream=stream, errors=errors
         )
 
 
@@ -108,10 +108,15 @@ class JointTachometers(_JointSensor):
     ) -> None:
         _check_single(joints, self)
         entries = [plant.num_positions() + joint.velocity_start() for joint in joints]
-        default = np.zeros(len(joints))
+        default, unit = np.zeros(len(joints)), _unit(joints, "/s")
         super().__init__(
-            "joint_velocity", plant, entries, default=default, period=period, unit="rad/s", stream=stream, errors=errors
+            "joint_velocity", plant, entries, default=default, period=period, unit=unit, stream=stream, errors=errors
         )
+
+
+def _unit(joints: Sequence[Joint], per: str = "") -> str:
+    """Return the units of the joints' positions, each once, with ``per`` behind them."""
+    return ", ".join(dict.fromkeys(("m" if joint.type_name() == "prismatic" else "rad") + per for joint in joints))
 
 
 def _check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
