@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.unit import DOUBTFUL, TRACKING
 from vtbdrake.testbed import ScenarioError
+from vtbdrake_diagrams.forest.drives import Drive, Track
 from vtbdrake_diagrams.forest.next_route import (
     COUNTED,
     FOUND,
@@ -14,9 +17,9 @@ from vtbdrake_diagrams.forest.next_route import (
     UNKNOWN,
     RouteAnswer,
     RouteScenario,
-    deviation,
-    squared_error,
+    late_error,
     summary,
+    variance,
 )
 from vtbdrake_diagrams.forest.scanner_choice import (
     BEAMS,
@@ -74,26 +77,35 @@ def test_maps_from_files_are_not_imagined() -> None:
 
 def test_routes_are_judged_after_they_have_parted() -> None:
     late = FOUND + HORIZON - COUNTED
-    assert deviation(late - 1.0, np.eye(3)) == 0.0
-    assert deviation(late, np.diag([0.09, 0.16, 1.0])) == pytest.approx(0.5)
-    assert deviation(late, np.diag([np.inf, np.inf, np.inf])) == UNKNOWN
-    assert squared_error(late, np.array([3.3, 4.4]), late - LAG, TRUTH, VELOCITY) == pytest.approx(0.25)
-    assert squared_error(late, np.full(2, np.nan), late - LAG, TRUTH, VELOCITY) == UNKNOWN**2
+    assert variance(late - 1.0, np.eye(3)) == 0.0
+    assert variance(late, np.diag([0.09, 0.16, 1.0])) == pytest.approx(0.25)
+    assert variance(late, np.diag([np.inf, np.inf, np.inf])) == UNKNOWN**2
+
+
+def test_error_of_a_drive_is_that_of_its_end() -> None:
+    times = np.array([0.0, 1.0, 2.0, 3.0]) + COUNTED
+    times[0] = 1.0
+    truth, poses = np.zeros((4, 3)), np.array([[9.0, 9.0, 0.0], [0.3, 0.4, 0.1], [np.nan] * 3, [40.0, 0.0, 0.0]])
+    drive = Drive(times, truth, truth, (Landmarks.empty(),) * 4)
+    track = Track(drive, poses, np.tile(np.eye(3), (4, 1, 1)), np.array([TRACKING, TRACKING, DOUBTFUL, TRACKING]))
+    # Without a pose and far off, it counts as unknown.
+    assert late_error(track) == pytest.approx(((0.25 + 2.0 * UNKNOWN**2) / 3.0) ** 0.5)
 
 
 def test_summary_compares_the_choice_with_all_routes() -> None:
     choice, none = SimpleNamespace(values={ROUTE: 1.0}), SimpleNamespace(values={})
+    first, second = np.array([0.5, 0.2, 0.1]), np.array([0.1, 0.2, 0.6])
     answers = {
-        7: RouteAnswer(choice, np.array([0.2, 0.1, 0.3]), np.array([0.5, 0.2, 0.1])),
-        8: RouteAnswer(none, np.array([0.3, 0.4, 0.5]), np.array([0.1, 0.2, 0.6]), in_use=2),
+        # Two surveys, of which the root mean square is as told; the map in use says something else.
+        7: RouteAnswer(choice, np.array([0.2, 0.1, 0.3]), np.array([[0.4, 0.3, 0.0], 0.6 * first, 1.64**0.5 * first])),
+        8: RouteAnswer(none, np.array([0.3, 0.4, 0.5]), np.array([[0.9, 0.9, 0.9], second, second]), in_use=2),
     }
     assert [answer.chosen for answer in answers.values()] == [1, 2]
     assert [answer.rank for answer in answers.values()] == [1, 2]
-    mean, use, every, promised, errors, expected = summary(answers).splitlines()[-6:]
+    mean, use, every, own, promised = summary(answers).splitlines()[-5:]
     assert mean.split() == ["mean", "0.300", "0.400", "0.550", "0.283", "0.100", "1.5"]
-    # The gains are 0.3 and 0, and 0.067 and -0.3.
+    # The gains are 0.3 and 0, and 0.067 and -0.3; with the map in use 0.1 and 0.
     assert use.endswith("in use: 0.150 m, with a standard error of 0.150 m")
     assert every.endswith("routes: -0.117 m, with a standard error of 0.183 m")
+    assert own.endswith("with the map in use: 0.050 m, with a standard error of 0.050 m")
     assert promised.endswith(": 0.050 m")
-    assert errors.endswith("errors of the routes of a forest: 0.194 m")
-    assert expected.endswith("expected deviations of the routes of a forest: 0.082 m")
