@@ -210,3 +210,13 @@ def test_bad_input_is_rejected():
         TrunkDetector(heights=(2.0, 1.0))
     with pytest.raises(ValueError, match="cell must be in m, at least a 2000th of the reach, not 0.01"):
         TrunkDetector(reach=40.0, cell=0.01)
+
+
+def test_scan_with_the_ground_above_shows_nothing():
+    scene = stand(3)
+    points, _ = scene.scan(EYE, noise=0.02, seed=3)
+    mirrored = EYE + (points - EYE) * [1.0, 1.0, -1.0]
+    assert len(detect_trunks(points, EXACT, p_HoLo_H=EYE)) > 20
+    assert not len(detect_trunks(mirrored, EXACT, p_HoLo_H=EYE))
+    # Trunks without any ground are still seen.
+    assert len(detect_trunks(points[points[:, 2] > 1.0], EXACT, p_HoLo_H=EYE)) > 10
