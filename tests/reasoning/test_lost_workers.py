@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -83,3 +84,27 @@ def test_after_a_hung_worker_the_other_one_decides(gated):
     decision = reasoner.decide(belief)
     assert (decision.health.rollouts, decision.warnings) == (6, ())
     assert second in workers()
+
+
+def test_after_an_interrupted_decision_new_workers_warm_up(gated, monkeypatch):
+    belief, reasoner, workers, _ = gated
+    run, before, calls = reasoner.executor.run, workers(), []
+
+    def interrupted(*arguments, **options):
+        results = run(*arguments, **options)
+        os.kill(min(before), signal.SIGSTOP)  # Its rollout is under way when Ctrl-C comes.
+        yield next(results)
+        raise KeyboardInterrupt
+
+    def recorded(task, points, *, start=None, cutoff=None):
+        calls.append(cutoff.deadline)
+        return run(task, points, start=start, cutoff=cutoff)
+
+    monkeypatch.setattr(reasoner.executor, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reasoner.decide(belief)
+    assert min(before) not in workers()
+    monkeypatch.setattr(reasoner.executor, "run", recorded)
+    assert reasoner.decide(belief, budget=Budget(seconds=1e4, rollouts=6)).health.rollouts == 6
+    assert calls[0] == -inf < calls[1]  # The budget begins when both are warm.
+    assert len(workers()) == 2

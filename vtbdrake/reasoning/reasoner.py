@@ -192,7 +192,8 @@ class Reasoner:
     def warm_up(self) -> None:
         """Let every worker build its testbed, so that no decision has to wait for it.
 
-        The first decision with a budget of wall time warms up before its budget begins.
+        The first decision with a budget of wall time warms up before its budget begins; so does the first one after a
+        decision that was interrupted (Ctrl-C), which ends the workers that had rollouts.
 
         Raises:
             ReasonerError: a decision is under way (in another thread), or the reasoner is closed.
@@ -241,7 +242,11 @@ class Reasoner:
             starts = self._starts(believer, context, now)
             held = self._plan_in_use(starts[0])
             given = None if plan is None else self.space.point(plan, starts[0].time)
-            return DecisionRun(self, budget, starts, held, given, begin).decision()
+            try:
+                return DecisionRun(self, budget, starts, held, given, begin).decision()
+            except BaseException:
+                self._warm = False  # Workers that are interrupted are ended, and others take their place.
+                raise
 
     def _starts(
         self, believer: AddressedDiagram | Belief | Start, context: Context | None, now: float
