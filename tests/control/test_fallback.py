@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
 
 from vtbdrake.control.fallback import (
     NO_COMMAND,
     Brake,
+    CarryWeight,
     Fallback,
     FallbackController,
     Hold,
@@ -41,6 +45,50 @@ def test_brake_acts_against_the_measured_velocity() -> None:
     brake = Brake("joint_state", gain=[2.0, 3.0], entries=slice(2, 4))
     command = brake.command(np.zeros(2), {"joint_state": np.array([9.0, 9.0, 1.0, -0.5])}, {}, 1e-3)
     assert command.tolist() == [-2.0, 1.5]
+
+
+MASSES, LENGTHS = (3.0, 2.0), (0.5, 0.4)
+
+
+def arm(*, actuated: tuple[int, ...] = (1, 0)) -> MultibodyPlant:
+    """Two massless links in the vertical plane with a point mass at each end; the elbow has the first actuator."""
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -9.81])
+    joints, parent, offset = [], plant.world_frame(), 0.0
+    for i in range(2):
+        inertia = SpatialInertia(MASSES[i], [LENGTHS[i], 0.0, 0.0], UnitInertia.PointMass([LENGTHS[i], 0.0, 0.0]))
+        link = plant.AddRigidBody(f"link{i}", inertia)
+        elbow = plant.AddFrame(FixedOffsetFrame(f"joint{i}_base", parent, RigidTransform([offset, 0.0, 0.0])))
+        # A positive angle lifts the link.
+        joints.append(plant.AddJoint(RevoluteJoint(f"joint{i}", elbow, link.body_frame(), [0.0, -1.0, 0.0])))
+        parent, offset = link.body_frame(), LENGTHS[i]
+    for i in actuated:
+        plant.AddJointActuator(f"actuator{i}", joints[i])
+    plant.Finalize()
+    return plant
+
+
+def test_weight_is_carried_at_the_last_accepted_position() -> None:
+    q, v = np.array([0.3, -0.8]), np.array([0.5, -0.25])
+    brake = Brake("joint_state", gain=2.0, entries=slice(3, 1, -1))  # In the order of the actuators.
+    carry = CarryWeight(arm(), "joint_state", entries=slice(0, 2), brake=brake, longest=0.2)
+    assert chain(carry, TORQUE, interface=INTERFACE)[0] is carry
+    elbow = 9.81 * MASSES[1] * LENGTHS[1] * np.cos(q.sum())
+    shoulder = elbow + 9.81 * sum(MASSES) * LENGTHS[0] * np.cos(q[0])
+    state = np.concatenate((q, v))
+    fresh = carry.command(np.zeros(2), {"joint_state": state}, {"joint_state": Sample(state, 0.0)}, 1e-3)
+    np.testing.assert_allclose(fresh, [elbow, shoulder] - 2.0 * v[::-1])
+    stale = carry.command(np.zeros(2), {}, {"joint_state": Sample(state, 0.2)}, 1e-3)
+    np.testing.assert_allclose(stale, [elbow, shoulder])
+    assert carry.command(np.zeros(2), {}, {"joint_state": Sample(state, 0.21)}, 1e-3) is NO_COMMAND
+    assert carry.command(np.zeros(2), {}, {}, 1e-3) is NO_COMMAND
+
+
+def test_plant_whose_weight_cannot_be_carried_is_rejected() -> None:
+    with pytest.raises(ValueError, match="2 positions and 1 actuators cannot be carried"):
+        CarryWeight(arm(actuated=(1,)), "joint_state")
+    with pytest.raises(ValueError, match="4 entries of 'joint_state'"):
+        chain(CarryWeight(arm(), "joint_state"), TORQUE, interface=INTERFACE)
 
 
 def test_controller_gets_what_a_fallback_gets() -> None:

@@ -6,6 +6,7 @@ from vtbdrake.control.clock import Clock as Clock
 from vtbdrake.control.clock import SimulatedClock as SimulatedClock
 from vtbdrake.control.clock import WallClock as WallClock
 from vtbdrake.control.fallback import Brake as Brake
+from vtbdrake.control.fallback import CarryWeight as CarryWeight
 from vtbdrake.control.fallback import Fallback as Fallback
 from vtbdrake.control.fallback import FallbackController as FallbackController
 from vtbdrake.control.fallback import Hold as Hold

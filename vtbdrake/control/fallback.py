@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.testbed import Interface, Signal
+
+if TYPE_CHECKING:
+    from pydrake.multibody.plant import MultibodyPlant
 
 
 class Sample(NamedTuple):
@@ -78,7 +81,7 @@ class Zero(Fallback):
     """Commands zero torque, force or velocity, approached within the limits.
 
     Zero torque is safe for an arm that carries its own weight. Another one falls, and its time-out does not brake it,
-    as commands go on: take `Silence`, or a `FallbackController` with a model.
+    as commands go on: take `Silence` or `CarryWeight`.
     """
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
@@ -134,6 +137,72 @@ class Brake(Fallback):
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         return -self.gain * sensed[self.velocity][self.entries]
+
+
+class CarryWeight(Fallback):
+    """Carries the weight of an arm by the torques u of its actuators, with B u = -tau_g(q), so that it floats in place.
+
+    B is the actuation matrix of a plant, and tau_g(q) its generalized forces of gravity at the measured positions q. A
+    `Brake` adds its torques while its velocity is fresh; without one, nothing stops an arm that moves. Torques are in
+    the order of the plant's actuators.
+
+    Without a fresh position the weight at the last accepted one is carried, until that sample is ``longest`` old. Then,
+    or if no position was ever accepted, nothing is sent (`Silence`): what is unknown cannot be carried.
+
+    Args:
+        plant: The finalized plant of the arm and its tool alone, as the DPS models it. Every joint has an actuator.
+        position: Name of the sensor signal that contains q, in the plant's order.
+        entries: The entries of that signal that are q; by default all.
+        brake: Damps the motion.
+        longest: Seconds for which the weight is carried at the last accepted position.
+
+    Raises:
+        ValueError: Some joints of the plant have no actuator.
+    """
+
+    otherwise = Silence()
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        position: str,
+        *,
+        entries: slice = slice(None),
+        brake: Brake | None = None,
+        longest: float = 0.2,
+    ) -> None:
+        self.position, self.entries, self.brake, self.longest = position, entries, brake, longest
+        actuation = plant.MakeActuationMatrix()
+        size = plant.num_positions()
+        if actuation.shape != (size, size) or np.linalg.matrix_rank(actuation) < size:
+            raise ValueError(
+                f"a plant with {size} positions and {plant.num_actuators()} actuators cannot be carried: it needs one "
+                "actuator per position, so weld its base and leave out what is not actuated"
+            )
+        self._plant, self._context = plant, plant.CreateDefaultContext()
+        self._to_actuators = np.linalg.inv(actuation)
+
+    def check(self, signal: Signal, *, interface: Interface) -> None:
+        sizes = {sensor.name: sensor.size for sensor in interface.sense if sensor.size is not None}
+        found = len(range(sizes.get(self.position, 0))[self.entries])
+        if not found == self._plant.num_positions() == signal.size:
+            raise ValueError(
+                f"the weight of a plant with {self._plant.num_positions()} positions is carried by as many torques and "
+                f"measured positions, not by the {signal.size} entries of {signal.name} with {found} entries of "
+                f"{self.position!r}"
+            )
+        if self.brake is not None:
+            self.brake.check(signal, interface=interface)
+
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        last = known.get(self.position)
+        if last is None or (self.position not in sensed and last.age > self.longest):
+            return NO_COMMAND
+        self._plant.SetPositions(self._context, last.value[self.entries])
+        torques = -self._to_actuators @ self._plant.CalcGravityGeneralizedForces(self._context)
+        if self.brake is not None and self.brake.velocity in sensed:
+            torques += self.brake.command(last_sent, sensed, known, dt)
+        return torques
 
 
 class FallbackController(Fallback):
