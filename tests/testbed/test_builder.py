@@ -261,7 +261,7 @@ def test_a_belief_goes_from_dps_to_sim():
         _believing(of=("sim.sense.y.value",)).build()
     with pytest.raises(ValueError, match="did you mean dps.estimate"):
         _believing(of=("dps.estimates",)).build()
-    with pytest.raises(ValueError, match="say with by= how"):
+    with pytest.raises(ValueError, match="give the function of them as by="):
         _believing(of=("dps.estimate", "dps.estimate"))
     builder = VirtualTestbedBuilder(Interface([SENSE], [ACT]))
     builder.set_dps(_relay())

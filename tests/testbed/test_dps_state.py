@@ -160,7 +160,7 @@ def test_testbed_and_context_are_freed():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"parts": 2}, "one slow part that samples its state at most, not 2: dps.planner, dps.planner_1"),
+        ({"parts": 2}, "at most one slow part that samples its state, not 2: dps.planner, dps.planner_1"),
         ({"latency": 0.06}, "choose a period of at least 0.06 s"),
         ({"latency": 0.05, "offset": 0.01}, "needs a period longer than its latency of 0.05 s"),
     ],

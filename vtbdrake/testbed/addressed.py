@@ -1,4 +1,4 @@
-"""A Diagram with addresses: what a testbed, the DPS alone and the world alone have in common."""
+"""A Diagram with addresses: the base of a testbed, of the DPS alone and of the world alone."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ class AddressedDiagram:
         interface: Interface,
         simulator_config: SimulatorConfig,
         scenario: Scenario | None,
-        extra: Iterable[Variable],
+        extra: Iterable[Variable] = (),
         plant_roles: Mapping[str, str] | None = None,
     ) -> None:
         """Collect the variables of ``diagram``; ``plant_roles`` maps model instances to ``sys`` or ``env``."""
         roles = plant_roles or {}
         clock = Variable("time", X, (), "s", lambda context: context.get_time())
-        self.diagram = diagram  # the input and output ports of it carry the DPS's signals
+        self.diagram = diagram  # its input and output ports carry the DPS's signals
         self.interface = interface  # the DPS's signals
-        self.simulator_config = simulator_config  # how it is to be integrated
-        self.scenario = scenario  # what built it, or None
+        self.simulator_config = simulator_config  # settings of its integration
+        self.scenario = scenario  # the scenario that built it, or None
         self._variables = collect(
             diagram,
             plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
@@ -87,7 +87,7 @@ class AddressedDiagram:
         """Return a new context: s0 from defaults."""
         context = self.diagram.CreateDefaultContext()
         if self.simulator_config.use_error_control:
-            # Drake uses it to find the time of events that depend on the state, such as a foot that lands.
+            # By the accuracy, Drake finds the times of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
         self.attach(context)
         return context
@@ -95,8 +95,8 @@ class AddressedDiagram:
     def attach(self, context: Context) -> None:
         """Give the slow part that samples the state of the DPS access to it, as `default_context` and `simulator` do.
 
-        It is for a context that was made in another way: a Clone, or the context of a Diagram around this one. Without
-        such a slow part, it does nothing.
+        Call it for a context that was made in another way: a Clone, or the context of a Diagram around this one.
+        Without such a slow part, nothing happens.
 
         Args:
             context: A root context of this diagram, or of a diagram that holds it.
@@ -108,7 +108,7 @@ class AddressedDiagram:
         """Reject a context that is not the root context of this diagram, or of a diagram that holds it.
 
         Raises:
-            ValueError: It is another diagram's, or that of a part.
+            ValueError: The context is another diagram's, or a subsystem's.
         """
         self._own_context(context)
 
@@ -168,24 +168,25 @@ class AddressedDiagram:
         """Return s(t) of a running simulation, from which a new simulation continues exactly as the running one.
 
         An integrator with error control remembers its last step, which no snapshot can hold: rollouts from a plain
-        `snapshot` begin with a first step of another size, and differ by about the accuracy asked for, more where
-        contact amplifies it. Here the running simulation continues with a new integrator, too. Its future is then
-        equal, to the last bit, to a rollout from the snapshot (``Problem(start=...)``), or to a simulation by
-        ``simulator(context, restored=True)`` of a restored context, if it is advanced to the same instants: where a
-        call of AdvanceTo ends, a step ends. For a rollout these are `RolloutTask.instants`. With a discrete plant or
-        fixed steps, a plain snapshot does. Values that are fixed at input ports are no state, and stay behind.
+        `snapshot` begin with a first step of another size, and differ by about the integrator's accuracy, more if
+        contact amplifies the difference. After a fork the running simulation continues with a new integrator, too. Its
+        future is then equal, to the last bit, to a rollout from the snapshot (``Problem(start=...)``), or to a
+        simulation by ``simulator(context, restored=True)`` of a restored context, if both are advanced to the same
+        instants: where a call of AdvanceTo ends, a step ends. For a rollout these are `RolloutTask.instants`. With a
+        discrete plant or fixed steps, a plain snapshot suffices. Values that are fixed at input ports are no state, and
+        are not part of the snapshot.
 
         Args:
-            simulator: One of this testbed; between two calls of its AdvanceTo. (After AdvancePendingEvents, the updates
-                of the present instant would happen again, on both sides.)
+            simulator: A simulator of this testbed, between two calls of its AdvanceTo. (After AdvancePendingEvents, the
+                updates of the present instant would happen again, in both simulations.)
 
         Raises:
-            ValueError: It is no Simulator, or one of another Diagram.
+            ValueError: ``simulator`` is no Simulator, or one of another Diagram.
         """
         if not isinstance(simulator, Simulator):
             raise ValueError(f"fork a simulator made by testbed.simulator(), not {simulator!r}")
         if simulator.get_system() is not self.diagram:
-            raise ValueError("the simulator to be forked is one of another Diagram: make it by testbed.simulator()")
+            raise ValueError("the simulator to be forked is of another Diagram: make it by testbed.simulator()")
         snapshot = self.snapshot(simulator.get_context())
         self._give_integrator(simulator)
         simulator.Initialize(InitializeParams(suppress_initialization_events=True))
@@ -226,7 +227,7 @@ class AddressedDiagram:
         """Set variables in ``context``: all of ``values`` (address -> value), or none.
 
         Raises:
-            ValueError: There is no such variable, or it does not take the value. Nothing has been set then.
+            ValueError: There is no such variable, or it does not take the value; nothing has been set.
         """
         self.check_context(context)
         self._variables.write(context, values)
@@ -252,7 +253,7 @@ class AddressedDiagram:
         raise AddressError(f"there is no variable and no port {address!r}{suggestion(address, self.addresses())}")
 
     def addresses(self) -> list[str]:
-        """Return the addresses of everything that can be read: variables, output ports, and what the machine sends."""
+        """Return the addresses of everything that can be read: variables, output ports, and ports ``real.sense.*``."""
         return [*self._variables, *self._ports, *self._inputs]
 
     def _input_reader(self, port: InputPort) -> Callable[[Context], Any]:
@@ -297,7 +298,7 @@ class AddressedDiagram:
         """Raise a SnapshotError if the snapshot is of another scenario, or no snapshot."""
         if not isinstance(snapshot, Snapshot):
             raise SnapshotError(
-                f"a state is restored from a snapshot, by Snapshot.load(file), say, not from {snapshot!r}"
+                f"a state is restored from a Snapshot, such as Snapshot.load(file), not from {snapshot!r}"
             )
         if self.scenario is None or not snapshot.scenario:
             return
@@ -319,7 +320,7 @@ class AddressedDiagram:
 
     @cached_property
     def start_layout(self) -> StateLayout:
-        """Return the layout of what a belief sets: all state but the switches, and the DPS's parameters."""
+        """Return the layout of a start from a belief: all state but the switches, and the DPS's parameters."""
         return StateLayout(self.diagram, state=_is_no_board, parameters=is_dps)
 
     @cached_property
@@ -335,7 +336,7 @@ class AddressedDiagram:
 
 
 def record_differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], *, where: str) -> list[str]:
-    """Return how a scenario's record differs from that of this one, each as a phrase; ``where`` is where it stands."""
+    """Return the differences of two records of scenarios as phrases; ``where`` tells where ``theirs`` comes from."""
     keys = ["scenario"] if theirs.get("scenario") != mine.get("scenario") else dict.fromkeys([*mine, *theirs])
     nothing = object()
     return [
@@ -357,9 +358,9 @@ def _is_no_board(path: str) -> bool:
 def _sampling_part(diagram: Diagram) -> SlowPart | None:
     found = {path: part for path, part in slow_parts(diagram).items() if part.samples_dps}
     if len(found) > 1:
-        # The sample of the one would hold those of the other that are under way, and so on.
+        # The samples of each would contain those of the other that are under way, and so on.
         raise ValueError(
-            f"a DPS has one slow part that samples its state at most, not {len(found)}: {', '.join(found)}"
+            f"a DPS has at most one slow part that samples its state, not {len(found)}: {', '.join(found)}"
         )
     return next(iter(found.values()), None)
 

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
-from vtbdrake.state import Variable
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
@@ -47,10 +46,9 @@ class VirtualTestbedBuilder:
 
     Attributes:
         diagram_builder: The DiagramBuilder of the testbed, for functions of Drake that take one.
-        plant, scene_graph: Those of the simulated world; None until `add_plant` adds them.
+        plant, scene_graph: Plant and SceneGraph of the simulated world; None until `add_plant` adds them.
         sensors, actuators: The ports of the simulated world, by signal.
-        belief_rules: What `believe` declares.
-        extra_variables: Those that `add_variable` lists.
+        belief_rules: The rules that `believe` has declared.
     """
 
     def __init__(self, interface: Interface, *, simulator_config: SimulatorConfig | None = None) -> None:
@@ -69,7 +67,6 @@ class VirtualTestbedBuilder:
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
         self.belief_rules: list[BeliefRule] = []
-        self.extra_variables: list[Variable] = []
 
     def add(self, role: str, name: str, system: S) -> S:
         """Add a part of the simulated world under the name ``sim.<role>.<name>``, and return it.
@@ -95,8 +92,8 @@ class VirtualTestbedBuilder:
         """Add the MultibodyPlant, named ``plant``, and its SceneGraph, like Drake's `AddMultibodyPlant`.
 
         Args:
-            config: Drake's defaults (a discrete plant) if left out; ``time_step=0`` makes it continuous.
-            scene_graph_config: Drake's defaults if left out.
+            config: Config of the plant; by default Drake's (a discrete plant). ``time_step=0`` makes it continuous.
+            scene_graph_config: Config of the SceneGraph; by default Drake's.
         """
         if self.plant is not None:
             raise ValueError("the testbed has a plant already: add bodies in contact with its bodies to that plant")
@@ -113,7 +110,7 @@ class VirtualTestbedBuilder:
     def place(self, instance: str, *, role: str) -> None:
         """Assign a model instance of the plant to the role ``sys`` or ``env``.
 
-        Without it, what is fixed to the world and has no joints belongs to the environment.
+        By default, a model instance that is fixed to the world and has no joints belongs to ``env``.
         """
         if role not in ("sys", "env"):
             raise ValueError(f"model instance {instance} belongs to sys or env, not to {role!r}")
@@ -210,15 +207,11 @@ class VirtualTestbedBuilder:
             age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
                 sensor, which shows its state, is one period late. Predictions from the belief need the age.
             period: Sample period of the estimates in seconds; 0 if the DPS computes them at any time. If it is given,
-                ``by`` gets the keyword ``late``, the time in seconds since the instant that the estimates are about,
-                and returns what the target is then: ``lambda q, v, *, late: q + late * v``, say. So a mental world
-                begins at the present, and not at an instant that lies ``age`` and up to a period before it.
+                ``by`` gets the keyword ``late``, the present age of the estimates in seconds, and returns the present
+                value of the target, for example ``lambda q, v, *, late: q + late * v``. So a mental world begins at the
+                present, and not at an instant that lies ``age`` and up to a period before it.
         """
         self.belief_rules.append(BeliefRule(target, tuple(of), by, age, period))
-
-    def add_variable(self, variable: Variable) -> None:
-        """List a further variable, for example one that is derived from others."""
-        self.extra_variables.append(variable)
 
     def build(
         self, *, mode: str = "sim", scenario: Scenario | None = None, meshcat: Meshcat | None = None, prefix: str = ""
@@ -252,13 +245,18 @@ class VirtualTestbedBuilder:
 
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.diagram_builder, self.scene_graph, meshcat, parameters)
-        self.extra_variables[:0] = commands
         return VirtualTestbed(
-            self, self._dps, switches, self.build_diagram("vtb"), scenario=scenario, visualized=meshcat is not None
+            self,
+            self._dps,
+            switches,
+            self.build_diagram("vtb"),
+            commands=commands,
+            scenario=scenario,
+            visualized=meshcat is not None,
         )
 
     def build_diagram(self, name: str) -> Diagram:
-        """Build the Diagram of all that has been added.
+        """Build the Diagram of all systems that have been added.
 
         Systems without a name are named by their class, see `name_systems`.
 
@@ -279,7 +277,7 @@ class VirtualTestbedBuilder:
             kind = class_name(system)
             if kind in _REFUSED:
                 raise ValueError(f"{path} is a {kind}, {_REFUSED[kind]}")
-            if not is_scene_graph(system):  # Its default context is costly, and it is known.
+            if not is_scene_graph(system):  # Its default context is costly, and its state is known.
                 abstract_state(path, system, system.CreateDefaultContext())
         return diagram
 

@@ -11,16 +11,16 @@ from vtbdrake.state.systems import leaves
 
 
 def followers(diagram: Diagram, sources: Iterable[str]) -> dict[str, str]:
-    """Return the leaf systems that depend on some of them through connections, in order of distance.
+    """Return the leaf systems that depend on the sources through connections, in order of distance.
 
-    Every output of a system counts as dependent on all its inputs, its state and its parameters; that is cautious.
+    Every output of a system is assumed to depend on all its inputs, its state and its parameters.
 
     Args:
         diagram: The Diagram.
         sources: Paths of leaf systems.
 
     Returns:
-        Path of each follower -> path of the system from which it was reached first; that of a source is itself.
+        Path of each follower -> path of the system from which it was reached first; a source is mapped to itself.
     """
     paths = {system: path for path, system in leaves(diagram)}
     readers: dict[str, list[str]] = {path: [] for path in paths.values()}

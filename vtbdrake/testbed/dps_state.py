@@ -1,4 +1,4 @@
-"""The state of the whole DPS, as a slow part of it samples it."""
+"""The state of the whole DPS, as one of its slow parts samples it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class DpsState:
     time: float  # in seconds
     contents: FlatState  # state and parameters of the DPS's systems
     commands: Mapping[str, np.ndarray]  # the commands u that are set from outside, by name
-    # the sensor values that are vectors, as the DPS sees them at this instant, by name; without those never fed
+    # the vector sensor values that the DPS has at its ports at this instant, by name; without those never fed
     received: Mapping[str, np.ndarray]
 
 
@@ -50,8 +50,8 @@ class DpsReader:
     """Reads the state of a DPS in root contexts of its Diagram.
 
     Args:
-        layout: That of the DPS's systems.
-        commands: Reads the commands u that are set from outside, by name.
+        layout: Layout of the DPS's systems.
+        commands: Functions of a root context that read the commands u that are set from outside, by name.
         sensors: The DPS's input ports of sensor signals that are vectors, by name.
     """
 
@@ -76,9 +76,9 @@ class DpsReader:
 
 
 class RootReference:
-    """Leads from the context of one system to the root context, which Drake does not show to a system.
+    """A reference from the context of one system to the root context, which Drake does not show to a system.
 
-    It is the value of an input port of that system. A Clone of the root context shares it, which is noticed.
+    It is the value of an input port of that system. A Clone of the root context shares it, which `find` detects.
 
     Args:
         root: The root context, which is not kept alive; None is a reference to nothing.
@@ -95,7 +95,7 @@ class RootReference:
 
         Args:
             system: The system.
-            context: Its own context.
+            context: The context of the system.
 
         Raises:
             ValueError: ``context`` is not part of the root context.

@@ -53,10 +53,9 @@ class HardwareSimScenario(Scenario):
             builder.sim_sensor("image", cameras["oracular_view"].GetOutputPort("color_image"))
             builder.sim_actuator("torque", builder.plant.get_actuation_input_port())
 
-    What connects hardware_sim to LCM, draws it and ends it has other means here: the switches and a bridge replace
-    ``model_drivers`` and ``lcm_buses``, ``build(meshcat=...)`` replaces ``visualization``, and the horizon of a rollout
-    replaces ``simulation_duration``. The world is that of the default values: nothing is drawn with ``random_seed``.
-    These fields are read, kept, and not used.
+    Some fields are read and kept, but not used: the switches and a bridge replace ``model_drivers`` and ``lcm_buses``,
+    ``build(meshcat=...)`` replaces ``visualization``, and the horizon of a rollout replaces ``simulation_duration``.
+    The world has the default values, so that ``random_seed`` is not used either.
 
     Attributes:
         simulator_config, plant_config, scene_graph_config: As in hardware_sim; the defaults are Drake's.

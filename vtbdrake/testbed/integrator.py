@@ -6,13 +6,13 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 
 
 def apply_simulator_config(config: SimulatorConfig, simulator: Simulator) -> None:
-    """Apply ``config`` as Drake does, and let the solver of CENIC reach the same tolerance with less work.
+    """Apply ``config`` as Drake does, and make the solver of CENIC faster at the same tolerance.
 
     CENIC takes each step from the minimum of a convex function. By default its solver, Newton's method, factorizes a
     new Hessian in every iteration; here it keeps one, from step to step too, as long as it converges quickly with it
     (Hairer and Wanner, "Solving Ordinary Differential Equations II", section IV.8). Its line searches end when the
-    slope is 1e-4 of what it was, instead of 1e-8. For a walking robot this saves three of five factorizations, and a
-    seventh of the time; the distance walked in 15 s changes by less than a micrometre.
+    slope is 1e-4 of its first value, instead of 1e-8. For a walking robot this saves three of five factorizations, and
+    a seventh of the time; the distance walked in 15 s changes by less than a micrometre.
 
     Like Drake's function it gives the simulator a new integrator, which remembers nothing of an earlier one.
     """

@@ -1,4 +1,4 @@
-"""Ctrl-C while Drake runs: the exception is raised again where it would be lost."""
+"""Ctrl-C while Drake runs: an exception that pybind11 drops is raised again."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, Self
 
 
 class Interruptible:
-    """A context manager that raises again what a handler of SIGINT or SIGTERM raised inside of it, if that got lost.
+    """A context manager that raises an exception of a handler of SIGINT or SIGTERM again if it got lost.
 
     Python raises KeyboardInterrupt wherever its main thread is. While pybind11 converts an argument (numpy makes an
-    array of a list, say) it drops that exception, and reports arguments that do not fit (TypeError) or tries the next
-    overload; and Python drops what is raised in a finalizer. A controller that writes its output at every step loses
-    about one Ctrl-C of 25 in this way, and the failed call would pass for a failed simulation.
+    array of a list, for example) it drops that exception, and reports arguments that do not fit (TypeError) or tries
+    the next overload; and Python drops exceptions of finalizers. With a controller that writes its output at every step
+    about one Ctrl-C of 25 is lost in this way, and the failed call would be taken for a failed simulation.
 
-    Outside the main thread, where no handler runs, and for a signal without a handler, it does nothing.
+    Nothing happens outside the main thread, where no handler runs, and for a signal without a handler.
     """
 
     def __init__(self) -> None:

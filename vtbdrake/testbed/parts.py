@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class DpsAlone(AddressedDiagram):
     """The DPS of a scenario without its simulated world, and with the same boundary to the machine as the testbed.
 
-    What the DPS needs to know of the world (a map, a model of the robot) is part of the DPS, and stays. Every actuator
-    signal commands: ``real.act.active`` is 1 throughout.
+    The DPS's own knowledge of the world (a map, a model of the robot) is part of the DPS, and stays. All actuator
+    signals command: every entry of ``real.act.active`` is 1.
 
     Attributes:
         dps: The data processing system, a direct subsystem of the diagram.
@@ -90,7 +90,7 @@ class DpsAlone(AddressedDiagram):
         """Make ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
 
         Raises:
-            SnapshotError: It is of another scenario, or of a DPS that is built in another way.
+            SnapshotError: The snapshot is of another scenario, or of a DPS that is built in another way.
         """
         self.check_context(context)
         self.check_scenario(snapshot)
@@ -143,7 +143,6 @@ class WorldAlone(AddressedDiagram):
             interface=parts.interface,
             simulator_config=_unpaced(own.simulator_config),
             scenario=own,
-            extra=parts.extra_variables,
             plant_roles=parts.plant_roles(),
         )
         self.plant = parts.plant
@@ -158,7 +157,7 @@ class WorldAlone(AddressedDiagram):
         return context
 
     def actuate(self, context: Context, name: str, value: Any) -> None:
-        """Set the actuator command of the simulated actuator ``name``, which lasts until the next one.
+        """Set the command of the simulated actuator ``name``, which holds until the next one.
 
         Args:
             context: A root context of this world.
@@ -177,6 +176,6 @@ class WorldAlone(AddressedDiagram):
         self.feed(context)(name, np.array(value, dtype=float) if signal.is_vector else value)
 
     def feed(self, context: Context) -> Feed:
-        """Return a `Feed` of the simulated actuators of one context: unchecked, at the lowest cost."""
+        """Return a `Feed` of the simulated actuators of one context; it does not check values."""
         self.check_context(context)
         return Feed(self._actuators, context)

@@ -1,4 +1,4 @@
-"""Prediction of sensor values by the simulated world of a scenario, set to the DPS's belief."""
+"""Prediction of sensor values by simulating the world of a scenario from the DPS's belief."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Predictor:
 
     Attributes:
         interface: The signals of the DPS.
-        estimates: By age of a belief, in periods, the addresses of the estimates that it is made of.
+        estimates: Age of a belief in periods -> the addresses of its estimates.
 
     Raises:
         ValueError: The scenario declares no belief, or one whose age is not a multiple of the period; a signal is
@@ -86,7 +86,7 @@ class Predictor:
         self._now = step
 
     def set_belief(self, age: int, estimates: Mapping[str, Any]) -> None:
-        """Set the variables that the beliefs of one age are about.
+        """Set the variables of the world whose beliefs have one age.
 
         An estimate beyond the bounds of its variable (a joint a little past its stop) is clipped.
 

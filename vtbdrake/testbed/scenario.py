@@ -28,27 +28,28 @@ if TYPE_CHECKING:
 
     from vtbdrake.deployment import Deployment, Runtime
 
-# Seen with 1.51.1, and not with 1.58: after a fixed step of CENIC, poses and contact results are those before it.
+# With 1.51.1, and not with 1.58, poses and contact results after a fixed step of CENIC are those before the step.
 _DRAKE = version("drake")
 _CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
-# Under which keys files hold these fields.
+# The keys of these fields in files.
 FILE_KEYS = {"simulator_config": "simulator", "plant_config": "plant"}
 # Fields of SimulatorConfig that do not change a trajectory.
 _NO_IDENTITY = {"simulator.start_time", "simulator.target_realtime_rate", "simulator.publish_every_time_step"}
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot be found, read or built."""
+    """A scenario cannot be found, read or built."""
 
 
 @dataclass
 class Scenario(ABC):
     """A dataclass, with a default for every field, that builds a testbed.
 
-    A subclass adds fields and defines the interface of the DPS, the DPS, and the simulated world. What lies in the
-    Context (masses, gains, poses) is a variable of the testbed; what needs another Diagram (geometry, gravity, a time
-    step) is a field. Fields are plain types, dataclasses of them, and Drake's configs (`MultibodyPlantConfig`,
-    `CameraConfig`, ...), so that a scenario can be written as YAML and sent to other processes.
+    A subclass adds fields and defines the interface of the DPS, the DPS, and the simulated world. Elements of the
+    Context (masses, gains, poses) are variables of the testbed; properties that need another Diagram (geometry,
+    gravity, a time step) are fields. Fields are plain types, dataclasses of them, and Drake's configs
+    (`MultibodyPlantConfig`, `CameraConfig`, ...), so that a scenario can be written as YAML and sent to other
+    processes.
 
     When a study varies a field, a testbed is built for each value. Python's garbage collector frees unused ones if
     every system in Python has ``__slots__ = NO_DICT`` and computes its output ports by ``weakly(self, Class._calc)``;
@@ -99,7 +100,7 @@ class Scenario(ABC):
         """Add the simulated sensors, system, actuators and environment."""
 
     def validate(self) -> None:
-        """Check the fields; `build` and `load_scenario` do so. Subclasses add their own checks.
+        """Check the fields; called by `build` and `load_scenario`. Subclasses add their own checks.
 
         Raises:
             ScenarioError: A value has another type than its field, a number is not finite, or the simulator_config
@@ -142,10 +143,11 @@ class Scenario(ABC):
         """Check fields in `validate` of a subclass.
 
         Args:
-            checks: Field -> whether its value is good, and what it must be, in words. Nested fields have dotted names.
+            checks: Field -> (whether its value is valid, a phrase for the valid values). Nested fields have dotted
+                names.
 
         Raises:
-            ScenarioError: A value is not good; the error has all of that.
+            ScenarioError: A value is not valid; the message has field, phrase and value.
         """
         for name, (good, expected) in checks.items():
             if not good:
@@ -176,11 +178,11 @@ class Scenario(ABC):
             raise RuntimeError(f"{self!r} cannot be built: {error}") from error
 
     def mental(self) -> Scenario:
-        """Return the scenario that a robot of this one simulates when it reasons; by default this scenario itself.
+        """Return the scenario that the robot simulates when it reasons; by default this scenario itself.
 
-        A mental scenario may differ in its world (integrator, terrain, what an a-priori map knows, no cameras) and in
-        the periods of its sensors and of its DPS. Its DPS has the same systems, with state and parameters of the same
-        sizes, as it continues from the state of the running one.
+        A mental scenario may differ in its world (another integrator, the terrain of an a-priori map, no cameras) and
+        in the periods of its sensors and of its DPS. Its DPS has the same systems, with state and parameters of the
+        same sizes, because it continues from the state of the running one.
         """
         return self
 
@@ -209,8 +211,8 @@ class Scenario(ABC):
             record: A new file in which the loop is recorded, for `vtbdrake.replay`.
             options: Further keyword arguments:
 
-                * ``target`` (VirtualTestbed or DpsAlone): what runs, for instance the whole testbed; a new DPS alone
-                  by default.
+                * ``target`` (VirtualTestbed or DpsAlone): the diagram to run, for instance the whole testbed; by
+                  default a new DPS alone.
                 * ``context`` (Context): the state of the target to continue from.
                 * ``start`` (Snapshot): a snapshot to continue from.
                 * ``values`` (mapping of address to value): variables to set before the first cycle.

@@ -32,9 +32,9 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
 
             * ``package.module:Class``: the scenario with its defaults;
             * ``package.module:Class@FILE``: with the fields of a YAML file;
-            * ``package.module:Class@FILE#KEY``: with those below one of several keys of the file, as files of Drake's
-              ``hardware_sim`` have them;
-            * the YAML file alone, if the class that it names is imported already. It looks like ::
+            * ``package.module:Class@FILE#KEY``: with the fields below one of several keys of the file, as in files of
+              Drake's ``hardware_sim``;
+            * the YAML file alone, if the class that it names is imported already. For example::
 
                   vtbdrake_diagrams.space_climber:SpaceClimberScenario:
                     gravity: 3.71
@@ -162,20 +162,20 @@ def _resolve_types(schema: type) -> None:
 
 
 def _parts(hint: Any) -> Iterator[Any]:
-    """Yield a type and those that it is made of: for list[Rock] | None also list[Rock], Rock and None."""
+    """Yield a type and its parts: for list[Rock] | None also list[Rock], Rock and None."""
     yield hint
     for argument in get_args(hint):
         yield from _parts(argument)
 
 
 def _check_nodes(document: yaml.Node, path: Path) -> None:
-    """Refuse keys that occur twice, and a few aliases that stand for very much."""
+    """Refuse keys that occur twice, and aliases that expand to very many nodes."""
     waiting, count = [document], 0
     while waiting:
         node = waiting.pop()
         count += 1
         if count > _MOST_NODES:
-            raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, those by aliases included")
+            raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, with aliases expanded")
         if isinstance(node, yaml.MappingNode):
             # Of two equal keys, YAML readers silently keep the last.
             keys = [str(key.value) for key, _ in node.value]
@@ -188,7 +188,7 @@ def _check_nodes(document: yaml.Node, path: Path) -> None:
 
 
 def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
-    """Refuse keys that are no field of the class that is expected there."""
+    """Refuse keys that are no field of the expected class."""
     alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
     inside = Union[inside] if inside else Any  # noqa: UP007
@@ -198,7 +198,7 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
         return
     if not isinstance(node, yaml.MappingNode):
         return
-    # Of several classes, a tag names the one that is meant, and the first one needs no tag.
+    # A tag chooses one of several classes; the first one needs no tag.
     classes = [part for part in alternatives if isinstance(part, type) and field_types(part)]
     expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
     known = field_types(expected)

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, InputPort, OutputPort, PortDataTy
 
 
 class SignalError(ValueError):
-    """A signal that is ill declared, missing, or does not fit the port that is to carry it."""
+    """A signal is declared wrongly, is missing, or does not fit its port."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -22,17 +22,17 @@ class Signal:
     """One signal that crosses the boundary of a DPS.
 
     Attributes:
-        name: The name of the port that carries it, on every side.
-        size: Entries of a vector signal; leave it out for an abstract one.
-        model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector one. All
-            images have its size, unless it has none.
-        unit: SI unit of all entries; ``"1"`` if it has none.
-        lower, upper: Limits of its entries, scalars or arrays of shape (size,).
-        rate: The largest change per second of an entry.
-        acceleration: The largest change per second of that change.
+        name: Name of the signal's port, in the DPS, in the simulated world and on the machine.
+        size: Number of entries of a vector signal; None for an abstract one.
+        model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector signal. The
+            size of a model image is that of all images; a model image of size zero allows any.
+        unit: SI unit of all entries; ``"1"`` for numbers without a unit.
+        lower, upper: Limits of the entries, scalars or arrays of shape (size,).
+        rate: Limit of the first derivative by time, a scalar or shape (size,).
+        acceleration: Limit of the second derivative by time, a scalar or shape (size,).
         max_age: Largest age in seconds; an older sample is stale.
         idle: For an actuator signal, the command of the simulated actuator while the real one is driven.
-        default: The value of a command until another one is given; zeros if left out.
+        default: The value of a command until another one is given; by default zeros.
     """
 
     name: str
@@ -232,9 +232,9 @@ class Interface:
 
 
 class Feed:
-    """The input ports of one context, by signal, which hold the last value.
+    """Sets the values of input ports in one context, by signal; a port holds its last value.
 
-    After the first time, a value is changed in place, which takes one or two microseconds. `GetMutableData` must be
+    After the first call, a value is changed in place, which takes one or two microseconds. `GetMutableData` must be
     called before each change, to invalidate caches; the view of a vector's numbers can be kept.
     """
 
@@ -244,7 +244,7 @@ class Feed:
         self._fixed: dict[str, tuple[Callable[[], Any], np.ndarray | None]] = {}
 
     def __call__(self, name: str, value: Any) -> None:
-        """Give the port of a signal a value: for a vector signal an array of its size."""
+        """Set the value of a signal's port: for a vector signal an array of its size."""
         known = self._fixed.get(name)
         if known is None:
             signal, port = self._ports[name]

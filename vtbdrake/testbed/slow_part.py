@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class SlowPartError(ValueError):
-    """A result of a slow part that does not match its declaration."""
+    """A result of a slow part does not match its declaration."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class SlowFunction:
     The arrays of a value are named ``<name>`` or, where its codec makes several, ``<name>.<part>``.
 
     Attributes:
-        function: The user's, see `SlowPart`.
+        function: The user's function, see `SlowPart`.
         inputs, outputs: The codecs, by port.
-        memory: That of the memory, under its name; empty if there is none.
+        memory: The codec of the memory, under its name; empty if there is none.
         makes: The names of all arrays of a result.
     """
 
@@ -52,7 +52,8 @@ class SlowFunction:
         If the function returns None for the outputs, there is no result, and no arrays of outputs.
 
         Raises:
-            SlowPartError: The function did not return what it declares. Its own exceptions pass.
+            SlowPartError: The function did not return the declared outputs.
+            Exception: Any exception of the function.
         """
         codecs = {**self.inputs, **self.memory}
         result = self.function(**{name: decode(arrays, name, codec) for name, codec in codecs.items()})
@@ -142,9 +143,9 @@ class Work:
     """The state of one sample.
 
     Attributes:
-        tick: Its number.
+        tick: Number of the sample.
         status: Waiting, done or missing.
-        arrays: Of the inputs while it waits, of the outputs when it is done.
+        arrays: Arrays of the inputs while the sample waits, of the outputs when it is done.
     """
 
     tick: int
@@ -158,7 +159,7 @@ class Progress:
 
     Attributes:
         shown: The arrays of the abstract outputs.
-        memory: Those of the memory.
+        memory: The arrays of the memory.
         under_way: The samples whose results are not due yet, in order.
     """
 
@@ -176,7 +177,8 @@ class Progress:
     def having(self, tick: int, arrays: Arrays) -> Progress:
         """Return the progress with the result of sample number ``tick``.
 
-        Its memory counts in any case, its outputs if they are awaited. A result without outputs is missing.
+        The memory of the result is always used, its outputs only if they are awaited. A result without outputs is
+        missing.
         """
         memory, outputs = split_memory(arrays)
         result = Work(tick, DONE if outputs else MISSING, outputs)
@@ -219,7 +221,7 @@ _RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED, _REQUEST, _TAKEN, _DP
 
 
 class SlowPart(LeafSystem):
-    """A part of a DPS that takes its time: perception, a planner, a localization.
+    """A part of a DPS that takes longer than a cycle of the loop: perception, a planner, a localization.
 
     .. pydrake_system::
 
@@ -230,45 +232,44 @@ class SlowPart(LeafSystem):
         - dps (only with ``samples_dps``; filled by `AddressedDiagram.attach`)
         output_ports:
         - <output>
-        - sampled_at (s; when the inputs were sampled that the outputs belong to, at first -inf)
-        - valid (1 if the result that was due last was there, else 0)
-        - missed (how many were not)
+        - sampled_at (s; when the inputs of the present outputs were sampled, at first -inf)
+        - valid (1 if the result that was due last arrived in time, else 0)
+        - missed (the number of results that did not)
         - taken (only with ``on_request``: the request that was taken last, at first 0)
 
-    At t_k = offset + k period it samples its inputs. From t_k + latency on, its outputs show ``function`` of them,
-    also to systems that are updated at that very instant. Until the first result they show ``initial``.
+    At t_k = offset + k period the part samples its inputs. From t_k + latency on, its outputs show ``function`` of
+    these inputs, also to systems that are updated at that very instant. Until the first result they show ``initial``.
 
     In a simulation, the function is computed when its result is due. A runtime computes it in another process, and
     delivers the result with `deliver` at any time before. If a result is declared missing, the outputs stay unchanged.
     A result that has neither arrived nor been declared missing is computed here, so that a copy of a running context
-    can continue without a runtime. A function that returns None has no result: it is missing.
+    can continue without a runtime. If the function returns None, the result is missing.
 
-    On request, it samples its inputs at the first t_k at which the request is neither 0 nor the one that was taken
-    last, and no other one is being worked on. A request that is still there when another one is done is taken then.
+    On request, the part samples its inputs at the first t_k at which the request is neither 0 nor the one that was
+    taken last, and no other request is being worked on. A request that comes meanwhile, and stays, is taken afterwards.
 
-    All its memory lies in its context, as arrays: the samples and results under way, latency / period of them, and
-    the memory.
+    All memory of the part lies in its context, as arrays: up to latency / period samples and results under way, and the
+    memory of the function.
 
     Args:
-        function: ``function(**inputs)`` returns the outputs by name, or, if there is one only, its value. It depends
-            on nothing else, changes nothing, and travels by cloudpickle. If it has a method ``prepare``, the process
-            beside a loop calls it once, before the first sample; a simulation does not.
-        inputs: By name, the size of a vector port, or a value like those of an abstract one.
-        outputs: Likewise.
-        period, latency, offset: In seconds. The latency may be longer than the period.
-        initial: Outputs until the first result; by default zeros, and the values given in ``outputs``.
-        memory: What the function remembers from one call to the next, at first: it is the argument ``memory``, and
-            the function returns ``(outputs, memory)``. A call begins with the memory of the last one whose result has
-            come, be it too late to be shown.
-        on_request: Whether it works on request only. The function gets the ``request``, (1,).
-        samples_dps: Whether the function gets ``dps``, the state of the whole DPS as a `DpsState`, too. A DPS has one
-            such part at most, which works on one sample at a time.
-        codecs: By port name or ``memory``, how values become arrays, where `codec_of` has no codec.
-        patience: After how many latencies without an answer a runtime ends the other process, and starts another.
+        function: ``function(**inputs)`` returns the outputs by name, or the value of a single output. It depends on
+            nothing else and has no side effects. It is sent to the other process by cloudpickle. If it has a method
+            ``prepare``, the process beside a loop calls that once, before the first sample; a simulation does not.
+        inputs: Name -> the size of a vector port, or a model value of an abstract one.
+        outputs: Name -> size or model value, as for the inputs.
+        period, latency, offset: Times in seconds. The latency may be longer than the period.
+        initial: Outputs until the first result; by default zeros, and the model values in ``outputs``.
+        memory: Initial memory of the function: it gets the argument ``memory``, and returns ``(outputs, memory)``. A
+            call begins with the memory of the last call whose result has arrived, even if too late to be shown.
+        on_request: Whether the part works on request only. The function gets the ``request``, shape (1,).
+        samples_dps: Whether the function also gets ``dps``, the state of the whole DPS as a `DpsState`. A DPS has at
+            most one such part, which works on one sample at a time.
+        codecs: Port name or ``memory`` -> the codec of its values, if `codec_of` has none.
+        patience: The number of latencies without an answer after which a runtime replaces the other process.
 
     Attributes:
-        function: From arrays to arrays, see `SlowFunction`.
-        samples_dps: See above.
+        function: The function from arrays to arrays, see `SlowFunction`.
+        samples_dps: Whether the function gets the state of the whole DPS.
 
     Raises:
         ValueError: A name or a time is impossible, more than 16 samples would be under way (or, of the state of the
@@ -430,7 +431,7 @@ class SlowPart(LeafSystem):
     # -- the state of the whole DPS, for a part that samples it
 
     def sample_dps_by(self, read: DpsReader) -> None:
-        """Set how the state of the DPS is read; the Diagram that is ready calls it once."""
+        """Set the reader of the state of the DPS; called once, by the finished Diagram."""
         self._read_dps = read
 
     def attach(self, context: Context) -> None:
@@ -464,12 +465,13 @@ class SlowPart(LeafSystem):
     def function_beside(self, period: float) -> SlowFunction:
         """Return the function for a process beside a loop with this period in seconds.
 
-        An answer has the latency less a period: its sample leaves after a step, and it is needed before another.
+        The time for an answer is the latency less a period: a sample is sent after a step, and the answer is needed
+        before another step.
         """
         return self.function
 
     def deliver(self, context: Context, tick: int, arrays: Arrays) -> None:
-        """Deliver the result of sample number ``tick``: it is shown when it is due, and its memory counts at once.
+        """Deliver the result of sample number ``tick``: it is shown when it is due; its memory is used at once.
 
         If the result is not awaited, only its memory is used.
 
@@ -480,7 +482,7 @@ class SlowPart(LeafSystem):
                 missing.
 
         Raises:
-            SlowPartError: The arrays are none of these.
+            SlowPartError: The arrays have other names or shapes.
         """
         self._check_result(arrays)
         own = self.GetMyMutableContextFromRoot(context)
@@ -498,9 +500,9 @@ class SlowPart(LeafSystem):
                 raise SlowPartError(f"the result {name} has {size} entries, not the shape {arrays[name].shape}")
 
 
-def slow_parts(diagram: Diagram, *, below: str = "dps") -> dict[str, SlowPart]:
-    """Return the slow parts in the DPS of a testbed's diagram (or below another path), by path."""
-    found = {path: system for path, system in leaves(diagram) if path == below or path.startswith(f"{below}.")}
+def slow_parts(diagram: Diagram) -> dict[str, SlowPart]:
+    """Return the slow parts in the DPS of a testbed's diagram, by path."""
+    found = {path: system for path, system in leaves(diagram) if path == "dps" or path.startswith("dps.")}
     return {path: system for path, system in found.items() if isinstance(system, SlowPart)}
 
 

@@ -147,14 +147,14 @@ class Switches:
 
     Attributes:
         sense, act: The selectors, by signal.
-        sim_sense, real_sense: Where the simulated and the real sensors go, by signal.
-        dps_sense: What the DPS reads, by signal.
-        sim_act, real_act: What the simulated and the real actuators get, by signal.
-        active: Port of the flags of all actuator signals.
-        commands: Where the constant commands u come from, by signal.
+        sim_sense, real_sense: Input ports for the simulated and the real sensors, by signal.
+        dps_sense: Output ports for the sensor inputs of the DPS, by signal.
+        sim_act, real_act: Output ports for the simulated and the real actuators, by signal.
+        active: Output port of the flags of all actuator signals.
+        commands: Output ports of the constant commands u, by signal.
 
     Args:
-        u: The commands that are constants, by signal, with their defaults.
+        u: Default values of the constant commands, by signal.
     """
 
     def __init__(

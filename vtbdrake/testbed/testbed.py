@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.state import Snapshot, SnapshotError, Variables
+from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, TWIN
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BeliefRule:
-    """How estimates of the DPS set a variable of the world.
+    """How estimates of the DPS set a variable of the world; see `VirtualTestbedBuilder.believe`.
 
     ``target`` (an address in sim) is ``by`` of the estimates at the addresses ``of`` (in dps).
 
-    ``age`` is the time in seconds from the instant of the world that the estimates are about to that of the sensor
-    values from which they are made: that of sampling, say. What lies between machine and DPS does not count.
+    ``age`` is the age of the estimates in seconds when the DPS gets the sensor values from which they are computed, for
+    example because a sensor is sampled. Delays between machine and DPS do not count.
 
     ``period`` is the sample period of the estimates in seconds, 0 if they are computed at any time. If it is given,
-    ``by`` gets the keyword ``late``, see `late`, so that it can return what the target is then.
+    ``by`` gets the keyword ``late``, see `late`, to extrapolate the target to the present.
 
     Raises:
-        ValueError: Several estimates and no ``by``, an age that is negative or infinite, or such a period, or one
-            without ``by``.
+        ValueError: There are several estimates and no ``by``; ``age`` or ``period`` is negative or infinite; or there
+            is a ``period`` without ``by``.
     """
 
     target: str
@@ -50,15 +50,17 @@ class BeliefRule:
         if not 0.0 <= self.age < inf:
             raise ValueError(f"the age of the belief about {self.target} is a time of at least 0 s, not {self.age!r}")
         if self.by is None and len(self.of) != 1:
-            raise ValueError(f"the belief about {self.target} is of {len(self.of)} estimates: say with by= how")
+            raise ValueError(
+                f"the belief about {self.target} is of {len(self.of)} estimates: give the function of them as by="
+            )
         if self.period is not None and not 0.0 <= self.period < inf:
             raise ValueError(
                 f"the sample period of the belief about {self.target} is a time of at least 0 s, not {self.period!r}"
             )
         if self.period is not None and self.by is None:
             raise ValueError(
-                f"the belief about {self.target} has a sample period, but no function that uses it: say with "
-                "by=f(estimates..., late=seconds) what the target is at the present"
+                f"the belief about {self.target} has a sample period, but no function that uses it: give the present "
+                "value of the target as by=f(estimates..., late=seconds)"
             )
 
     def check(self, variables: Variables) -> None:
@@ -81,9 +83,9 @@ class BeliefRule:
         return self.value_of(estimates, late=self.late(context.get_time()))
 
     def late(self, time: float) -> float:
-        """Return the time in seconds since the instant that the estimates are about.
+        """Return the age of the estimates at ``time``, in seconds: `age`, and the time since the DPS has sampled last.
 
-        That is their age, and the time since the DPS has sampled last. What it samples at ``time`` itself comes later.
+        A sample that the DPS takes at ``time`` itself does not count yet.
         """
         if not self.period:
             return self.age
@@ -95,8 +97,8 @@ class BeliefRule:
         """Return the target's value.
 
         Args:
-            estimates: In the order of `of`.
-            late: The time in seconds since the instant that they are about. 0: the value is that of this instant.
+            estimates: Values of the estimates, in the order of `of`.
+            late: Age of the estimates in seconds; 0: the target's value at the instant that they describe.
         """
         if self.by is None:
             return estimates[0]
@@ -157,11 +159,11 @@ class VirtualTestbed(AddressedDiagram):
             port carries no command: NaN, or an empty `ActuatorCommand` for an abstract signal. No system in it touches
             anything outside the Diagram, so that any of its contexts can be simulated without side effects.
         dps: The data processing system, a direct subsystem of the diagram.
-        plant, scene_graph: Those of the simulated world, if it has them.
+        plant, scene_graph: Plant and SceneGraph of the simulated world, or None.
         simulated_sensors, simulated_actuators: The systems that offer sensor signals or take actuator signals, by
             signal.
         belief_rules: How estimates of the DPS set variables of the simulated world.
-        visualized: True if a Meshcat draws it.
+        visualized: True if the testbed draws into a Meshcat.
     """
 
     def __init__(
@@ -171,10 +173,11 @@ class VirtualTestbed(AddressedDiagram):
         switches: Switches,
         diagram: Diagram,
         *,
+        commands: Sequence[Variable],
         scenario: Scenario | None,
         visualized: bool,
     ) -> None:
-        """Take over what `VirtualTestbedBuilder.build` has made of its parts."""
+        """Make the testbed of the parts that `VirtualTestbedBuilder.build` has put together."""
         self._sense, self._act = switches.sense, switches.act
         selectors = [*self._sense.values(), *self._act.values()]
         super().__init__(
@@ -182,7 +185,7 @@ class VirtualTestbed(AddressedDiagram):
             interface=parts.interface,
             simulator_config=parts.simulator_config,
             scenario=scenario,
-            extra=[*(selector.variable() for selector in selectors), *parts.extra_variables],
+            extra=[*(selector.variable() for selector in selectors), *commands],
             plant_roles=parts.plant_roles(),
         )
         self.dps = dps
@@ -253,7 +256,7 @@ class VirtualTestbed(AddressedDiagram):
         """Make ``context`` continue from ``snapshot``: s_sim(t0) from a file.
 
         Raises:
-            SnapshotError: It is of another scenario, or of a testbed that is built in another way.
+            SnapshotError: The snapshot is of another scenario, or of a testbed that is built in another way.
         """
         self.check_context(context)
         self.check_scenario(snapshot)
@@ -276,11 +279,14 @@ class VirtualTestbed(AddressedDiagram):
         An estimate beyond the bounds of its target (a joint a little past its stop) is clipped.
 
         Raises:
-            ValueError: The testbed declares no belief, or a variable refuses what is believed of it.
+            ValueError: The testbed declares no belief, or a variable refuses its believed value.
         """
         self.check_context(context)
         if not self.belief_rules:
-            raise ValueError("this testbed does not declare what of its DPS sets its simulated world (see `believe`)")
+            raise ValueError(
+                "this testbed does not declare which estimates of its DPS set its simulated world: see "
+                "VirtualTestbedBuilder.believe"
+            )
         self.write(
             context,
             {
