@@ -1,5 +1,6 @@
 """Tests of the choices of a scanner and of a route: what counts, and that the testbed is asked as it should be."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import DOUBTFUL, TRACKING
 from vtbdrake.testbed import ScenarioError
-from vtbdrake_diagrams.forest.drives import Drive, Track
+from vtbdrake_diagrams.forest import next_route
+from vtbdrake_diagrams.forest.drives import Drive, Track, localize, simulated_drive
 from vtbdrake_diagrams.forest.next_route import (
     COUNTED,
     FOUND,
@@ -32,6 +34,7 @@ from vtbdrake_diagrams.forest.scanner_choice import (
 )
 from vtbdrake_diagrams.forest.scanner_choice import UNKNOWN as FAR
 from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.stand import REMOTE, Stand
 
 # The true pose and velocity, and the time of the pose of the DPS: the carrier has come 3 cm and 4 cm since then.
 TRUTH, VELOCITY, LAG = np.array([3.03, 4.04, 0.5, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0, 1.5, 2.0, 0.0]), 0.02
@@ -90,6 +93,20 @@ def test_error_of_a_drive_is_that_of_its_end() -> None:
     track = Track(drive, poses, np.tile(np.eye(3), (4, 1, 1)), np.array([TRACKING, TRACKING, DOUBTFUL, TRACKING]))
     # Without a pose and far off, it counts as unknown.
     assert late_error(track) == pytest.approx(((0.25 + 2.0 * UNKNOWN**2) / 3.0) ** 0.5)
+
+
+def test_map_in_use_comes_before_the_other_surveys(monkeypatch: pytest.MonkeyPatch) -> None:
+    def drive(one: RouteScenario, *, length: float) -> Drive:
+        assert length == one.speed * (FOUND + HORIZON)
+        return simulated_drive(one.stand(), seed=one.route, length=6.0)
+
+    monkeypatch.setattr(next_route, "recorded_drive", drive)
+    monkeypatch.setattr(next_route, "SURVEYS", 1)
+    scenario = RouteScenario(seed=3, length=60.0, width=60.0, stand_kind="natural", density=800.0, map_seed=5)
+    found = next_route.errors_by_map(scenario)
+    assert found.shape == (2, 2) and (found < 0.3).all() and len(np.unique(found)) == 4
+    unit = scenario.unit(Stand(seed=3, length=60.0, width=60.0, density=800.0, road_width=4.0).map(REMOTE, seed=5))
+    assert found[0, 1] == late_error(localize(drive(replace(scenario, route=1), length=86.0), unit))
 
 
 def test_summary_compares_the_choice_with_all_routes() -> None:
