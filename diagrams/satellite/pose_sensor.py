@@ -119,6 +119,7 @@ class PoseReader(LeafSystem):
             parameter("latency", 0, unit="s", bounds=(0.0, 1.0)),
             parameter("deviation", 0, start=1, unit="m", bounds=(0.0, inf)),
         )
+        self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> EventStatus:

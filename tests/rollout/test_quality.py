@@ -1,19 +1,23 @@
 """Qualities, constraints and how their samples are read."""
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf, nan
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydrake.common.value import Value
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import ZeroOrderHold
 from scipy.special import ellipj, ellipk
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import Constraint, Quality, QualityError, RolloutRunner, RolloutTask
 from vtbdrake.rollout.quality import best_sample, exceeds
+from vtbdrake.state import discrete_state
 
 PERIOD = 0.1
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -192,6 +196,40 @@ def test_a_rollout_steps_like_a_simulation_with_events():
     simulator.AdvanceTo(750 * 0.02)
     assert runner.steps == simulator.get_num_steps_taken() == 750
     assert result.quality[-1] == abs(testbed.read(context, SHOULDER))
+
+
+class Ticks(LeafSystem):
+    """Counts unrestricted updates, whose period Drake does not tell."""
+
+    def __init__(self, period):
+        super().__init__()
+        self.variables = (discrete_state("ticks", self.DeclareDiscreteState(1)),)
+        self.timings = ((period, 0.0),)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._count)
+
+    def _count(self, context, state):
+        state.get_mutable_discrete_state(0).SetFromVector(context.get_discrete_state(0).value() + 1.0)
+
+
+@dataclass
+class WithTicks(AcrobotScenario):
+    other: float = 0.1
+
+    def add_world(self, builder):
+        super().add_world(builder)
+        builder.add("env", "other", Ticks(self.other))
+        builder.add("env", "hold", ZeroOrderHold(0.3, Value(0.0)))
+
+
+@pytest.mark.parametrize(("period", "other", "sample_period"), [(0.02, 0.1, 0.1), (0.02, 0.05, 0.1), (0.1, 0.03, 0.3)])
+def test_samples_come_before_all_updates_of_their_instant(period, other, sample_period):
+    counts = {"dps.ticks": period, "sim.env.other.ticks": other}
+    scenario = WithTicks(period=period, other=other, time_step=period)
+    runner = RolloutRunner(RolloutTask(scenario, 15.0, record=list(counts), sample_period=sample_period))
+    result = runner.run({})
+    for address, own in counts.items():
+        np.testing.assert_array_equal(result.record[address], np.ceil(np.round(result.times / own, 6)))
+    assert (0.3, 0.0) in runner.testbed.event_timings()
 
 
 THETA = "sim.sys.Pendulum.theta.position"

@@ -71,6 +71,7 @@ class Arrival(LeafSystem):
             discrete_state("number", self._number, bounds=(0.0, inf)),
             parameter("age", 0, unit="s", bounds=(0.0, inf)),
         )
+        self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> EventStatus:

@@ -229,24 +229,23 @@ class RolloutTask:
         return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
 
     def instants(self, t0: float, timings: Sequence[tuple[float, float]]) -> np.ndarray:
-        """Return the simulator's time at each sample: t0 + t, or the instant of an event that coincides up to rounding.
+        """Return the simulator's time at each sample: t0 + t, or that of the first event that coincides up to rounding.
 
         Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
-        advanced to the one would take another step, of 1e-16 s, to the other.
+        advanced to the one would take another step, of 1e-16 s, to the other. And the updates of the other would have
+        happened at some of the samples, which are to show the state before all updates of their instant.
 
         Args:
             t0: Time at which rollouts begin, in seconds.
             timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
         """
         times = t0 + self.sample_times()
-        snapped = times.copy()
         # Two ways to compute an instant may differ by some roundings.
         close = 8.0 * np.spacing(np.maximum(np.abs(times), 1.0))
-        distance = np.full(times.shape, np.inf)
+        first = np.full(times.shape, np.inf)
         for period, offset in timings:
             events = offset + np.maximum(np.round((times - offset) / period), 0.0) * period
-            away = np.abs(events - times)
-            nearer = (away <= close) & (away < distance)
-            snapped[nearer], distance[nearer] = events[nearer], away[nearer]
-        snapped[0] = t0
-        return snapped
+            first = np.where(np.abs(events - times) <= close, np.minimum(first, events), first)
+        instants = np.where(np.isfinite(first), first, times)
+        instants[0] = t0
+        return instants

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
+from pydrake.systems.primitives import ZeroOrderHold
 
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
@@ -203,14 +204,20 @@ class AddressedDiagram:
     def event_timings(self) -> tuple[tuple[float, float], ...]:
         """Return (period, offset) in seconds of the periodic updates of all systems, each pair once.
 
-        The n-th update is at offset + n * period. Of unrestricted updates, those of discrete plants are known; Drake
-        does not tell the timings of others, of publishing, nor of a system with several.
+        The n-th update is at offset + n * period. Drake tells the timing of a system with one kind of discrete updates.
+        That of discrete plants and of holds is known, too; of other unrestricted updates, and of several updates, it is
+        what the system declares in an attribute ``timings``, pairs like these.
         """
         systems = [system for _, system in leaves(self.diagram)]
         attributes = (system.GetUniquePeriodicDiscreteUpdateAttribute() for system in systems)
         timings = {(a.period_sec(), a.offset_sec()) for a in attributes if a is not None}
-        steps = {system.time_step() for system in systems if is_plant(system)}
-        return tuple(sorted(timings | {(step, 0.0) for step in steps if step > 0.0}))
+        for system in systems:
+            timings.update(getattr(system, "timings", ()))
+            if is_plant(system) and system.time_step() > 0.0:
+                timings.add((system.time_step(), 0.0))
+            elif isinstance(system, ZeroOrderHold):  # Of an abstract value: an unrestricted update.
+                timings.add((system.period(), system.offset()))
+        return tuple(sorted(timings))
 
     # -- addresses
 

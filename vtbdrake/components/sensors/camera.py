@@ -181,6 +181,7 @@ class Camera(LeafSystem):
         entry = self.DeclareCacheEntry("scene", scenes, {self.nothing_ticket()})
         self._scene = entry.cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
+        self.timings = ((self._period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, self._sample)
 
     def _declare_parameters(

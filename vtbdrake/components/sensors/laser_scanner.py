@@ -230,6 +230,7 @@ class LaserScanner(LeafSystem):
             *self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors),
             *self._declare_state(),
         )
+        self.timings = ((self._slice_period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._slice_period, 0.0, self._end_slice)
 
     def _declare_parameters(
