@@ -35,7 +35,8 @@ class ResidualConfig:
         period: Period of the machine's cycles and the DPS's, in seconds.
         horizon: Length of a prediction in periods, after which it restarts from the belief.
         delay: Periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
-            where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on.
+            where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on. A
+            machine whose samples lack the period that simulated sensors take has one less.
         settle: Windows that are predicted but not used at first and after a gap, while state that the belief does not
             cover (currents of drives, samples in transit) follows the actuator commands.
         values: Values of variables of the predicted world by address, such as the assumed payload.
