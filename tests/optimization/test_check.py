@@ -67,6 +67,30 @@ def test_memory_in_self_is_named_with_its_system(again, what):
     assert not found.ok and str(found) == finding
 
 
+class WithModel(SampledFeedback):
+    """Computes with a plant, whose Context it keeps; it sets all of it before each use."""
+
+    def __init__(self):
+        super().__init__(0.02)
+        self._plant = AcrobotScenario().build().plant
+        self._model = self._plant.CreateDefaultContext()
+
+    def _update(self, context, discrete):
+        self._plant.SetPositionsAndVelocities(self._model, self._state.Eval(context))
+        discrete.set_value(0, [-0.1 * self._plant.CalcPotentialEnergy(self._model)])
+
+
+@dataclass
+class ModelScenario(AcrobotScenario):
+    def make_dps(self):
+        return WithModel()
+
+
+def test_a_context_kept_in_self_is_named():
+    (finding,) = _problem(ModelScenario()).check().findings
+    assert finding.startswith("self._model of dps (WithModel) is a Context: rollouts in threads share it")
+
+
 def test_a_quality_with_memory_is_named():
     calls = []
 

@@ -10,6 +10,7 @@ from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import ContextBase
 
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
@@ -83,7 +84,7 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
         sending = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
     end, sample = reference[-1]
     failure = next((measured for measured in sample[""] if isinstance(measured, str)), "")
-    return Check((*findings, *sending), float(end), failure)
+    return Check((*findings, *_kept_contexts(testbed), *sending), float(end), failure)
 
 
 def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:
@@ -167,6 +168,18 @@ def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
         for name, value in vars(system).items()
         if not name.startswith("_pydrake")
     }
+
+
+def _kept_contexts(testbed: VirtualTestbed) -> Iterator[str]:
+    """Yield a finding per Context that a system in Python keeps, of a plant with which it computes for example."""
+    for path, system in leaves(testbed.diagram):
+        for name, value in vars(system).items() if path in testbed.python_systems else ():
+            if isinstance(value, ContextBase):
+                yield (
+                    f"self.{name} of {path} ({type(system).__name__}) is a Context: rollouts in threads share it, and "
+                    "one computes with what another has set. Keep it in a cache entry (DeclareCacheEntry), or use "
+                    "executor='processes' or 'serial'"
+                )
 
 
 def _fingerprint(value: Any) -> Any:
