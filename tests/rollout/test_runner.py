@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 from pydrake.common import RandomDistribution
+from pydrake.geometry import DrakeVisualizer
+from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import RandomSource
@@ -505,6 +507,20 @@ class WithGusts(AcrobotScenario):
 def test_what_no_copy_can_repeat_is_refused():
     with pytest.raises(ValueError, match="no copy can continue"):
         WithGusts().build()
+
+
+@dataclass
+class DrawingScenario(PendulumScenario):
+    def add_world(self, builder):
+        super().add_world(builder)
+        DrakeVisualizer.AddToBuilder(builder.diagram_builder, builder.scene_graph, DrakeLcm("memq://"))
+
+
+def test_a_rollout_does_not_draw():
+    assert DrawingScenario().build().visualized
+    assert not PendulumScenario().build().visualized
+    with pytest.raises(ValueError, match="a rollout does not draw: .* without visualizers in its world"):
+        RolloutRunner(RolloutTask(DrawingScenario(), 0.1))
 
 
 def test_a_rollout_does_not_keep_the_pace_of_its_scenario():

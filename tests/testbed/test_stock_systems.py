@@ -31,7 +31,7 @@ from pydrake.perception import BaseField, Fields, PointCloud
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.controllers import InverseDynamicsController, PidControlledSystem, PidController
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, PortDataType
-from pydrake.systems.lcm import LcmSubscriberSystem
+from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 from pydrake.systems.primitives import (
     ConstantValueSource,
     DiscreteDerivative,
@@ -238,6 +238,14 @@ def test_cameras_that_are_sampled_by_a_composite_come_back():
         (
             lambda: LcmSubscriberSystem.Make("X", lcmt_iiwa_command, pydrake.lcm.DrakeLcm("memq://")),
             "LcmSubscriberSystem, which receives data from outside the Diagram: feed the DPS by a real port",
+        ),
+        (
+            lambda: LcmPublisherSystem.Make("X", lcmt_iiwa_command, pydrake.lcm.DrakeLcm("memq://"), PERIOD),
+            "LcmPublisherSystem, which sends data out of the Diagram, from every copy of it, too: let a bridge send it",
+        ),
+        (
+            lambda: LcmInterfaceSystem(pydrake.lcm.DrakeLcm("memq://")),
+            "LcmInterfaceSystem, which receives data from outside",
         ),
         (
             lambda: ZeroOrderHold(PERIOD, Value([1, 2])),

@@ -53,7 +53,9 @@ class RolloutRunner:
                 "the testbed was built from another scenario than the task's: leave it out, and a new one is built"
             )
         if self.testbed.visualized:
-            raise ValueError("a rollout does not draw: build the scenario without meshcat")
+            raise ValueError(
+                "a rollout does not draw: build the scenario without meshcat, and without visualizers in its world"
+            )
         self._variables = self.testbed.variables()
         # f first, then what else is measured.
         self._measures = [*([task.quality] if task.quality else []), *task.measures]

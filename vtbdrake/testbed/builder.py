@@ -10,7 +10,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
 from vtbdrake.state.codecs import abstract_state
-from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, name_systems
+from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, BeliefRule, VirtualTestbed, check_mode
@@ -28,6 +28,7 @@ P = TypeVar("P", InputPort, OutputPort)
 
 # Systems of Drake that copies of a context cannot continue, and what to use instead.
 _LISTENS = "which receives data from outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
+_SENDS = "which sends data out of the Diagram, from every copy of it, too: let a bridge send it (see Protocol)"
 _REFUSED = {
     "RandomSource": "whose generator no copy can continue: compute noise from (seed, stream, tick), as the sensors in "
     "vtbdrake.components do",
@@ -36,9 +37,17 @@ _REFUSED = {
     "SchunkWsgTrajectoryGenerator": "which keeps its trajectory in itself, where no copy can find it: use a "
     "SchunkWsgPositionController",
     "LcmSubscriberSystem": _LISTENS,
+    "LcmInterfaceSystem": _LISTENS,
+    "LcmPublisherSystem": _SENDS,
+    "LcmScopeSystem": _SENDS,
     "JointSliders": _LISTENS,
     "MeshcatPoseSliders": _LISTENS,
 }
+
+
+def _draws(system: System) -> bool:
+    """Return whether a system is one of Drake's visualizers, which draw whatever context is simulated."""
+    return not is_python(system) and class_name(system).endswith("Visualizer")
 
 
 class VirtualTestbedBuilder:
@@ -245,14 +254,15 @@ class VirtualTestbedBuilder:
 
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.diagram_builder, self.scene_graph, meshcat, parameters)
+        diagram = self.build_diagram("vtb")
         return VirtualTestbed(
             self,
             self._dps,
             switches,
-            self.build_diagram("vtb"),
+            diagram,
             commands=commands,
             scenario=scenario,
-            visualized=meshcat is not None,
+            visualized=any(_draws(system) for _, system in leaves(diagram)),
         )
 
     def build_diagram(self, name: str) -> Diagram:
