@@ -125,6 +125,13 @@ def test_the_ends_of_the_range_are_told_as_such():
     assert str(_sweep(unsafe).boundary()) == "m: not safe at 0 kg, the smallest value examined"
 
 
+@pytest.mark.parametrize("unit", ["", "1"])
+def test_a_boundary_without_unit_is_a_plain_number(unit):
+    outcomes, _ = _examine(_refinement(), lambda m, _: m > 30.0)
+    boundary = replace(_sweep(outcomes).boundary(), unit=unit)
+    assert boundary.interval_text(30.0, 31.0) == "safe up to 30, not at 31"
+
+
 def test_a_simulation_that_fails_is_not_safe():
     boundary = _sweep({(0.0, 0): False, (5.0, 0): None, (10.0, 0): True}).boundary()
     assert (boundary.lower, boundary.upper, boundary.failed_at) == (0.0, 5.0, (5.0,))

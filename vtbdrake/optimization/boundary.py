@@ -115,17 +115,18 @@ class Boundary:
         """Show the interval, the chances in between and a plot in a notebook."""
         from vtbdrake.visualization.plots import summary_html
 
-        rows = {f"{chance.value:g} {self.unit}": str(chance) for chance in self.worst_chances}
+        rows = {self._amount(chance.value): str(chance) for chance in self.worst_chances}
         return summary_html(str(self), rows, None if self.sweep is None else self.plot())
 
     def __str__(self) -> str:
         missed = ""
         # If all steps are alike, the interval itself shows how fine they are.
         if self.gap > (0.0 if isinf(self.upper) else self.step * (1.0 + 1e-9)):
-            missed = f"; an unsafe range below that is narrower than {self.gap:.3g} {self.unit} may have been missed"
+            gap = self._amount(self.gap, digits=3)
+            missed = f"; an unsafe range below that is narrower than {gap} may have been missed"
         again = [v for v in self.safe_beyond if v > self.upper]
-        beyond = f"; not monotonic: safe again at {_listed(again, self.unit)}" if again else ""
-        ended = f"; ended early by the testbed at {_listed(self.ended_at, self.unit)}" if self.ended_at else ""
+        beyond = f"; not monotonic: safe again at {self._listed(again)}" if again else ""
+        ended = f"; ended early by the testbed at {self._listed(self.ended_at)}" if self.ended_at else ""
         failed = f" ({len(self.failed_at)} values with failed simulations: {self.failure})" if self.failed_at else ""
         interval = self.interval_text(self.lower, self.upper)
         return f"{self.address}: {interval}{self._undecided()}{missed}{beyond}{ended}{failed}"
@@ -134,24 +135,29 @@ class Boundary:
         """Return an interval of this boundary in words."""
         least, most = self.examined
         if lower == most:
-            return f"safe up to {lower:g} {self.unit}, the largest value examined"
+            return f"safe up to {self._amount(lower)}, the largest value examined"
         if upper == least:
-            return f"not safe at {upper:g} {self.unit}, the smallest value examined"
-        begin = f"not always safe at {least:g} {self.unit}" if isinf(lower) else f"safe up to {lower:g} {self.unit}"
-        end = f"not always unsafe up to {most:g} {self.unit}" if isinf(upper) else f"not at {upper:g} {self.unit}"
+            return f"not safe at {self._amount(upper)}, the smallest value examined"
+        begin = f"not always safe at {self._amount(least)}" if isinf(lower) else f"safe up to {self._amount(lower)}"
+        end = f"not always unsafe up to {self._amount(most)}" if isinf(upper) else f"not at {self._amount(upper)}"
         return f"{begin}, {end}"
 
     def _undecided(self) -> str:
         between = [c for c in self.worst_chances if self.lower < c.value < self.upper]
         if not between:
             return ""
-        counts = ", ".join(f"{c.unsafe} of {c.rollouts} unsafe at {c.value:g} {self.unit}" for c in between)
+        counts = ", ".join(f"{c.unsafe} of {c.rollouts} unsafe at {self._amount(c.value)}" for c in between)
         return f", undecided between ({counts})"
 
+    def _listed(self, values: Sequence[float]) -> str:
+        shown = self._with_unit(", ".join(f"{value:g}" for value in values[:3]))
+        return shown + (f" and {len(values) - 3} more values" if len(values) > 3 else "")
 
-def _listed(values: Sequence[float], unit: str) -> str:
-    shown = ", ".join(f"{value:g}" for value in values[:3])
-    return f"{shown} {unit}" + (f" and {len(values) - 3} more values" if len(values) > 3 else "")
+    def _amount(self, value: float, *, digits: int = 6) -> str:
+        return self._with_unit(f"{value:.{digits}g}")
+
+    def _with_unit(self, text: str) -> str:
+        return text if self.unit in ("", "1") else f"{text} {self.unit}"
 
 
 def why_no_boundary(sweep: Sweep) -> str:

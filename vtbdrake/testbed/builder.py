@@ -27,6 +27,7 @@ P = TypeVar("P", InputPort, OutputPort)
 
 
 # Systems of Drake that copies of a context cannot continue, and what to use instead.
+_PORTS = "Its ports have the names of the signals: export them under these names, from a Diagram"
 _LISTENS = "which receives data from outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
 _SENDS = "which sends data out of the Diagram, from every copy of it, too: let a bridge send it (see Protocol)"
 _REFUSED = {
@@ -189,11 +190,12 @@ class VirtualTestbedBuilder:
         known = ", ".join(inputs) or "none"
         for signal in [*self.interface.sense, *self.interface.commands]:
             if signal.name not in inputs:
-                raise SignalError(f"the DPS has no input port {signal.name}; it has: {known}")
+                raise SignalError(f"the DPS has no input port {signal.name}; it has: {known}. {_PORTS}")
             signal.check_port(inputs.pop(signal.name), "the DPS")
         for signal in self.interface.act:
             if signal.name not in outputs:
-                raise SignalError(f"the DPS has no output port {signal.name}; it has: {', '.join(outputs) or 'none'}")
+                has = ", ".join(outputs) or "none"
+                raise SignalError(f"the DPS has no output port {signal.name}; it has: {has}. {_PORTS}")
             signal.check_port(outputs[signal.name], "the DPS")
         if inputs:
             raise SignalError(f"the interface has no signal for the DPS's input port {', '.join(inputs)}")
