@@ -507,6 +507,22 @@ def test_values_that_waited_in_a_pause_are_not_acted_on(between_runs, alive):
     assert clock.now() - begin < 5.0 + (0.03 if alive else 0.2)
 
 
+def test_slow_loop_takes_no_period_for_a_pause():
+    class Waiting(ScriptedBridge):
+        def note_pause(self, since, signals):
+            raise AssertionError("no pause")
+
+    scenario, clock, period = ServoScenario(rate=0.0), SimulatedClock(), 0.1
+    assert all(signal.max_age < period for signal in scenario.interface().sense)
+    bridge = Waiting(scenario.interface(), clock, still)
+    runtime = Runtime(DpsAlone(scenario), bridge, period=period, clock=clock)
+    runtime.cycle()
+    runtime.switch("real")
+    runtime.run(cycles=2)
+    runtime.run(cycles=2)
+    assert runtime.guards.latched == () and len(bridge.sent) == 4
+
+
 @pytest.mark.parametrize(("held_up", "missed"), [(2.5, 0), (8.5, 8), (50.5, 50)])
 @pytest.mark.parametrize("asleep", [False, True])
 def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, asleep):

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
-from vtbdrake.control.guards import Guards
+from vtbdrake.control.guards import MOST_UNSENT, Guards
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepping import RESET, Cycle, Stepped
@@ -122,7 +122,9 @@ class Runtime(Stepped):
         self._patience = patience * period
         self._watchers = list(watchers)
         self._read_at = self.clock.now()  # when all that had arrived was read
-        self._shortest_age = min((monitor.max_age for monitor in self.guards.monitors.values()), default=inf)
+        # Between two cycles; after a longer one, what has waited may be too old.
+        ages = [monitor.max_age for monitor in self.guards.monitors.values()]
+        self._longest_gap = max(min(ages, default=inf), (MOST_UNSENT + 1) * period)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
         self._foreign = bridge.foreign
@@ -238,7 +240,7 @@ class Runtime(Stepped):
         begin = self.clock.now()
         if poll:
             self.bridge.poll()
-        if begin - self._read_at > self._shortest_age:
+        if begin - self._read_at > self._longest_gap:
             self._catch_up(_WAIT)
         elif lateness > self.period or self.statistics.run:
             self._read_backlog()
@@ -291,7 +293,8 @@ class Runtime(Stepped):
             patience: The longest wait, in seconds; nothing is waited for longer than its ``max_age`` or `_WAIT`.
         """
         begin, ages = self.clock.now(), {name: monitor.max_age for name, monitor in self.guards.monitors.items()}
-        old = [name for name, age in ages.items() if begin - self._read_at > age]
+        gap = begin - self._read_at
+        old = [name for name, age in ages.items() if gap > max(age, self._longest_gap)]
         dated_back = bool(old) and self.bridge.note_pause(self._read_at, old)
         self._read_backlog()
         limits = {name: begin + min(max(ages[name], _WAIT), patience) for name in old if name in self.watched}
