@@ -220,7 +220,7 @@ def test_an_unknown_address_suggests_the_nearest(world):
     with pytest.raises(AddressError, match=r"'plant.box.maas'; did you mean plant.box.mass"):
         variables["plant.box.maas"]
     for address in (None, 3, {}, ["plant.box.mass"]):
-        with pytest.raises(AddressError, match="an address is text, .* not "):
+        with pytest.raises(AddressError, match="an address is a text, .* not "):
             variables[address]
     with pytest.raises(AddressError, match="addresses begin with plant.Acrobot, plant.box"):
         variables["nothing like it at all"]

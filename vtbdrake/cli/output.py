@@ -1,4 +1,4 @@
-"""Output of the commands: numbers, tables, CSV files, recordings."""
+"""Output of the commands: numbers, CSV files, recordings."""
 
 from __future__ import annotations
 
@@ -20,15 +20,6 @@ RECORDINGS = (".csv", ".npz")
 def number(value: float) -> str:
     """Format a number with six digits, and without a negative zero."""
     return f"{value + 0.0:.6g}"
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format rows as columns under their names, as wide as their longest cell."""
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
-    lines = (header, ["-" * width for width in widths], *rows)
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
 
 
 def finite(value: Any) -> Any:

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class ArchiveError(ValueError):
-    """A file that is damaged, or of another kind."""
+    """A file is damaged, or of another kind."""
 
 
 def write_archive(path: str | os.PathLike[str], **parts: Any) -> None:
@@ -35,7 +35,7 @@ def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays:
     """Return an archive of ``kind`` with ``arrays`` and ``header`` (plain data).
 
     Raises:
-        ValueError: They would not be read again, see `read_archive`.
+        ValueError: The archive would be rejected when it is read, see `read_archive`.
     """
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

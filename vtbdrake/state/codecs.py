@@ -19,12 +19,12 @@ from vtbdrake.state.systems import class_name, is_camera, is_plant, is_scene_gra
 def codec_of(model: Any, *, varying: bool = False) -> Codec:
     """Return the codec for values like ``model``, exact to the last bit.
 
-    An array, a number, a text, a pose, a rotation, one of Drake's images or a point cloud is one array or a few; a
-    dataclass is one array per field, by its name; its fields are arrays and numbers.
+    There are codecs for arrays, numbers, texts, poses, rotations, Drake's images and point clouds, and for dataclasses
+    whose fields are arrays and numbers: these become one array per field, by its name.
 
     Args:
         model: A value of the type to encode.
-        varying: Accept arrays and images of another size than ``model``; by default they are rejected.
+        varying: Whether to accept arrays and images of another size than ``model``.
 
     Raises:
         ValueError: There is no codec for the type of ``model``.
@@ -39,7 +39,7 @@ def codec_of(model: Any, *, varying: bool = False) -> Codec:
         return Codec(lambda X_AB: {"": X_AB.GetAsMatrix34()}, _pose)
     if isinstance(model, RotationMatrix):
         return Codec(lambda R_AB: {"": R_AB.matrix()}, lambda arrays: RotationMatrix(arrays[""]))
-    # Drake's images and point clouds, without the import of their modules, which a DPS alone may do without.
+    # Drake's images and point clouds are recognized without importing their modules, which a DPS alone may not need.
     if hasattr(model, "mutable_data"):
         return _image_codec(type(model), None if varying else model.data.shape)
     if hasattr(model, "mutable_xyzs"):
@@ -165,13 +165,13 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class SnapshotError(ValueError):
-    """A snapshot that cannot be taken or applied."""
+    """A snapshot cannot be taken or applied."""
 
 
 class AbstractState:
     """Reads and writes the abstract state of one leaf system.
 
-    The codecs are those of the system's attribute ``codecs``, or else `codec_of` the present value of the state.
+    The codecs come from the system's attribute ``codecs``, or else from `codec_of` of the present value of the state.
 
     Raises:
         SnapshotError: The system keeps an abstract value that no codec can carry.
@@ -212,7 +212,7 @@ class AbstractState:
         """Return the state in the system's own context as arrays, by ``<index>/<name>``.
 
         Raises:
-            SnapshotError: The state has become something that its codec does not take.
+            SnapshotError: The codec does not accept the present state.
         """
         arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
@@ -227,10 +227,10 @@ class AbstractState:
         return {f"{index}/{name}": np.asarray(array) for name, array in parts.items()}
 
     def writer(self, arrays: Arrays) -> Callable[[Context], None]:
-        """Return a function that sets the state in the system's own context to what `read` gave.
+        """Return a function that sets the state in the system's own context to arrays of `read`.
 
         Raises:
-            SnapshotError: The arrays are not those of such a state.
+            SnapshotError: The arrays do not describe such a state.
         """
         values = {index: self._decode(index, arrays) for index in self._codecs}
 
@@ -255,8 +255,8 @@ class AbstractState:
 class DelayState(AbstractState):
     """Reads and writes the state of a DiscreteTimeDelay of abstract values.
 
-    Drake keeps it as a ring whose beginning Python cannot read. So the delayed values are read at the output, oldest
-    first, by stepping a copy; and another copy is filled through its input.
+    Drake keeps it in a ring buffer, whose beginning Python cannot read. So the delayed values are read at the output of
+    a copy, oldest first, which is stepped; and they are set by filling another copy through its input.
     """
 
     def __init__(self, path: str, system: DiscreteTimeDelay, context: Context) -> None:

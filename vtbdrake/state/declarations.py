@@ -73,8 +73,9 @@ NO_DICT: tuple[str, ...] = ()
 def weakly(owner: Any, method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that calls ``method(owner, ...)`` and does not keep ``owner`` alive.
 
-    Drake keeps what computes an output port or a cache entry in C++, where Python's garbage collector does not look. A
-    bound method there holds its system, which holds the method: neither would ever be freed, nor the Diagram around.
+    Drake keeps the functions of output ports and cache entries in C++, where Python's garbage collector cannot follow
+    references. A bound method there holds its system, which holds the method: neither would ever be freed, nor the
+    Diagram around.
     """
     reference = weakref.ref(owner)
 

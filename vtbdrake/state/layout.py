@@ -15,7 +15,7 @@ from vtbdrake.state.variables import Variable
 
 
 class LayoutError(ValueError):
-    """Contents that belong to systems of another layout."""
+    """Contents have another layout."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class FlatState:
 
     Attributes:
         names: The groups and their sizes, see `StateLayout.names`.
-        numbers: All of them, one after another, shape (n,); read only.
+        numbers: The numbers of all groups, concatenated, shape (n,); read only.
         abstract: The abstract states as arrays, by ``path/index/part``.
     """
 
@@ -36,7 +36,7 @@ class FlatState:
 class StateLayout:
     """Reads and writes the numeric groups and the abstract states of some leaf systems of a Diagram.
 
-    What SceneGraph and cameras hold is not part of it, nor is a plant's memory of its last discrete step.
+    The contents of SceneGraph and cameras are not part of a layout, nor is a plant's memory of its last discrete step.
 
     Args:
         diagram: The Diagram.
@@ -79,7 +79,7 @@ class StateLayout:
         self.size = start
 
     def indices_in(self, whole: StateLayout) -> np.ndarray:
-        """Return where in the numbers of a layout that holds this one the numbers of this one lie, shape (size,)."""
+        """Return the indices of this layout's numbers in a layout that contains this one, shape (size,)."""
         places = [whole._slices[name] for name in self._slices]
         return np.concatenate([np.arange(place.start, place.stop) for place in places] or [np.arange(0)])
 
@@ -88,7 +88,7 @@ class StateLayout:
         return next(name for name, place in self._slices.items() if place.start <= index < place.stop)
 
     def slice_of(self, variable: Variable) -> slice | None:
-        """Return where in the numbers the value of a variable lies, in C order; None if it does not lie there."""
+        """Return the slice of the numbers with the value of a variable, in C order; None if it is not among them."""
         place = variable.place
         for system, groups in self._groups if place is not None else ():
             for group, index, whole in groups:
@@ -101,7 +101,7 @@ class StateLayout:
         """Return the contents in a root context.
 
         Raises:
-            SnapshotError: An abstract state has become something that its codec does not take.
+            SnapshotError: A codec does not accept the present abstract state.
         """
         numbers = np.empty(self.size)
         for system, groups in self._groups:
@@ -125,7 +125,7 @@ class StateLayout:
         """Set the contents of a root context.
 
         Raises:
-            LayoutError: They are of another layout. Nothing has been set then.
+            LayoutError: The contents are of another layout; nothing has been set.
             SnapshotError: The arrays of an abstract state do not fit.
         """
         self.check(contents)
@@ -138,10 +138,10 @@ class StateLayout:
             write(system.GetMyMutableContextFromRoot(context))
 
     def check(self, contents: FlatState) -> None:
-        """Raise an error if the contents are of another layout.
+        """Check that contents are of this layout.
 
         Raises:
-            LayoutError: They are; it names the first difference.
+            LayoutError: The contents are of another layout; the message names the first difference.
         """
         if contents.names != self.names:
             raise LayoutError(difference(contents.names, self.names))
@@ -150,7 +150,7 @@ class StateLayout:
 
 
 def difference(found: tuple[str, ...], expected: tuple[str, ...]) -> str:
-    """Return what distinguishes the names of one layout from those of another, as text; empty if nothing does."""
+    """Return the first differences between the names of two layouts as text; empty if there are none."""
     missing = [name for name in expected if name not in found]
     foreign = [name for name in found if name not in expected]
     parts = [f"it lacks {missing[0]}"] if missing else []

@@ -88,9 +88,9 @@ def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 def element_address(
     plant: MultibodyPlant, element: RigidBody | Joint | FixedOffsetFrame | JointActuator, prefix: Prefix
 ) -> str:
-    """Return ``prefix.instance.element``, without an instance that Drake itself has named.
+    """Return the address ``prefix.instance.element``, without an instance that Drake itself has named.
 
-    An element that bears its model instance's name is called by it alone.
+    If an element has the name of its model instance, the name occurs once.
     """
     instance = plant.GetModelInstanceName(element.model_instance())
     named = element.model_instance() not in (world_model_instance(), default_model_instance())
@@ -284,8 +284,8 @@ def _friction(
 ) -> Iterator[Variable]:
     """Yield ``friction``, one coefficient for all geometries, and the static and dynamic ones that carry it.
 
-    What is read of ``friction`` is the first geometry's dynamic one: Drake's discrete and convex contact models use
-    the dynamic coefficients only.
+    The value of ``friction`` is the dynamic coefficient of the first geometry: Drake's discrete and convex contact
+    models use the dynamic coefficients only.
     """
     by_geometry = f"{address}.friction_by_geometry"
 

@@ -28,13 +28,13 @@ class Snapshot:
 
     Attributes:
         time: Time t in seconds.
-        scenario: Plain data that identifies what the snapshot belongs to; empty for a bare Diagram.
+        scenario: Plain data that identifies the scenario; empty for a bare Diagram.
         values: The addressed variables (derived ones left out), by address.
         groups: Every numeric group and, through its codec, every abstract state of every leaf system, under
             ``path/group/index`` and ``path/abstract/index/name``.
 
-    Two snapshots are equal if all of that is, where NaN equals NaN. Arrays are read only. The contact
-    results of a discrete plant's last step are not part of it: Python cannot read them.
+    Two snapshots are equal if all attributes are, where NaN equals NaN. Arrays are read only. The contact results of a
+    discrete plant's last step are not part of a snapshot: Python cannot read them.
     """
 
     time: float
@@ -80,8 +80,8 @@ class Snapshot:
     def compare(self, other: Snapshot) -> dict[str, float]:
         """Return the largest absolute difference to another snapshot, by address or group.
 
-        ``inf`` stands where only one of them has the entry, it has another shape, or it is not of real numbers. Equal
-        entries (NaN equals NaN) are left out, so that ``not a.compare(b)`` means that they are identical.
+        The difference is ``inf`` if only one snapshot has the entry, or if the shapes differ or the values are not real
+        numbers. Equal entries (NaN equals NaN) are left out: if ``a.compare(b)`` is empty, the snapshots are identical.
         """
         differences = {} if self.time == other.time else {"time": abs(self.time - other.time)}
         for mine, theirs in ((self.values, other.values), (self.groups, other.groups)):
@@ -110,7 +110,7 @@ class Snapshot:
         """Return the snapshot of a file that `save` wrote, or of the bytes of `to_bytes`.
 
         Raises:
-            ArchiveError: It is not a snapshot, is damaged, or was written by another version.
+            ArchiveError: The source is not a snapshot, is damaged, or was written by another version.
         """
         return read_archive(source, kind=KIND, version=VERSION, make=cls._from_parts)
 
@@ -138,8 +138,8 @@ def take(
     """Return the snapshot of ``context``.
 
     Raises:
-        SnapshotError: A system keeps something abstract that neither a codec nor a hidden variable carries.
-            (Of a testbed, it is refused when the testbed is built.)
+        SnapshotError: A system has an abstract value that neither a codec nor a hidden variable carries. (A testbed
+            with such a system is refused when it is built.)
     """
     groups: dict[str, np.ndarray] = {}
     for path, system in leaves(diagram):
@@ -240,11 +240,11 @@ class StateCopier:
 
     Args:
         source, target: The Diagrams; they may be the same one.
-        source_variables, target_variables: Theirs.
-        only: Selects the systems of the target that are copied, by path; left out, all are.
+        source_variables, target_variables: The variables of the Diagrams.
+        only: Predicate of a path that selects the systems of the target to copy; by default all.
 
     Raises:
-        ValueError: The two are not built alike.
+        ValueError: The source lacks a system of the target.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class StateCopier:
         Args:
             source: Context of the source Diagram.
             target: Context of the target Diagram.
-            hidden: Addresses of the hidden variables that can differ; left out, all are compared.
+            hidden: Addresses of the hidden variables that can differ; by default all.
         """
         target.SetTime(source.get_time())
         for from_system, to_system in self._pairs:

@@ -49,8 +49,8 @@ def class_name(system: System) -> str:
 def name_systems(diagram: Diagram) -> None:
     """Name every system below ``diagram`` that has no name by its class: ``ZeroOrderHold``, ``ZeroOrderHold_2``, ...
 
-    Those of one class are counted in the Diagram's order, so that two builds of one recipe get the same names. Drake
-    itself calls them by their addresses in memory.
+    The systems of one class are counted in the Diagram's order, so that two builds of one scenario get the same names.
+    Drake itself names them by their addresses in memory.
     """
     systems = diagram.GetSystems()
     taken = {system.get_name() for system in systems if not _UNNAMED.search(system.get_name())}
@@ -74,12 +74,12 @@ def pose_from_array(value: np.ndarray) -> RigidTransform:
 
 
 def pose_later(pose: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-    """Return where a body is after ``dt`` seconds if its spatial velocity stays.
+    """Return the pose of a body after ``dt`` seconds of constant spatial velocity.
 
     Args:
-        pose: Its pose X_WB, [x, y, z, roll, pitch, yaw] in m and rad, shape (6,).
-        velocity: Its spatial velocity V_WB, [angular in rad/s, that of Bo in m/s], shape (6,).
-        dt: Negative for where it was before.
+        pose: Pose X_WB of the body, [x, y, z, roll, pitch, yaw] in m and rad, shape (6,).
+        velocity: Spatial velocity V_WB of the body, [angular in rad/s, of Bo in m/s], shape (6,).
+        dt: Time in seconds; negative for an earlier pose.
     """
     X_WB, turn = pose_from_array(pose), dt * np.asarray(velocity[:3])
     angle = float(np.linalg.norm(turn))
@@ -90,7 +90,7 @@ def pose_later(pose: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
 def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | None = None) -> Iterator[Variable]:
     """Yield the variables of a leaf system that is neither a plant nor a SceneGraph.
 
-    ``declared`` names its elements where the system itself, one of Drake's, cannot.
+    ``declared`` names the elements of a system of Drake's, which has no declaration of its own.
     """
     if is_camera(system):
         yield from _camera_pose(path, system)

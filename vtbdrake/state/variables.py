@@ -22,7 +22,7 @@ Writer = Callable[[Context, np.ndarray], None]
 
 
 class VariableError(ValueError):
-    """A value that a variable cannot take, or a write to a derived one."""
+    """A variable cannot take a value, or is derived and cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Variable:
     # writes a checked value into a context; None marks a derived quantity, which is read only
     write: Writer | None = None
     bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for all entries or of the variable's shape
-    # empty if a copy of the numeric groups of a context carries the variable. Else (contact friction, camera poses,
-    # joint locks, switches) the address of the hidden variable that copies and snapshots have to carry for it: itself,
-    # or a finer one.
+    # empty if a copy of the numeric groups of a context contains the variable. Else (contact friction, camera poses,
+    # joint locks, switches) the address of the hidden variable that copies and snapshots must hold: the variable itself
+    # or one with more detail.
     carried_by: str = ""
     order: int = 0  # variables of a lower order are written first, as writing them changes others
     place: Place | None = None  # where the value lies as it is; None if it is computed from what lies somewhere
-    # raises a VariableError for an array that is finite, within the bounds, and no value all the same
+    # raises a VariableError for an array that is finite and within the bounds, but not allowed
     refuse: Callable[[np.ndarray], object] | None = None
 
     def __repr__(self) -> str:
@@ -61,7 +61,7 @@ class Variable:
 
     @property
     def hidden(self) -> bool:
-        """Return whether copies and snapshots have to carry this very variable."""
+        """Return whether copies and snapshots must hold this variable beside the numeric groups."""
         return self.carried_by == self.address
 
     @property
@@ -107,7 +107,7 @@ class Variable:
         return array
 
     def bounds_text(self) -> str:
-        """Return the closed interval of the bounds as text; of an array with several, the first."""
+        """Return the closed interval of the bounds as text; the first one of an array with several."""
         lower, upper = (float(np.ravel(bound)[0]) for bound in self.bounds)
         more = ", ..." if any(np.unique(bound).size > 1 for bound in self.bounds) else ""
         return f"[{lower:g}, {upper:g}]{more}"
@@ -124,7 +124,7 @@ class Variable:
 
 
 class AddressError(KeyError, ValueError):
-    """An address that the Diagram does not have."""
+    """The Diagram does not have the address."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -140,11 +140,18 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
     return f'<div style="max-height: 30em; overflow: auto"><table>{body}</table></div>'
 
 
+def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return rows as text in columns under their names, as wide as their longest cell."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = (header, ["-" * width for width in widths], *rows)
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
+
+
 class Variables(Mapping[str, Variable]):
     """The variables of one Diagram, in the order of its systems; ``address[3]`` is one entry of an array.
 
-    ``derived_by_demand`` gives, for an address that is not listed, a derived quantity that exists all the same
-    (the height of any body, say), or None.
+    ``derived_by_demand`` maps addresses that are not listed to functions that make a derived variable, for example the
+    height of a body.
     """
 
     def __init__(
@@ -208,8 +215,8 @@ class Variables(Mapping[str, Variable]):
     def write(self, context: Context, values: Mapping[str, ArrayLike]) -> None:
         """Check all of ``values`` (address -> value), then set the variables.
 
-        Their order does not matter: entries of one array are set together, and what changes other variables is set
-        first (a mass, which scales the inertia).
+        Their order does not matter: entries of one array are set together, and variables that change others (a mass,
+        which scales the inertia) are set first.
 
         Raises:
             VariableError: ``values`` is no mapping, a value is refused, or an array is given both whole and by entries.
@@ -241,7 +248,7 @@ class Variables(Mapping[str, Variable]):
 
     def table(self, context: Context, *, pattern: str = "") -> str:
         """Return a table of the variables whose address contains ``pattern``, as text."""
-        rows = [("address", "kind", "shape", "unit", "bounds", "value")]
+        rows = []
         for variable in self._listed.values():
             if pattern not in variable.address:
                 continue
@@ -252,10 +259,7 @@ class Variables(Mapping[str, Variable]):
                 else np.array2string(value.ravel(), precision=4, threshold=8, suppress_small=True, max_line_width=999)
             )
             rows.append((*_row(variable), text))
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-        lines.insert(1, "  ".join("-" * w for w in widths))
-        return "\n".join(lines)
+        return text_table(("address", "kind", "shape", "unit", "bounds", "value"), rows)
 
 
 def _row(variable: Variable) -> tuple[str, str, str, str, str]:
@@ -266,13 +270,13 @@ def _row(variable: Variable) -> tuple[str, str, str, str, str]:
 
 
 def check_address(address: object) -> None:
-    """Raise an AddressError if ``address`` is not a string.
+    """Check that an address is a string.
 
     Raises:
-        AddressError: ``address`` is no text.
+        AddressError: ``address`` is no string.
     """
     if not isinstance(address, str):
-        raise AddressError(f"an address is text, 'plant.box.mass', say, not {address!r}")
+        raise AddressError(f"an address is a text, such as 'plant.box.mass', not {address!r}")
 
 
 def suggestion(address: str, known: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of a decision: what each candidate would achieve (Figures 5 and 6), and how it would move (Figure 8)."""
+"""Pictures of a decision: the qualities of the candidates (Figures 5 and 6), and their motions (Figure 8)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PLAN = "black"
 
 
 def plot_decision(decision: Decision) -> Figure:
-    """Plot the quality of all candidates over time (Figure 5), and over what is decided (Figure 6).
+    """Plot the quality of all candidates over time (Figure 5), and over the decided values (Figure 6).
 
     The chosen candidate is orange, the plan in use black, the others have the colour of their quality. If one number is
     decided, the right plot shows the quality over it; otherwise over the order in which the candidates were tried, with
@@ -81,8 +81,8 @@ def show_decision(
         meshcat: The server that shows them.
         reasoner: The reasoner that made the decision.
         decision: The decision.
-        most: How many candidates are shown at most, the best first; the plan in use is one of them.
-        count: How many poses each motion is drawn in, overlaid (Figure 8); 0 records the motions instead.
+        most: The largest number of candidates shown, the best first; the plan in use is one of them.
+        count: Number of overlaid poses per motion (Figure 8); 0 records the motions instead.
         prefix: The Meshcat path under which they are drawn.
 
     Raises:

@@ -19,7 +19,7 @@ ROLES = ("sense", "sys", "act", "env")
 
 @dataclass(frozen=True)
 class Wire:
-    """A signal, where its switch stands ("" for a command, which has none), and the simulated system at its end.
+    """A signal, the position of its switch (empty for a command, which has none), and the simulated system at its end.
 
     The constant commands of the testbed have no system at their end.
     """
@@ -59,7 +59,7 @@ class Structure:
 
 
 def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Structure:
-    """Return what Figure 4 shows of a testbed, with its switches as in ``context`` (by default, as it was built)."""
+    """Return Figure 4 of a testbed, with its switches as in ``context`` (by default, as it was built)."""
     positions = testbed.positions(context if context is not None else testbed.default_context())
     sources: dict[tuple[str, int], str] = {}
     targets: dict[str, str] = {}
@@ -145,8 +145,8 @@ def svg(testbed: VirtualTestbed, context: Context | None = None) -> str:
     ``id`` is its address (``T_sense.<signal>``) and whose ``data-position`` is where it stands.
 
     Args:
-        testbed: What is drawn.
-        context: Holds the positions of the switches; by default, those in which the testbed was built.
+        testbed: The testbed to draw.
+        context: Context with the positions of the switches; by default those in which the testbed was built.
     """
     return _Drawing(structure_of(testbed, context)).text()
 

@@ -92,7 +92,7 @@ def make_meshcat() -> Meshcat:
 def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> Scene:
     """Record a motion in ``meshcat``; one second of the recording is one simulated second.
 
-    It replaces the present recording, and what is drawn under ``prefix``. `show_motions` shows several motions.
+    The present recording, and all objects under ``prefix``, are replaced. `show_motions` shows several motions.
 
     Args:
         meshcat: The server that shows it.

@@ -246,11 +246,11 @@ def draw_mesh(
 
     Args:
         axes: Where it is drawn.
-        x: Where the columns lie, ascending, shape (n,).
-        y: Where the rows lie, ascending, shape (m,).
+        x: Positions of the columns, ascending, shape (n,).
+        y: Positions of the rows, ascending, shape (m,).
         image: The values, shape (m, n); NaN leaves a hole.
         log: Whether the cells lie around their points on a logarithmic scale, in x and y.
-        lines: Draw the lines.
+        lines: Whether to draw the lines.
         cmap: The colour map.
     """
     cells = axes.pcolormesh(
@@ -300,8 +300,8 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
     parameters: the landscape of h, under the worst condition, with the best point.
 
     Args:
-        sweep: What is drawn.
-        boundary: The boundary to be shaded; left out, it is that of the sweep, if there is one.
+        sweep: The sweep to draw.
+        boundary: The boundary to shade; by default that of the sweep, if there is one.
 
     Raises:
         ValueError: There are more than two parameters, or no rollouts.

@@ -243,7 +243,7 @@ def plot_landscape(study: Study, *addresses: str) -> Figure:
     numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
 
     Args:
-        study: What is drawn.
+        study: The study to draw.
         addresses: One or two parameters; by default all of a study that has one or two.
 
     Raises:

@@ -29,7 +29,7 @@ Values = dict[str, float | NDArray[np.float64]]
 
 
 class LiveError(ValueError):
-    """A request that the DPS rejects, or an answer on the bus that no DPS would give."""
+    """The DPS rejects a request, or an answer on the bus is not valid."""
 
 
 class LiveTimeoutError(TimeoutError):
@@ -161,7 +161,7 @@ def watch(
     Args:
         url: LCM URL of the bus.
         addresses: Addresses of variables and output ports.
-        every: Period in cycles; fewer values come where the loop lacks the time to read all that is watched.
+        every: Period in cycles; fewer values come if the loop lacks the time to read all watched values.
         lease: Lease in seconds, which is renewed during the iteration.
         timeout: Seconds without a value after which an error is raised.
 

@@ -19,6 +19,9 @@ from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.monitoring.live.messages import ReadRequest, Request, SetRequest
 from vtbdrake.monitoring.live.server import VALUES, outcome_frame, serve, values_record
 
+# Seconds between two frames of watched values: waking the worker process costs more than reading a value.
+_PAUSE = 0.01
+
 
 class LiveService:
     """Lets other processes set variables of a running DPS, read and watch variables and ports, and reset its guards.
@@ -38,15 +41,12 @@ class LiveService:
         url: LCM URL of the bus.
         budget: Seconds of computing per cycle for reading; one value is always read.
         longest: Seconds of computing beyond which a single value is not read again.
-        pause: Seconds between two frames of watched values: waking the worker process costs more than reading a value.
 
     Attributes:
         rejected: Number of rejected requests, as last reported.
     """
 
-    def __init__(
-        self, runtime: Runtime, url: str, *, budget: float = 100e-6, longest: float = 1e-3, pause: float = 0.01
-    ) -> None:
+    def __init__(self, runtime: Runtime, url: str, *, budget: float = 100e-6, longest: float = 1e-3) -> None:
         if not 0.0 < budget <= longest:
             raise ValueError(f"budget must be above 0 s and at most longest, {longest} s, not {budget} s")
         self.budget = budget
@@ -59,7 +59,7 @@ class LiveService:
         self._readings: deque[_Reading] = deque()
         self._records: list[bytes] = []
         self._flush_at = -inf
-        self._pause = pause
+
         self._worker = BackgroundProcess(serve, url, addresses, name="the live service")
         runtime.watch(self)
 
@@ -91,7 +91,7 @@ class LiveService:
             self._begin(*pickle.loads(self._requests.popleft()))
         busy = bool(self._readings) and self._read(cycle)
         # Preferably in a cycle in which nothing is read.
-        if self._records and cycle.now >= self._flush_at + busy * self._pause:
+        if self._records and cycle.now >= self._flush_at + busy * _PAUSE:
             self._flush(cycle.now)
 
     def _begin(self, number: int, request: Request | int | None) -> None:
@@ -179,7 +179,7 @@ class LiveService:
     def _flush(self, now: float) -> None:
         self._worker.post(VALUES, *self._records)
         self._records.clear()
-        self._flush_at = now + self._pause
+        self._flush_at = now + _PAUSE
         if self._worker.dropped and not self._worker.alive:
             self._readings.clear()
 

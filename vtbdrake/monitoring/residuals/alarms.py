@@ -26,7 +26,7 @@ _EXCESS = 1.166  # Siegmund's correction for the excess over the threshold, for 
 
 
 class CalibrationError(ValueError):
-    """A calibration that cannot be made or read, or that does not fit."""
+    """A calibration cannot be made or read, or does not fit."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Calibration:
         """Return the calibration in a file that `save` has written.
 
         Raises:
-            CalibrationError: The file has something else.
+            CalibrationError: The file is not a calibration.
         """
         try:
             calibration = cls(**json.loads(Path(path).read_text()))
@@ -64,13 +64,13 @@ class Calibration:
 
 
 def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizon: int, period: float) -> Calibration:
-    r"""Return the calibration from the windows of a nominal run, which should do all that is done later.
+    r"""Return the calibration from the windows of a nominal run, which should include all motions of the later runs.
 
-    A test that adds up small residuals takes a slow change within the run for a shift. So the deviation is the largest
-    of those of batches of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), and at
-    least four times the largest distance of a batch's mean from the overall mean: then a lasting offset takes no more
-    than half of the allowance of 1/2 (`Cusum`). For independent values, a batch's mean scatters by a tenth of the
-    deviation, and this changes nothing.
+    A cumulative sum test takes a slow change within the run for a shift. So the deviation is the largest deviation of a
+    batch of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), and at least four
+    times the largest distance of a batch's mean from the overall mean: then a lasting offset takes no more than half of
+    the allowance of 1/2 (`Cusum`). For independent values, the mean of a batch scatters by a tenth of the deviation, so
+    that the second condition has no effect.
 
     Args:
         residuals: Residuals of consecutive windows, each of shape (size,).
@@ -139,11 +139,11 @@ class Cusum:
 
     Args:
         size: Number of values.
-        threshold: h.
-        allowance: k.
+        threshold: Threshold h.
+        allowance: Allowance k.
 
     Attributes:
-        threshold: h.
+        threshold: Threshold h.
         upper, lower: S+ and S-, of shape (size,).
     """
 

@@ -25,9 +25,9 @@ INDEX, TIME = 0, 1
 
 @dataclass(frozen=True, kw_only=True)
 class ResidualConfig:
-    """Configuration of residuals: what the prediction needs to know beside the scenario, and what an alarm is.
+    """Configuration of residuals: of the prediction, beside the scenario, and of the alarms.
 
-    A scenario has its own in `Scenario.deployment`.
+    `Scenario.deployment` contains the configuration of a scenario.
 
     Attributes:
         scenario: Scenario of the predicted world; by default that of the loop's target. It has the latencies of the
@@ -42,7 +42,7 @@ class ResidualConfig:
         values: Values of variables of the predicted world by address, such as the assumed payload.
         tolerance: By signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
             each; persistent residuals below half of it are not reported.
-        allowance: k of `Cusum`, in scales.
+        allowance: Allowance k of `Cusum`, in scales.
         false_alarm_interval: Mean time between two false alarms of all signals together, in seconds.
 
     Raises:
@@ -77,7 +77,7 @@ class ResidualConfig:
 
 
 class RowLayout:
-    """The layout of a row, which holds the values of one sample; values that are unknown or not new are NaN.
+    """The layout of a row with the values of one sample; values that are unknown or not new are NaN.
 
     Entry 0 is the index of the sample by the machine's own time, in periods since the first; entry 1 the DPS's time at
     the end of the cycle.
@@ -173,7 +173,7 @@ class Comparison:
         self._where = rows
         self._config = config
         self._twin = mode == TWIN
-        # A window is predicted so many rows after its end: late rows and beliefs have arrived by then.
+        # A window is predicted this many rows after its end: late rows and beliefs have arrived by then.
         self._wait = max(1, max(predictor.estimates) - config.horizon)
         self._rows: dict[int, Array] = {}
         self._nothing = rows.empty(1)[0]

@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 _START_TIMEOUT = 120.0  # s in which the worker process builds a world
 _MAX_WAITING = 100  # blocks of rows that may wait for the worker process; older ones are skipped
-# So many windows without a result, and this share of all windows, are worth a warning.
+# This many windows without a result, if they are this share of all windows, cause a warning.
 _BLIND_WINDOWS, _BLIND_SHARE = 50, 0.2
 _REPORT_WINDOWS = 10  # windows, with or without a result, after which a report is sent, if there is no alarm before
 
@@ -49,26 +49,26 @@ class ResidualError(RuntimeError):
 class ResidualMonitor:
     """Compares the machine with its model while the loop runs, and raises alarms where they differ.
 
-    It watches the loop from its construction until `close`. The loop only fills a row of numbers per cycle and sends
-    the rows once per window; a worker process does the rest. If that is too slow, windows are skipped and counted; if
-    it dies, the loop goes on, `running` becomes False, and an error is logged.
+    The monitor watches the loop from its construction until `close`. The loop only fills a row of numbers per cycle and
+    sends the rows once per window; a worker process does the rest. If the worker is too slow, windows are skipped and
+    counted; if it dies, the loop goes on, `running` becomes False, and an error is logged.
 
     While a sensor signal is not on real, nothing is predicted; the prediction restarts afterwards.
 
-    A window lacks a result if a sample is missing. If the machine has a clock of its own, and the cycles of the loop
-    begin by another one, there are cycles with no new sample, and cycles with two, of which the first is missed. So let
-    the machine's messages begin the cycles (`Deployment.pace`). From 50 windows and a fifth of all on, a warning is
-    logged.
+    A window lacks a result if a sample is missing. If the machine has a clock of its own, and the loop another one,
+    there are cycles without a new sample, and cycles with two, of which the first is missed. So let the machine's
+    messages begin the cycles (`Deployment.pace`). A warning is logged if at least 50 windows, and a fifth of all, have
+    no result.
 
     Args:
         runtime: The loop, which does not run yet.
-        mode: ``shadow``: what the machine reports acts on it, and the DPS's actuator commands are compared with that;
-            ``twin``: what the DPS sends acts on it.
+        mode: ``shadow``: the actuator commands that the machine reports drive the prediction, and the DPS's commands
+            are compared with them; ``twin``: the commands that the DPS sends drive the prediction.
         config: Configuration; by default that of the scenario's deployment.
         calibration: Calibration from nominal operation; without it, tolerances are needed.
-        learn: Whether to raise no alarms, but collect residuals for `calibrate`.
-        worker: Whether a worker process does the computing. If not, the loop waits for it: for tests, replays, and
-            loops without a clock.
+        learn: Whether to collect residuals for `calibrate` instead of raising alarms.
+        worker: Whether a worker process computes. Otherwise the loop's process computes, and the loop waits: for tests,
+            replays, and loops without a clock.
         memory: Number of windows, and of alarms, that are kept.
 
     Attributes:
@@ -315,7 +315,7 @@ def _sizes(interface: Interface) -> dict[str, int | None]:
 
 
 class Sampler:
-    """Fills rows with what happened in the cycles of a loop.
+    """Fills rows with the values of the cycles of a loop.
 
     Args:
         runtime: The loop, whose context is read after its steps.
