@@ -47,6 +47,8 @@ INDEPENDENT = 100.0
 """Estimates count as independent if they are at least this far apart along the path, in m."""
 REACH = 20.0
 """Trees within this distance of the path count as seen, in m; see `least_error_along`. Assumed."""
+LATE = 10.0
+"""From when on the errors of the vertical are told apart from those of the start, in s."""
 STANDING = 2.0
 """How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
@@ -516,11 +518,13 @@ def main() -> None:
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
     print(f"{len(found)} drives, {path:.0f} m of path, range bias {chosen.bias:g} m")
-    tilts = np.concatenate([one["poor"].drive.tilts for one in found])
-    if len(tilts):
-        roll, pitch = (1e3 * _rms(errors) for errors in tilts.T)
-        print(f"the vertical is off by {roll:.1f} mrad in roll and {pitch:.1f} mrad in pitch (RMS)")
     driven = {seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}
+    tilts = 1e3 * np.concatenate([drive.tilts for drive in driven.values()])
+    if len(tilts):
+        late = np.concatenate([drive.times for drive in driven.values()]) > LATE
+        for when, rows in (("", slice(None)), (f", later than {LATE:g} s after the start", late)):
+            roll, pitch = (_rms(errors) for errors in tilts[rows].T)
+            print(f"the vertical is off by {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
     least = least_error_along(driven, MAPS["poor"], scenario=drives.scenario)
     print(f"least error of an unbiased estimate on a poor map, by all landmarks within {REACH:g} m: {least:.2f} m")
 

@@ -259,6 +259,39 @@ def test_correlated_errors_of_the_map_are_expected():
     assert BOUNDS[0] < squares.mean() < BOUNDS[1]
 
 
+def test_the_heading_is_no_more_certain_than_the_map_allows():
+    """Neighbours that are displaced alike may be turned alike, too: scans do not show it, however many there are."""
+    rng = np.random.default_rng(8)
+    n, deviation, length, share, noise = 49, 0.7, 40.0, 0.98, 0.03
+    places = 6.0 * (np.array(np.divmod(np.arange(n), 7)).T - 3.0) + rng.uniform(-1.0, 1.0, (n, 2))
+    squares = ((places[:, None] - places) ** 2).sum(axis=2)
+    K = deviation**2 * (share * np.exp(-0.5 * squares / length**2) + (1.0 - share) * np.eye(n))
+    shown = places + np.linalg.cholesky(K) @ rng.standard_normal((n, 2))
+    covariances, diameters, known = np.tile(np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01)
+    tracker = Tracker(Landmarks(shown, deviation**2 * covariances, diameters, known), correlation=length, gate=0.9999)
+    motion, drift = np.array([0.25, 0.0, 0.0]), np.diag([0.01, 0.01, 0.001]) ** 2
+    truth = np.zeros(3)
+    for k in range(40):
+        truth = compose(truth, motion)
+        z = transform(inverse(truth), places) + noise * rng.standard_normal((n, 2))
+        scan = Landmarks(z, noise**2 * covariances, diameters, known)
+        if k == 0:
+            state, matches = tracker.start(truth, np.diag([0.7, 0.7, 0.02]) ** 2, scan)
+        else:
+            state, matches = tracker.update(tracker.predict(state, motion, drift, duration=PERIOD), scan)
+    assert len(matches.pairs) > 0.9 * n
+    # By generalized least squares (Gauss and Markov), where all places relative to the carrier are known.
+    around = places - truth[:2]
+    J = np.zeros((n, 2, 3))
+    J[:, :, :2], J[:, :, 2] = np.eye(2), np.column_stack([-around[:, 1], around[:, 0]])
+    J = J.reshape(-1, 3)
+    least = np.linalg.inv(J.T @ np.linalg.solve(np.kron(K, np.eye(2)), J))
+    found = state.pose_covariance
+    assert (found.diagonal() > 0.98 * least.diagonal()).all()
+    assert found[2, 2] < 1.2 * least[2, 2]
+    assert nees(state.pose, found, truth) < chi2.ppf(0.999, 3)
+
+
 def test_without_detections_covariance_grows_by_the_odometry():
     one = drive(0, ACCURATE)
     tracker, states = tracked(one, odometry_deviation=0.0, rate_deviation=0.0, rate_walk=0.0)
