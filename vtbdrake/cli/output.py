@@ -1,4 +1,4 @@
-"""Output of the commands: numbers, CSV files, recordings."""
+"""Output of the commands: numbers, tables, CSV files, recordings."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.state.archive import whole_file
+from vtbdrake.state.variables import text_table
 
 RECORDINGS = (".csv", ".npz")
 """Suffixes of the files that `save_recording` writes."""
+
+table = text_table
 
 
 def number(value: float) -> str:

@@ -31,7 +31,7 @@ from vtbdrake.cli.options import (
     settings,
     start_option,
 )
-from vtbdrake.cli.output import number, write_csv
+from vtbdrake.cli.output import number, table, write_csv
 from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
 from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension
@@ -39,7 +39,6 @@ from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.executor import NAMES
 from vtbdrake.state import Snapshot
-from vtbdrake.state.variables import text_table
 from vtbdrake.testbed import Scenario
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -279,7 +278,7 @@ def _points_table(sweep: Sweep) -> str:
         which = [str(condition)] if several else []
         rows.append([*map(number, point), *which, number(rollout.h), number(rollout.t_star), rollout.end])
     reasons = Counter(one_line(rollout.message) for rollout in sweep.rollouts if rollout.failed)
-    return "\n".join([text_table(header, rows), *(f"failed ({count}): {text}" for text, count in reasons.items())])
+    return "\n".join([table(header, rows), *(f"failed ({count}): {text}" for text, count in reasons.items())])
 
 
 def _conclusion(sweep: Sweep) -> str:

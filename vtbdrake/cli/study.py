@@ -12,12 +12,11 @@ import click
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import converted, option, output, parse_choice, parse_field, parse_scaled_range, settings
-from vtbdrake.cli.output import write_csv
+from vtbdrake.cli.output import table, write_csv
 from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, problem_options
 from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint
-from vtbdrake.state.variables import text_table
 from vtbdrake.testbed import Scenario
 
 # The options of `Study.run`.
@@ -160,7 +159,7 @@ def show(file: Path, csv: Path | None) -> None:
         if queue:
             header = ["waiting", *(parameter.address for parameter in opened.parameters)]
             rows = [[str(number), *map(str, point.values())] for number, point in queue.items()]
-            click.echo("\n" + text_table(header, rows))
+            click.echo("\n" + table(header, rows))
         for key, value in attributes.items():
             click.echo(f"attribute {key}: {json.dumps(value)}")
         if csv is not None:

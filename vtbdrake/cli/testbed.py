@@ -23,10 +23,10 @@ from vtbdrake.cli.options import (
     settings,
     start_option,
 )
-from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, write_whole
+from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.state import Snapshot, Variable, Variables
-from vtbdrake.state.variables import suggestion, text_table
+from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.testbed import MODES
 
@@ -183,7 +183,7 @@ def _extremes_table(result: RolloutResult, variables: Variables) -> str:
                 (name, unit, *map(number, (column[-1], *_extremes(column))))
                 for name, column in entries(address, values)
             ]
-    return text_table(("recorded", "unit", "final", "min", "max"), rows)
+    return table(("recorded", "unit", "final", "min", "max"), rows)
 
 
 def _extremes(values: np.ndarray) -> tuple[float, float]:
