@@ -98,6 +98,13 @@ def test_models_start_at_their_initial_positions(tmp_path):
     assert testbed.plant.time_step() == 0.002
 
 
+@pytest.mark.parametrize(("driver", "warns"), [("ZeroForceDriver", False), ("SchunkWsgDriver", True)])
+def test_a_driver_that_is_not_simulated_is_told(tmp_path, caplog, driver, warns):
+    load(tmp_path, DEMO.replace("ZeroForceDriver", driver)).build()
+    told = "the model_drivers of acrobot are not simulated: connect an actuator signal to these models"
+    assert [told] * warns == [record.getMessage() for record in caplog.records if "driver" in record.getMessage()]
+
+
 def test_a_camera_sees_the_world(tmp_path):
     testbed = load(tmp_path).build()
     context = testbed.default_context()

@@ -84,9 +84,12 @@ class HardwareSimScenario(Scenario):
         Raises:
             ScenarioError: A directive or an initial position does not fit.
         """
-        if self.model_drivers:
-            _log.info(
-                "model_drivers of %s are not used: the testbed's signals replace them", ", ".join(self.model_drivers)
+        # A plant applies zero force by itself.
+        unused = [name for name, driver in self.model_drivers.items() if type(driver).__name__ != "ZeroForceDriver"]
+        if unused:
+            _log.warning(
+                "the model_drivers of %s are not simulated: connect an actuator signal to these models",
+                ", ".join(unused),
             )
         plant, _ = builder.add_plant(self.plant_config, self.scene_graph_config)
         try:
