@@ -26,8 +26,8 @@ S = TypeVar("S", bound=System)
 P = TypeVar("P", InputPort, OutputPort)
 
 
-# Systems of Drake that copies of a context cannot continue, and what to use instead.
 _PORTS = "Its ports have the names of the signals: export them under these names, from a Diagram"
+# Systems of Drake that copies of a context cannot continue, and what to use instead.
 _LISTENS = "which receives data from outside the Diagram: feed the DPS by a real port (see Bridge), or leave it out"
 _SENDS = "which sends data out of the Diagram, from every copy of it, too: let a bridge send it (see Protocol)"
 _REFUSED = {
