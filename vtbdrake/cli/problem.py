@@ -39,6 +39,7 @@ from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.executor import NAMES
 from vtbdrake.state import Snapshot
+from vtbdrake.state.variables import with_unit
 from vtbdrake.testbed import Scenario
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -302,10 +303,10 @@ def _report(found: Boundary, sweep: Sweep) -> str:
             lines.append(f"  {_condition(i, sweep.conditions[i])}: {found.interval_text(lower, upper)}")
     for chance in found.worst_chances:
         which = f" under condition {chance.condition}" if several else ""
-        lines.append(f"  {number(chance.value)} {found.unit}: {chance}{which}")
+        lines.append(f"  {with_unit(number(chance.value), found.unit)}: {chance}{which}")
     if found.failed_at:
         values = ", ".join(map(number, found.failed_at))
-        lines.append(f"counted as unsafe: the simulation failed at {values} {found.unit}")
+        lines.append(f"counted as unsafe: the simulation failed at {with_unit(values, found.unit)}")
     rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]
     seconds = sum(rollout.wall_time for rollout in rollouts)
     return "\n".join([*lines, f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation"])

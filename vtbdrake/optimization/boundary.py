@@ -16,6 +16,7 @@ from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.optimization.sweep import Sweep, borrowed, make_sweep, numeric, roll_out
 from vtbdrake.rollout import Executor, RolloutResult
 from vtbdrake.rollout.task import TERMINATED
+from vtbdrake.state.variables import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -150,14 +151,11 @@ class Boundary:
         return f", undecided between ({counts})"
 
     def _listed(self, values: Sequence[float]) -> str:
-        shown = self._with_unit(", ".join(f"{value:g}" for value in values[:3]))
+        shown = with_unit(", ".join(f"{value:g}" for value in values[:3]), self.unit)
         return shown + (f" and {len(values) - 3} more values" if len(values) > 3 else "")
 
     def _amount(self, value: float, *, digits: int = 6) -> str:
-        return self._with_unit(f"{value:.{digits}g}")
-
-    def _with_unit(self, text: str) -> str:
-        return text if self.unit in ("", "1") else f"{text} {self.unit}"
+        return with_unit(f"{value:.{digits}g}", self.unit)
 
 
 def why_no_boundary(sweep: Sweep) -> str:

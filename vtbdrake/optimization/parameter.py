@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from vtbdrake.argument_checks import all_of, as_flag, as_number
 from vtbdrake.rollout.runner import FIELD
 from vtbdrake.state import Variable, Variables
+from vtbdrake.state.variables import with_unit
 
 
 class _Addressed:
@@ -141,7 +142,7 @@ class Parameter(_Addressed):
         if self.lower < lower or self.upper > upper:
             raise ValueError(
                 f"the range {self.range_text} of {self.address} exceeds its bounds "
-                f"{variable.bounds_text()} {variable.unit}"
+                f"{with_unit(variable.bounds_text(), variable.unit)}"
             )
         return variable
 

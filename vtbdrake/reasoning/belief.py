@@ -15,7 +15,7 @@ from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 from vtbdrake.rollout.start import Start
 from vtbdrake.state import VariableError
 from vtbdrake.state.layout import FlatState, LayoutError
-from vtbdrake.state.variables import A
+from vtbdrake.state.variables import A, with_unit
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.dps_state import DpsState
@@ -386,9 +386,9 @@ class _Target:
         if not np.isfinite(believed).all():
             raise BeliefError(f"the belief about {variable.address} is missing: {believed.tolist()}, of {told}")
         if ((believed < self._least - self._tolerance) | (believed > self._most + self._tolerance)).any():
+            amount, allowed = with_unit(str(believed.tolist()), variable.unit), variable.bounds_text()
             raise BeliefError(
-                f"the belief about {variable.address} is {believed.tolist()} {variable.unit}, of {told}, but it must "
-                f"lie in {variable.bounds_text()}"
+                f"the belief about {variable.address} is {amount}, of {told}, but it must lie in {allowed}"
             )
         return np.clip(believed, self._least, self._most)
 

@@ -99,9 +99,8 @@ class Variable:
             raise VariableError(f"{self.address} must be finite, but the value given is {value!r}")
         lower, upper = (np.asarray(bound, dtype=float) for bound in self.bounds)
         if (array < lower).any() or (array > upper).any():
-            raise VariableError(
-                f"{self.address} must lie in {self.bounds_text()} {self.unit}, but the value given is {value!r}"
-            )
+            allowed = with_unit(self.bounds_text(), self.unit)
+            raise VariableError(f"{self.address} must lie in {allowed}, but the value given is {value!r}")
         if self.refuse is not None:
             self.refuse(array)
         return array
@@ -121,6 +120,11 @@ class Variable:
         array = self.check(value)
         assert self.write is not None
         self.write(context, array)
+
+
+def with_unit(amount: str, unit: str) -> str:
+    """Return a text of numbers with their unit behind it, if they have one."""
+    return amount if unit in ("", "1") else f"{amount} {unit}"
 
 
 class AddressError(KeyError, ValueError):

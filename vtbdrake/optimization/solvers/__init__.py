@@ -110,7 +110,7 @@ def _find(name: object) -> str:
     if _plain(name) in names:
         return names[_plain(name)]
     near = difflib.get_close_matches(_plain(name), names, n=1, cutoff=0.5)
-    hint = f"; did you mean {names[near[0]]!r}?" if near else ""
+    hint = f"; did you mean {names[near[0]]!r}?" if near else "."
     raise SolverError(f"there is no solver {name!r}{hint} Known are: {', '.join(CATALOGUE)}")
 
 
