@@ -710,6 +710,17 @@ def test_cycle_records_changes_and_new_values():
     assert np.array_equal(cycles[0].fed["position"], [0.05, 0.0])
 
 
+def test_rejected_commands_are_logged_once_for_each_reason(caplog):
+    runtime, bridge, _ = make()
+    bridge.commands["target"] = ReceivedSignal()
+    runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
+    for reason in ("limits", "limits", "fingerprint"):
+        bridge.commands["target"].reject(reason)
+        runtime.cycle()
+    told = [record.getMessage() for record in caplog.records if "command target was rejected" in record.getMessage()]
+    assert ["limits" in told[0], "fingerprint" in told[1], len(told)] == [True, True, 2]
+
+
 def test_received_commands_reach_the_dps_or_are_counted():
     runtime, bridge, _ = make()
     bridge.commands["target"] = ReceivedSignal()

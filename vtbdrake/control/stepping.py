@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.signal import Feed
 from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
+
+_log = logging.getLogger(__name__)
 
 WRITE, SWITCH, RESET, RESULT = "write", "switch", "reset", "result"
 
@@ -165,6 +168,8 @@ class Stepped:
         # For each signal, the count of the newest value that the target has got.
         self._sensed = dict.fromkeys(bridge.sensed, 0)
         self._commands = dict.fromkeys(bridge.commands, 0)
+        # For each command, the reasons to reject it that have been logged.
+        self._told: dict[str, frozenset[str]] = dict.fromkeys(bridge.commands, frozenset())
         self.read_switches()
 
     @property
@@ -214,7 +219,10 @@ class Stepped:
                 self._fed[name] = received.value
 
     def take_commands(self) -> None:
-        """Write the commands u that the bridge has received; one that cannot be written is counted as rejected."""
+        """Write the commands u that the bridge has received.
+
+        One that cannot be written is counted as rejected. Of each reason to reject one, the first case is logged.
+        """
         for name, received in self.bridge.commands.items():
             if received.count != self._commands[name]:
                 self._commands[name] = received.count
@@ -223,6 +231,12 @@ class Stepped:
                     self.write({address: np.reshape(received.value, self.target.variables()[address].shape)})
                 except ValueError:
                     received.reject("refused")
+            if len(received.rejected) > len(self._told[name]):
+                new = ", ".join(received.rejected.keys() - self._told[name])
+                _log.warning(
+                    "a message with the command %s was rejected (%s); more like it are only counted", name, new
+                )
+                self._told[name] = frozenset(received.rejected)
 
     def read(self, address: str) -> Any:
         """Return the present value of a variable or a port of the target, for example ``real.sense.<signal>``.
