@@ -14,7 +14,7 @@ class _Pickler(cloudpickle.Pickler):
 
     cloudpickle sends what is defined in ``__main__`` by value, and with a class its metaclass. The metaclass of Drake's
     classes (pybind11's, nanobind's) cannot be imported under its name, and a copy of it is a "metaclass conflict". So
-    it travels as "the type of a class that can be imported", ``type(LeafSystem)`` say.
+    it is sent as the type of a class that can be imported, for example ``type(LeafSystem)``.
     """
 
     def __init__(self, file: io.BytesIO) -> None:

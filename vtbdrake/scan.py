@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-# How far the length of a direction may be from 1: directions may have travelled as 32-bit numbers.
+# How far the length of a direction may be from 1: messages carry directions as 32-bit numbers.
 _TOLERANCE = 1e-5
 
 

@@ -23,9 +23,9 @@ ORDERS = tuple(_LEAST_KNOTS)
 
 @dataclass(frozen=True)
 class Spline:
-    """A curve y(t) = B(t) w over [0, duration], where the matrix B depends on the time alone and w are n knots.
+    """A curve y(t) = B(t) w over [0, T], where the matrix B depends on the time alone and w are n knots.
 
-    Before 0 and after the duration T, the curve holds its first and its last value. Its pieces have equal lengths:
+    Before 0 and after T, the curve holds its first and its last value. Its pieces have equal lengths:
 
     * ``zero``: y = w_k on [k h, (k + 1) h), with h = T / n.
     * ``linear``: through w_k at k h, with h = T / (n - 1).
@@ -36,8 +36,8 @@ class Spline:
 
     Attributes:
         order: ``zero``, ``linear``, ``cubic`` or ``bspline``.
-        knots: Their number n; a B-spline needs four.
-        duration: T in seconds.
+        knots: The number n of knots; a B-spline needs four.
+        duration: The duration T in seconds.
 
     Raises:
         ValueError: There is no such order, there are too few knots, or the duration is not positive.

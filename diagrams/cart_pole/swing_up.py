@@ -82,7 +82,7 @@ def swing_up(reasoner: Reasoner, scenario: CartPoleScenario, *, seconds: float =
 def swing_up_onboard(scenario: CartPoleScenario, *, seconds: float = 6.0, every: float = 0.1) -> Swing:
     """Simulate a cart-pole that hangs at rest, and whose DPS decides the plan itself (``onboard=True``).
 
-    Thinking takes the time that the scenario declares, while the cart-pole moves on.
+    A decision takes the time that the scenario declares, while the cart-pole moves on.
 
     Args:
         scenario: The cart-pole.

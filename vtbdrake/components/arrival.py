@@ -1,4 +1,4 @@
-"""Dates what arrives at a DPS by the DPS's own clock: images, scans, and other samples of abstract signals."""
+"""Images, scans and other samples of abstract signals, with their times by the clock of the DPS that receives them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vtbdrake.state.declarations import NO_DICT
 
 
 class Arrival(LeafSystem):
-    """Holds the newest sample of an abstract signal, numbers it, and tells when it was taken.
+    """Holds the newest sample of an abstract signal, with its number and the time at which it was taken.
 
     .. pydrake_system::
 
@@ -27,11 +27,11 @@ class Arrival(LeafSystem):
         - time (s)
         - number
 
-    Every ``period`` it compares the signal with the sample that it holds. One that differs in any digit is a new one:
-    sensors have noise, and what they measure has a time stamp or moves. Its ``time`` is the time of its arrival less
-    the parameter ``age``, and not before 0: what is there at the start was taken then. ``number`` is 1 for the first
-    sample, and one more for each that follows; before it, ``sample`` is ``model_value``, of time 0 and number 0. So
-    nothing depends on the clock of the sensor, or on when it samples.
+    Every ``period`` it compares the signal with the sample that it holds. A value that differs in any bit is a new
+    sample: sensors have noise, and their values have time stamps or change. Its ``time`` is the time of its arrival
+    less the parameter ``age``, but at least 0: a sample that is there at the start was taken then. ``number`` counts
+    the samples; before the first, ``sample`` is ``model_value``, of time 0 and number 0. So nothing depends on the
+    clock of the sensor, or on its sample times.
 
     The outputs agree with each other, and stay until the next arrival. With a `SlowPart` on request, ``number`` is the
     request: then each sample is evaluated once.

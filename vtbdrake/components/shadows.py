@@ -1,7 +1,7 @@
-"""Shadows of the sun, by shadow mapping: what the sun does not see is in shadow.
+"""Shadows of the sun, by shadow mapping: points that are hidden from a camera at the sun are in shadow.
 
 VTK's own shadows are wrong: a surface that faces the sun becomes black where another one lies behind it, also the back
-of the same box, unless the scene is many times deeper than the bodies in it. These follow the geometry.
+of the same box, unless the scene is many times deeper than the bodies in it. The shadows of this module are right.
 """
 
 from __future__ import annotations

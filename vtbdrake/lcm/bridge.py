@@ -24,7 +24,7 @@ _HUB = "tcpq://"
 _PRIVATE = ("memq://", "file://")
 
 MARK_CHANNEL = "VTB_MARK"
-"""What a bridge publishes here comes back to it from the hub behind all messages that have waited there."""
+"""The channel on which a bridge publishes a mark; the hub returns it after all messages that have waited there."""
 
 FOREIGN_TIMEOUT = 1.0
 """Seconds for which a foreign actuator command prevents a switch to the real machine."""
@@ -42,15 +42,16 @@ class LcmBridge(Bridge):
     checked one by one: one that is out of its limits does not invalidate the others.
 
     A message is rejected as ``out of order`` if its time is before the last accepted one's, as a ``duplicate`` if it is
-    the same, and as ``ahead of time`` if it is more than `MAX_AHEAD` ahead of what the quickest message so far and the
-    time that has passed here let expect, unless the bus was lost in between. A sender that was restarted, or whose
-    clock was set, is accepted after ``reorder_window`` seconds in which no message has continued its old time.
+    the same, and as ``ahead of time`` if it is farther ahead of this computer's clock than that of any message before,
+    by more than `MAX_AHEAD`, unless the bus was lost in between. A sender that was restarted, or whose clock was set,
+    is accepted after ``reorder_window`` seconds in which no message has continued its old time.
 
     After a pause (`note_pause`) a hub, and the socket to it, may still hold old messages, or the hub may have closed
-    the connection behind them. So the bridge publishes a mark; values that arrive before it is back are dated back.
+    the connection after sending them. So the bridge publishes a mark. Values that arrive before the mark has returned
+    count as received at the beginning of the pause.
 
-    Limiting actuator commands is the guards' business, but one that is not finite or not within its signal's limits is
-    never sent: its whole message is withheld and counted, as is one that lacks a signal it cannot do without.
+    The guards limit actuator commands. One that is nevertheless not finite, or not within its signal's limits, is never
+    sent: its whole message is withheld and counted, as is a message that lacks a required signal.
 
     Attributes:
         url: The LCM URL of the bus.
@@ -260,7 +261,7 @@ class LcmBridge(Bridge):
 
 
 class ChannelReader:
-    """Checks the messages of one channel and updates its signals; `LcmBridge` tells the rules."""
+    """Checks the messages of one channel and updates its signals, by the rules of `LcmBridge`."""
 
     def __init__(
         self, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal], reorder_window: float
@@ -332,9 +333,9 @@ class SentSignal:
 
     count: int = 0  # how many actuator commands were sent
     # how many were not, by reason: ``type``, ``size``, ``not finite``, ``limits``, ``incomplete`` (its message needs
-    # another signal), ``same message`` (another signal of its message was at fault), ``encode``, ``no bus`` (lost, or
-    # it takes nothing at present), ``refused`` (the hub protects the channel for another client; counted from the hub's
-    # first message about it)
+    # another signal), ``same message`` (another command of its message was withheld), ``encode``, ``no bus`` (lost, or
+    # it accepts nothing at present), ``refused`` (the hub protects the channel for another client; counted from the
+    # hub's first message about it)
     withheld: dict[str, int] = field(default_factory=dict)
 
     def record(self, problem: str) -> None:
@@ -385,7 +386,7 @@ class ChannelWriter:
 
 
 class ForeignCommands:
-    """Detects other publishers on the actuator channels: their messages, and what a hub tells of protected channels.
+    """Detects other publishers on the actuator channels: their messages, and a hub's reports on protected channels.
 
     Our own messages come back, too, in any order: they are recognized by their bytes, which the time stamp makes
     unique. A copy of one is foreign. A protected channel lets only its owner's messages pass.
@@ -396,7 +397,7 @@ class ForeignCommands:
         blocked: The channels that a hub protects for another client; it reports them within 10 ms of the first refusal.
     """
 
-    _MEMORY = 4096  # own messages on their way per channel: some seconds of a hub that stands still
+    _MEMORY = 4096  # own messages on their way per channel: those of some seconds in which the hub is stopped
 
     def __init__(
         self,
@@ -408,7 +409,7 @@ class ForeignCommands:
 
         Args:
             channels: The actuator channels.
-            name: Returns under which name the hub knows our connection at present.
+            name: Returns the present name of our connection at the hub.
             on_foreign: Called with channel and bytes of a foreign message.
         """
         self.heard = dict.fromkeys(channels, 0)

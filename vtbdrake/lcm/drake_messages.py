@@ -86,8 +86,8 @@ def _pixels() -> dict[type, tuple[int, int]]:
 class ImageMap(LcmMap):
     """An `LcmMap` of images; `image_map` and `image_array_map` make one.
 
-    A signal's ``model_value`` gives pixel type, width and height. Rejected are an image of another size (``size``), of
-    another pixel type (``type``), and one that is compressed by anything but zlib (``compression``).
+    A signal's ``model_value`` gives pixel type, width and height. An image is rejected if its size (``size``) or pixel
+    type (``type``) differs, or if it is compressed by anything but zlib (``compression``).
 
     Attributes:
         frames: By signal, the ``frame_name`` of its image.
@@ -227,9 +227,9 @@ def _signal_of(kind: type, signals: Sequence[Signal], channel: str, *, example: 
 class PointCloudMap(LcmMap):
     """An `LcmMap` of point clouds; `point_cloud_map` makes one.
 
-    The signal's ``model_value`` tells which properties its clouds have: positions, normals, colours. Rejected are a
-    message that lacks one of them (``missing``), and one whose data are not as long as it says (``size``). Points may
-    be infinite or NaN: so a sensor says that it saw nothing there. (Drake's `PointCloudToLcm` leaves such points out.)
+    The signal's ``model_value`` has the properties of its clouds: positions, normals, colours. A message is rejected if
+    it lacks one of them (``missing``), or if its data have not the announced length (``size``). Points may be infinite
+    or NaN, where a sensor has seen nothing. (Drake's `PointCloudToLcm` leaves such points out.)
     """
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
@@ -262,8 +262,8 @@ def point_cloud_map(channel: str, signal: str) -> PointCloudMap:
 class ScanMap(LcmMap):
     """An `LcmMap` of laser scans; `scan_map` makes one.
 
-    Rejected are a message that lacks one of the fields (``missing``), one whose data are not as long as it says
-    (``size``), and one with a ray that is fired after the stamp (``time``).
+    A message is rejected if it lacks one of the fields (``missing``), if its data have not the announced length
+    (``size``), or if a ray is fired after the stamp (``time``).
     """
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:

@@ -1,4 +1,4 @@
-"""Maps between LCM channels and signals: which signals travel in which messages, and how they are coded."""
+"""Maps between LCM channels and signals: which messages carry which signals, and how they are coded."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class LcmMap:
     Attributes:
         channel: Name of the channel.
         type: Class made by lcm-gen.
-        signals: Names of the signals that travel in the messages.
+        signals: Names of the signals that the messages carry.
         decode: Returns the values by signal from a message; required for receiving. A value is an array of the
             signal's size, or an object of an abstract signal's type. Raises `MalformedError` to reject the message.
         encode: Returns a message from values by signal and the time in microseconds; required for sending. Raises
@@ -147,9 +147,9 @@ class LcmMap:
         return lambda values, utime: bytes(to_message(values, utime).encode())
 
     def age(self, values: Mapping[str, Any], time: float) -> float:
-        """Return how old values are, in seconds, by which their message is stamped earlier than it is sent.
+        """Return the age of values in seconds, by which the time stamp of their message precedes the sending.
 
-        It is 0 by default: most values do not tell.
+        It is 0 by default: most values have no time of their own.
 
         Args:
             values: The values by signal, which are about to be sent by a simulated machine.
@@ -339,7 +339,7 @@ def _number_field(message_type: Any, known: Mapping[str, Field], path: str) -> F
     if field.typename not in _NUMBERS or (field.length and len(field.dimensions) > 1):
         shape = "".join(f"[{dimension}]" for dimension in field.dimensions)
         raise ValueError(
-            f"field {path} of {message_type.__name__} is a {field.typename}{shape}: a vector signal travels in "
-            "numbers, in arrays of fixed dimensions, or in an array of one dimension; write an LcmMap for it"
+            f"field {path} of {message_type.__name__} is a {field.typename}{shape}: fields of a vector signal are "
+            "numbers, arrays of fixed dimensions, or an array of one dimension; write an LcmMap for it"
         )
     return field

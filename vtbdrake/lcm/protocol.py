@@ -29,14 +29,14 @@ class Protocol:
             return Deployment(protocol=protocol)
 
     Attributes:
-        sense: What the machine publishes; each sensor signal in one map.
-        act: What it listens to; each actuator signal in one map.
-        commands: Commands u that reach the controller over LCM; the machine has no part in them.
+        sense: Maps of the channels that the machine publishes; each sensor signal in one map.
+        act: Maps of the channels that it receives; each actuator signal in one map.
+        commands: Maps of the commands u that reach the controller over LCM; the machine does not use them.
         reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
             machine says it executed in the cycle that has just ended.
-        periods: By channel of ``sense``, seconds between two messages; one per cycle of the machine, if not named. The
-            first message leaves in cycle 0, the others one cycle after the multiples of the period: a sensor that
-            samples at these has its new value then.
+        periods: By channel of ``sense``, seconds between two messages; by default, one is sent in every cycle of the
+            machine. The first message is sent in cycle 0, the others one cycle after the multiples of the period: a
+            sensor that samples at these has its new value then.
     """
 
     sense: Sequence[LcmMap]

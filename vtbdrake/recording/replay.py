@@ -117,11 +117,11 @@ def replay(
 
     Args:
         log: A log, or the path of its file.
-        target: What is stepped; by default what was recorded, built from the log's scenario. A `DpsAlone` can replay
-            the log of a testbed whose sensor signals were all on real. A testbed can replay the log of a DPS alone;
-            its simulated world is idle then.
-        values: Values of variables by address, which hold from the beginning on, whatever the log says of them: what
-            would the DPS have commanded with another gain? Nothing is compared then.
+        target: The testbed or DPS to step; by default the recorded one, built from the log's scenario. A `DpsAlone` can
+            replay the log of a testbed whose sensor signals were all on real. A testbed can replay the log of a DPS
+            alone; its simulated world is idle then.
+        values: Values of variables by address, which replace the recorded ones from the beginning on, for example to
+            find the commands with another gain. Nothing is compared then.
         record: Addresses of variables or output ports to be read after every cycle.
 
     Raises:

@@ -38,18 +38,18 @@ class FuturesExecutor(Executor):
     """Rollouts on a `concurrent.futures.Executor` of the user; it is not closed.
 
     Each of its processes builds a testbed once and keeps it; each of its threads has a Context. A pool breaks when one
-    of its processes is killed, and does not say by which rollout. If its processes run on this computer (the standard
-    library's, loky's) and it has no initializer, a `ProcessExecutor` with as many workers runs all that is not
-    finished, so that only the rollout at fault fails. With other pools, the rollouts under way fail, and a
-    `WorkerError` ends the others. Any other error of the pool is raised unchanged.
+    of its processes is killed, and does not report the rollout that caused it. If its processes run on this computer
+    (the standard library's, loky's) and it has no initializer, a `ProcessExecutor` with as many workers runs the
+    unfinished rollouts, so that only the one that kills its process fails. With other pools, the rollouts under way
+    fail, and the others end with a `WorkerError`. Any other error of the pool is raised unchanged.
 
-    Ray has no such pool of its own: one is a subclass of `concurrent.futures.Executor` whose ``submit(fn, *args)``
-    returns ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` says how many run at a time.
+    Ray has no such pool. Write a subclass of `concurrent.futures.Executor` whose ``submit(fn, *args)`` returns
+    ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` is the number that run at a time.
 
     Args:
         pool: The pool that runs the rollouts.
-        in_flight: The number of rollouts that the pool has at a time; by default twice its workers, so that none waits.
-            An interruption takes back what has not begun; what runs goes on to its end.
+        in_flight: The number of rollouts that the pool has at a time; by default twice its workers, so that none is
+            idle. An interruption cancels rollouts that have not begun; the others go on to their ends.
     """
 
     cancels = False

@@ -87,7 +87,7 @@ def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Str
 
 
 def _class_name(system: System) -> str:
-    """Return the name of a system's class; empty for a plain Diagram, whose name tells nothing."""
+    """Return the name of a system's class; empty for a plain Diagram, whose class is no information."""
     name = type(system).__name__
     return "" if name == "Diagram" else name.rstrip("_")
 

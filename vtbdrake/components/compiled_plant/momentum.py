@@ -255,7 +255,7 @@ class BaseReaction:
 
 
 def momentum_world(model: MomentumModel, positions: ArrayLike, *, period: float) -> CasadiSystem:
-    r"""Return a System in which the joints are always where they are told to be, and the base moves accordingly.
+    r"""Return a System in which the joints follow their commands exactly, and the base moves accordingly.
 
     .. pydrake_system::
 
@@ -272,7 +272,7 @@ def momentum_world(model: MomentumModel, positions: ArrayLike, *, period: float)
 
     Args:
         model: The model.
-        positions: Of the joints at first, shape (m,); the base is at the origin of W.
+        positions: Initial positions of the joints, shape (m,); the base starts at the origin of W.
         period: T in seconds.
     """
     m = len(model.joints)

@@ -1,4 +1,4 @@
-"""What a perception function says about a pose: the pose, how sure it is, and when it held."""
+"""The result of a perception function: a pose with its covariance and its time."""
 
 from __future__ import annotations
 

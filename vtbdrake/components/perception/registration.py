@@ -57,8 +57,8 @@ class Faces:
         """Find the nearest point on the faces that are turned towards an eye.
 
         Args:
-            points: In T, (n, 3) in m.
-            eye: Where they were seen from, in T, (3,) in m.
+            points: Points in T, (n, 3) in m.
+            eye: Position in T of the sensor that saw them, (3,) in m.
 
         Returns:
             The nearest points (n, 3), the outward normals of their faces (n, 3), and whether each point lies above its
@@ -80,17 +80,18 @@ class Faces:
         return nearest, R[best, :, 2], ~beyond[rows, best].any(axis=1)
 
     def offsets(self, points: Array, *, eye: Array, thickness: float) -> tuple[Array, Array, Array, Array]:
-        """Measure how far points lie beside the faces that they cover from one edge to the other.
+        """Measure the offsets, in the plane of a face, of points that cover the face from one edge to the other.
 
-        Points say where their plane is, but not where in it. On a face that is cut into strips, the first and the last
-        point of a strip end within the mean distance s of points from the edges; their middle is that of the face to
-        ± s / 2. The offset is the mean over the strips. If the rows of points are parallel to an edge, all strips end
-        alike: so the standard deviation is that of one strip, s / √12 for a uniform distribution.
+        The distances of points from a plane do not determine a motion within the plane; the edges do. The face is cut
+        into strips. The first and the last point of a strip lie within the mean distance s of points from the edges, so
+        that their midpoint is that of the face to ± s / 2. The offset is the mean over the strips. If the rows of
+        points are parallel to an edge, the errors of all strips are equal: so the standard deviation is that of one
+        strip, s / √12 for a uniform distribution.
 
         Args:
-            points: In T, (n, 3) in m.
-            eye: Where they were seen from, in T, (3,) in m.
-            thickness: How far from a face its points may lie, in m.
+            points: Points in T, (n, 3) in m.
+            eye: Position in T of the sensor that saw them, (3,) in m.
+            thickness: Largest distance of its points from a face, in m.
 
         Returns:
             For each direction along a face in which both edges were seen: the centre of the face (k, 3), the direction
@@ -262,14 +263,14 @@ def register_points(
 def misfit(points: ArrayLike, faces: Faces, X_AT: RigidTransform, *, eye: ArrayLike, limit: float) -> float:
     """Return the mean of min(d, limit)² over points with the distances d to the body at X_AT, in m².
 
-    It tells which of several registrations explains most points, and best.
+    Of several registrations, the one with the least misfit explains the points best.
 
     Args:
-        points: In A, (n, 3) in m.
+        points: Points in A, (n, 3) in m.
         faces: The model.
         X_AT: The pose of the body.
-        eye: Where the points were seen from, in A, (3,) in m.
-        limit: The distance beyond which a point is none of the body, in m.
+        eye: Position in A of the sensor that saw the points, (3,) in m.
+        limit: The distance in m beyond which a point does not belong to the body.
     """
     X_TA = X_AT.inverse()
     in_T = np.asarray(points, dtype=float) @ X_TA.rotation().matrix().T + X_TA.translation()

@@ -84,13 +84,14 @@ class Camera(LeafSystem):
         - depth_image (only with ``depth``)
 
     The images are state: ImageRgba8U, and ImageDepth32F with Drake's conventions (metres along z_C, 0 if too close, inf
-    if too far). Nothing is rendered for those who read them. Before the initialization they are black; it takes the
-    first image, so that readers at t = 0 see the scene. A reader that is updated at the same instant by an unrestricted
-    update (a `SlowPart`) sees the image before, one that has a discrete update the new one.
+    if too far). Reading them renders nothing. Before the initialization they are black; the initialization takes the
+    first image, so that readers at t = 0 get the scene. A reader that is updated at the same instant by an unrestricted
+    update (a `SlowPart`) gets the previous image, one with a discrete update the new one.
 
-    The camera frame C is that of Drake: x to the right, y down, z forward. It starts where ``frame`` is on its body P;
-    the parameter ``pose``, [x, y, z, roll, pitch, yaw] of C in P, moves it. P may move. Drake's principal point
-    (cx, cy) counts from the image's left upper corner, OpenCV's from the centre of its first pixel: half a pixel less.
+    The camera frame C is that of Drake: x to the right, y down, z forward. It is fixed to the body P of ``frame``, by
+    default at ``frame``; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of C in P, changes that. Drake's principal
+    point (cx, cy) counts from the image's left upper corner, OpenCV's from the centre of its first pixel: half a pixel
+    less.
 
     The world is rendered by VTK in the light of the port ``light`` (without it, a white light from the camera, before
     Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail, bright

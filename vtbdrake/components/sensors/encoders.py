@@ -115,16 +115,12 @@ class JointTachometers(_JointSensor):
 
 
 def _unit(joints: Sequence[Joint], per: str = "") -> str:
-    """Return the units of the joints' positions, each once, with ``per`` behind them."""
+    """Return the units of the joints' positions, each once, followed by ``per``."""
     return ", ".join(dict.fromkeys(("m" if joint.type_name() == "prismatic" else "rad") + per for joint in joints))
 
 
 def _check_single(joints: Sequence[Joint], sensor: SampledSensor) -> None:
-    """Raise a ValueError if a joint has not exactly one degree of freedom.
-
-    Raises:
-        ValueError: a joint has not exactly one degree of freedom.
-    """
+    """Raise a ValueError if a joint has not exactly one degree of freedom."""
     for joint in joints:
         if joint.num_positions() != 1:
             raise ValueError(

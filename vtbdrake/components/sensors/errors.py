@@ -74,7 +74,7 @@ class ErrorModel:
         """Raise a ValueError if no sensor can have such errors.
 
         Raises:
-            ValueError: a value that no sensor can have.
+            ValueError: No sensor can have such a value.
         """
         checks = {
             "noise": (0.0 <= self.noise < inf, "a standard deviation, finite and not negative"),
@@ -122,7 +122,7 @@ class ErrorStage:
     """The errors of a sensor, in its Context.
 
     Attributes:
-        variables: the parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also
+        variables: The parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also
             ``bias``, ``drift``, ``quantization`` (one per entry), ``latency``, ``dropout``, ``outlier_probability``
             and ``outlier_size``, and the state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown,
             newest first).
