@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -92,11 +92,17 @@ def _strategy(mean: np.ndarray, sigma: float, counts: np.ndarray, population: in
     # Imported here because it is slow: it loads scipy.stats.
     from cmaes import CMA, CMAwM
 
-    bounds = np.tile([0.0, 1.0], (len(mean), 1))
+    # What lies outside is drawn again, and moved to the bounds in the end. Of more than a hundred numbers one is nearly
+    # always outside, and the package multiplies two matrices for each draw.
+    options: dict[str, Any] = {
+        "bounds": np.tile([0.0, 1.0], (len(mean), 1)),
+        "n_max_resampling": 100 if len(mean) <= 100 else 5,
+        "population_size": population,
+    }
     if not counts.any():
-        return CMA(mean=mean, sigma=sigma, bounds=bounds, seed=seed, population_size=population)
+        return CMA(mean=mean, sigma=sigma, seed=seed, **options)
     steps = np.array([1.0 / (count - 1) if count else 0.0 for count in counts])
-    return CMAwM(mean=mean, sigma=sigma, bounds=bounds, steps=steps, seed=seed, population_size=population)
+    return CMAwM(mean=mean, sigma=sigma, steps=steps, seed=seed, **options)
 
 
 class DifferentialEvolution(BlockingSolver):
