@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 
 def as_number(name: str, value: Any) -> float:
     """Return ``value`` as a float; raise a ValueError if it is no number (a text is none, nor is True)."""
@@ -21,6 +23,17 @@ def as_whole(name: str, value: Any) -> int:
     if not as_number(name, value).is_integer():
         raise ValueError(f"{name} is a whole number, not {value!r}")
     return int(value)
+
+
+def as_array(name: str, value: Any) -> np.ndarray:
+    """Return ``value`` as an array of floats; raise a ValueError if it is no array of real numbers (a text is none)."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # A ragged list.
+        array = np.array(None)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} must be a number or several, not {value!r}")
+    return array.astype(float)
 
 
 def as_flag(name: str, value: Any) -> bool:

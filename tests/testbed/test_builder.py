@@ -43,6 +43,13 @@ def _world(builder, sensor=None, actuator=None):
         (lambda: Signal("y", size=2, model_value=1), "either a vector"),
         (lambda: Signal("y", size=0), "at least one entry, not 0"),
         (lambda: Signal("a.b", size=1), "one word"),
+        (lambda: Signal("a[0]", size=1), "one word"),
+        (lambda: Signal(3, size=1), "one word .* not 3"),
+        (lambda: Signal("y", size=1, unit=3), "its unit is a text, 'm/s', say, not 3"),
+        (lambda: Signal("y", size=1, lower="0"), "its lower must be a number or several, not '0'"),
+        (lambda: Signal("y", size=1, upper=None), "its upper must be a number or several, not None"),
+        (lambda: Signal("y", size=1, idle=np.inf), "its idle must be finite, not inf"),
+        (lambda: Interface(None, []), r"sense is a list of Signal\(...\), \[\] for none, not None"),
         (lambda: Signal("y", size=2, lower=[0.0, 0.0, 0.0]), r"2 entries, but its lower has shape \(3,\)"),
         (lambda: Signal("y", size=2, lower=1.0, upper=0.0), "lower limit 1.0 lies above"),
         (lambda: Signal("y", size=2, rate=0.0), "rate limit must be positive"),
@@ -247,6 +254,9 @@ def test_a_rule_with_a_period_is_told_how_late_its_estimates_are():
         ({"period": np.inf}, "at least 0 s, not inf"),
         ({"period": 0.1}, "no function that uses it"),
         ({"age": np.nan}, "at least 0 s, not nan"),
+        ({"age": "1 s"}, "is a number, not '1 s'"),
+        ({"period": "1 s", "by": abs}, "is a number, not '1 s'"),
+        ({"by": 3}, "is a function of estimates, not 3"),
     ],
 )
 def test_a_belief_of_impossible_times_is_refused(options, message):

@@ -151,6 +151,21 @@ def test_a_value_of_another_type_is_refused_at_build(values, message):
     AcrobotScenario(period=np.float64(0.02)).validate()
 
 
+class Undecorated(AcrobotScenario):
+    extra: float = 1.0
+
+
+def test_a_field_that_is_none_is_refused():
+    with pytest.raises(ScenarioError, match="Undecorated.extra is no field: decorate Undecorated with @dataclass"):
+        Undecorated().build()
+
+
+def test_what_is_no_scenario_is_refused():
+    for value in (None, AcrobotScenario, "acrobot"):
+        with pytest.raises(ValueError, match="a scenario is an instance"):
+            DpsAlone(value)
+
+
 def test_a_failed_assertion_of_drake_does_not_end_the_process():
     with pytest.raises(RuntimeError, match=r"AcrobotScenario\(time_step=-0.1\) cannot be built: .* 'time_step >= 0'"):
         AcrobotScenario(time_step=-0.1).build()

@@ -18,6 +18,7 @@ from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.rollout.recorded_motion import RecordedMotion
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.scenario import check_is_scenario
 
 THRESHOLD = "threshold"
 HORIZON = "horizon"
@@ -154,8 +155,7 @@ class RolloutTask:
     motion: RecordedMotion | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.scenario, Scenario):
-            raise ValueError(f"a scenario is an instance, MyScenario() or load_scenario(name), not {self.scenario!r}")
+        check_is_scenario(self.scenario)
         if not isinstance(self.start, Snapshot | None):
             raise ValueError(f"the start of rollouts is a Snapshot, such as Snapshot.load(file), not {self.start!r}")
         for name, what in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():

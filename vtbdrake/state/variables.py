@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 
+from vtbdrake.argument_checks import as_array
+
 X = "x"
 A = "a"
 
@@ -86,13 +88,9 @@ class Variable:
         if self.write is None:
             raise VariableError(f"{self.address} is derived from other variables and cannot be set")
         try:
-            array = np.asarray(value)
-            # Not a text, although "5" could be converted, nor None, which would be NaN.
-            if array.dtype.kind not in "biuf":
-                raise TypeError(array.dtype)
-        except (TypeError, ValueError) as error:
-            raise VariableError(f"{self.address} takes numbers of shape {self.shape}, not {value!r}") from error
-        array = array.astype(float)
+            array = as_array(self.address, value)
+        except ValueError:
+            raise VariableError(f"{self.address} takes numbers of shape {self.shape}, not {value!r}") from None
         if array.shape != self.shape:
             raise VariableError(f"{self.address} has shape {self.shape}, but the value given has {array.shape}")
         if not np.isfinite(array).all():

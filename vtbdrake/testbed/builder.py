@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
+from vtbdrake.argument_checks import as_addresses
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
@@ -88,6 +89,8 @@ class VirtualTestbedBuilder:
         """
         if role not in ROLES:
             raise ValueError(f"the role of {name} is one of {', '.join(ROLES)}, not {role!r}")
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"a part of the simulated world has a name, a text, not {name!r}")
         if not isinstance(system, System):
             raise ValueError(f"sim.{role}.{name} is a System, not {system!r}")
         return self.diagram_builder.AddNamedSystem(f"sim.{role}.{name}", system)
@@ -222,7 +225,9 @@ class VirtualTestbedBuilder:
                 value of the target, for example ``lambda q, v, *, late: q + late * v``. So a mental world begins at the
                 present, and not at an instant that lies ``age`` and up to a period before it.
         """
-        self.belief_rules.append(BeliefRule(target, tuple(of), by, age, period))
+        self.belief_rules.append(
+            BeliefRule(target, as_addresses(f"what the belief about {target} is of", of), by, age, period)
+        )
 
     def build(
         self, *, mode: str = "sim", scenario: Scenario | None = None, meshcat: Meshcat | None = None, prefix: str = ""

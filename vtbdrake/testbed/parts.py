@@ -17,11 +17,11 @@ from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.variables import html_table
 from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.scenario import Scenario, check_is_scenario
 from vtbdrake.testbed.signal import Feed, Interface, SignalError
 from vtbdrake.testbed.switch import COMMAND, REAL, Switches
 
 if TYPE_CHECKING:
-    from vtbdrake.testbed.scenario import Scenario
     from vtbdrake.testbed.testbed import VirtualTestbed
 
 
@@ -36,6 +36,7 @@ class DpsAlone(AddressedDiagram):
     """
 
     def __init__(self, scenario: Scenario) -> None:
+        check_is_scenario(scenario)
         scenario.validate()
         interface = scenario.interface()
         parts = VirtualTestbedBuilder(interface)
@@ -128,6 +129,7 @@ class WorldAlone(AddressedDiagram):
             ScenarioError: A field of the scenario has a value that nothing can be built with.
             SignalError: The world lacks a signal of the interface.
         """
+        check_is_scenario(scenario)
         scenario.validate()
         own = copy.deepcopy(scenario)
         parts = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
+from inspect import get_annotations
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Self
 
@@ -107,6 +108,10 @@ class Scenario(ABC):
                 cannot be used.
         """
         name = type(self).__name__
+        for kind in type(self).__mro__:
+            plain = list(get_annotations(kind)) if "__dataclass_fields__" not in vars(kind) else []
+            if plain and issubclass(kind, Scenario):
+                raise ScenarioError(f"{kind.__name__}.{plain[0]} is no field: decorate {kind.__name__} with @dataclass")
         for key, owner, kinds in _scalar_fields(self):
             value = getattr(owner, key.rpartition(".")[2])
             if value is not None:  # A field that may be None has a type like float | None.
@@ -266,6 +271,12 @@ class Scenario(ABC):
         from vtbdrake.testbed.scenario_file import save_scenario
 
         save_scenario(self, path)
+
+
+def check_is_scenario(value: Any) -> None:
+    """Raise a ValueError if ``value`` is not an instance of a scenario: a class, say, or a name."""
+    if not isinstance(value, Scenario):
+        raise ValueError(f"a scenario is an instance, MyScenario() or load_scenario(name), not {value!r}")
 
 
 def class_name(scenario: type[Scenario]) -> str:

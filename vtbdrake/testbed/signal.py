@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from math import inf
 from typing import Any
@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPort, OutputPort, PortDataType
+
+from vtbdrake.argument_checks import as_array
 
 
 class SignalError(ValueError):
@@ -58,8 +60,10 @@ class Signal:
         return f"Signal({', '.join(shown)})"
 
     def __post_init__(self) -> None:
-        if not self.name or any(c in self.name for c in ".:/ "):
-            raise SignalError(f"a signal's name is one word without '.', ':', '/' or blanks, not {self.name!r}")
+        if not isinstance(self.name, str) or not self.name or any(c in ".:/[]" or c.isspace() for c in self.name):
+            raise SignalError(f"a signal's name is one word without '.', ':', '/', '[' or blanks, not {self.name!r}")
+        if not isinstance(self.unit, str):
+            raise SignalError(f"signal {self.name}: its unit is a text, 'm/s', say, not {self.unit!r}")
         if (self.size is None) == (self.model_value is None):
             raise SignalError(f"signal {self.name} is either a vector (give size=) or abstract (give model_value=)")
         if self.size is not None:
@@ -74,18 +78,18 @@ class Signal:
             raise SignalError(f"signal {self.name} must have at least one entry, not {self.size!r}")
         for name in ("lower", "upper", "rate", "acceleration", "idle", "default"):
             value = getattr(self, name)
-            if value is None:
+            if value is None and name in ("idle", "default"):
                 continue
             try:
-                array = np.asarray(value, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise SignalError(
-                    f"signal {self.name}: its {name} must be a number or several, not {value!r}"
-                ) from error
+                array = as_array(f"signal {self.name}: its {name}", value)
+            except ValueError as error:
+                raise SignalError(str(error)) from None
             if array.shape not in ((), (self.size,)):
                 raise SignalError(f"signal {self.name} has {self.size} entries, but its {name} has shape {array.shape}")
             if np.isnan(array).any():
                 raise SignalError(f"signal {self.name}: its {name} has a NaN")
+            if name in ("idle", "default") and np.isinf(array).any():
+                raise SignalError(f"signal {self.name}: its {name} must be finite, not {value!r}")
         if (np.asarray(self.lower) > np.asarray(self.upper)).any():
             raise SignalError(f"signal {self.name}: its lower limit {self.lower} lies above its upper {self.upper}")
         for name in ("rate", "acceleration"):
@@ -203,7 +207,10 @@ class Interface:
 
     def __post_init__(self) -> None:
         for name in ("sense", "act", "commands"):
-            signals = (given,) if isinstance(given := getattr(self, name), Signal) else tuple(given)
+            given = getattr(self, name)
+            if not isinstance(given, Signal | Iterable):
+                raise SignalError(f"an interface's {name} is a list of Signal(...), [] for none, not {given!r}")
+            signals = (given,) if isinstance(given, Signal) else tuple(given)
             if wrong := [item for item in signals if not isinstance(item, Signal)]:
                 raise SignalError(f"an interface's {name} is a list of Signal(...), but has {wrong[0]!r}")
             object.__setattr__(self, name, signals)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, System
 
+from vtbdrake.argument_checks import as_number
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -47,13 +48,16 @@ class BeliefRule:
     period: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.age < inf:
+        if not 0.0 <= as_number(f"the age of the belief about {self.target}", self.age) < inf:
             raise ValueError(f"the age of the belief about {self.target} is a time of at least 0 s, not {self.age!r}")
+        if self.by is not None and not callable(self.by):
+            raise ValueError(f"by= of the belief about {self.target} is a function of estimates, not {self.by!r}")
         if self.by is None and len(self.of) != 1:
             raise ValueError(
                 f"the belief about {self.target} is of {len(self.of)} estimates: give the function of them as by="
             )
-        if self.period is not None and not 0.0 <= self.period < inf:
+        period = 0.0 if self.period is None else as_number(f"the period of the belief about {self.target}", self.period)
+        if not 0.0 <= period < inf:
             raise ValueError(
                 f"the sample period of the belief about {self.target} is a time of at least 0 s, not {self.period!r}"
             )
