@@ -98,7 +98,8 @@ def associate(
 
     Each object is seen once at most, and classes agree. Among all one-to-one assignments within the gate, this is the
     one with the least sum of d² over the pairs plus the gate for each sighting that is left over (global nearest
-    neighbours). The gate is the quantile of the chi-square distribution with the pair's degrees of freedom.
+    neighbours). The gate is the quantile of the chi-square distribution with the pair's degrees of freedom. Nothing
+    tells how close the decision was: between two objects that fit equally well, a sighting is of the first.
 
     Args:
         objects: The objects that may have been seen.
