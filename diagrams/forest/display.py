@@ -45,8 +45,9 @@ _LOOKS = {
     DOUBTFUL: ("doubtful", Rgba(0.9, 0.62, 0.0, 1.0)),
     LOST: ("lost", Rgba(0.84, 0.37, 0.0, 1.0)),
 }
-_TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.4)
+_TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.8)
 _TRUNK_HEIGHT, _LETTERS, _MARKER = 1.5, 1.0, 0.25
+_ROOF = 1.0
 # Where the carrier is seen from, in m, and how bright all is.
 _VIEW, _AMBIENT = (0.0, -14.0, 26.0), 3.0
 
@@ -54,9 +55,10 @@ _VIEW, _AMBIENT = (0.0, -14.0, 26.0), 3.0
 class DriverDisplay:
     """Draws what a localization unit knows into Meshcat, under ``display``.
 
-    The carrier stands where the pose says, with the ellipse of its position (`DEVIATIONS`) around it and the landmarks
-    of the last scan as cylinders. Without a pose there are neither: the status stands where the last pose was, or in
-    the middle of the map. All is moved so that this place stays in the middle of the view, north up.
+    The carrier stands where the pose says, with the ellipse of its position (`DEVIATIONS`) on its roof, and the
+    landmarks of the last scan as cylinders. Beside the status stands the larger semi-axis of the ellipse. Without a
+    pose there is none of them: the status stands where the last pose was, or in the middle of the map. All is moved so
+    that this place stays in the middle of the view, north up.
     """
 
     def __init__(self, meshcat: Meshcat, world_map: WorldModel) -> None:
@@ -67,7 +69,7 @@ class DriverDisplay:
             world_map: The map of the unit.
         """
         self._meshcat = meshcat
-        self._status: int | None = None
+        self._told = ""
         self._landmarks = self._shown = 0
         show_world_model(meshcat, world_map, prefix="display/map", marker=_MARKER, deviations=0.0, label_height=0.0)
         self._place = world_map.positions().mean(axis=0)
@@ -76,7 +78,7 @@ class DriverDisplay:
             meshcat.SetProperty("/Background", color, [1.0, 1.0, 1.0])
         meshcat.SetProperty("/Grid", "visible", False)
         meshcat.SetProperty("/Lights/AmbientLight/<object>", "intensity", _AMBIENT)
-        meshcat.SetObject("display/carrier/body", Box(2.5, 1.5, 1.0), _LOOKS[TRACKING][1])
+        meshcat.SetObject("display/carrier/body", Box(2.5, 1.5, _ROOF), _LOOKS[TRACKING][1])
         meshcat.SetObject("display/carrier/ahead", Box(1.5, 0.15, 0.15), _LOOKS[TRACKING][1])
         meshcat.SetTransform("display/carrier/ahead", RigidTransform([2.0, 0.0, 0.0]))
         meshcat.SetObject("display/ellipse", Sphere(1.0), _ELLIPSE)
@@ -86,16 +88,17 @@ class DriverDisplay:
         known = {address: np.asarray(values[address], dtype=float) for address in WATCHED}
         status = int(known[STATUS])
         pose = np.append(known[POSITION], known[HEADING])
+        covariance = known[COVARIANCE][:2, :2]
         has_pose = bool(np.isfinite(pose).all())
         for path in ("carrier", "ellipse"):
             self._meshcat.SetProperty(f"display/{path}", "visible", has_pose)
         if has_pose:
             self._place = np.append(pose[:2], 0.0)
             X_WH = RigidTransform(RotationMatrix.MakeZRotation(pose[2]), self._place)
-            self._meshcat.SetTransform("display/carrier", X_WH @ RigidTransform([0.0, 0.0, 0.5]))
-            self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], known[COVARIANCE][:2, :2]))
+            self._meshcat.SetTransform("display/carrier", X_WH @ RigidTransform([0.0, 0.0, _ROOF / 2.0]))
+            self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], covariance))
         self._show_landmarks(known[FOUND_AT], known[LANDMARKS].reshape(-1, 3))
-        self._show_status(status)
+        self._show_status(status, covariance)
         self._meshcat.SetTransform("display", RigidTransform(-self._place))
 
     def _show_landmarks(self, X_WH: Array, landmarks: Array) -> None:
@@ -116,16 +119,24 @@ class DriverDisplay:
             self._meshcat.SetProperty(f"display/landmarks/{k}", "visible", len(seen) > self._shown)
         self._shown = len(seen)
 
-    def _show_status(self, status: int) -> None:
-        if status != self._status:
-            text, color = _LOOKS[status]
-            self._meshcat.SetLineSegments("display/status", *text_strokes(text, _LETTERS), 2.0, color)
-            self._status = status
+    def _show_status(self, status: int, covariance: Array) -> None:
+        text = told(status, covariance)
+        if text != self._told:
+            self._meshcat.SetLineSegments("display/status", *text_strokes(text, _LETTERS), 2.0, _LOOKS[status][1])
+            self._told = text
         self._meshcat.SetTransform("display/status", RigidTransform(self._place + np.array([0.0, 0.0, 3.0])))
 
 
+def told(status: int, covariance: Array) -> str:
+    """Return the status in words, and with a pose how well the position (covariance (2, 2) in m^2) is known."""
+    words = _LOOKS[status][0]
+    if not np.isfinite(covariance).all():
+        return words
+    return f"{words} ±{DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]):.2f} m"
+
+
 def ellipse(place: Array, covariance: Array) -> Array:
-    """Return the matrix (4, 4) that turns the unit sphere into the ellipse of a position in the plane.
+    """Return the matrix (4, 4) that turns the unit sphere into the ellipse of a position, as high as the roof.
 
     Args:
         place: The middle, (2,) in m.
@@ -135,7 +146,7 @@ def ellipse(place: Array, covariance: Array) -> Array:
     matrix = np.eye(4)
     matrix[:2, :2] = DEVIATIONS * axes * np.sqrt(np.maximum(variances, 0.0))
     matrix[2, 2] = 0.02
-    matrix[:2, 3] = place
+    matrix[:3, 3] = [*place, _ROOF + 0.05]
     return matrix
 
 

@@ -40,7 +40,7 @@ from vtbdrake.scan import Scan
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.carrier import Carrier
-from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main
+from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main, told
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.perception import Localizer
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
@@ -353,7 +353,15 @@ def test_display_follows_the_pose(drive: Drive) -> None:
         ellipse = matrices["ellipse"][:2, :2]
         covariance = drive.seen["dps.env.pose.covariance"][k][:2, :2]
         np.testing.assert_allclose(ellipse @ ellipse.T, 9.0 * covariance, rtol=1e-6)
+        # It lies on the carrier, which would hide it otherwise: it is far smaller.
+        assert matrices["ellipse"][2, 3] > 2.0 * X_WH[2, 3]
     assert drawn(meshcat, "set_property")["carrier"] is True
+
+
+def test_display_tells_how_well_the_position_is_known() -> None:
+    turned = np.array([[0.0026, 0.0024], [0.0024, 0.0026]])  # variances 0.005 and 0.0002 m^2
+    assert told(TRACKING, turned) == "tracking ±0.21 m"
+    assert told(LOST, np.diag([np.inf, np.inf])) == "lost"
 
 
 def test_display_of_another_scenario_is_refused() -> None:
