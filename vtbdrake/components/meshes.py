@@ -70,7 +70,7 @@ def copies(surface: Surface, shapes: Array, positions: Array) -> Surface:
     """Return n copies of a surface as one surface; copy k has the vertices A_k p + b_k for the vertices p.
 
     Args:
-        surface: What is copied; all is as one mesh, because Drake's geometries cost time one by one.
+        surface: The surface to copy. The copies are one mesh, because each geometry costs Drake time.
         shapes: The matrices A_k, which scale, shear and turn, shape (n, 3, 3), with positive determinants.
         positions: The vectors b_k in m, shape (n, 3).
     """

@@ -33,7 +33,7 @@ HALF_SPACE = 2000.0
 
 @dataclass(frozen=True)
 class Hits:
-    """What n rays hit first.
+    """The first hits of n rays.
 
     Attributes:
         distances: From the origins of the rays in m, infinite where nothing is hit, shape (n,).

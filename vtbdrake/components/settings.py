@@ -9,7 +9,7 @@ def check_settings(owner: str, settings: object, checks: Mapping[str, tuple[bool
     """Raise an error for the first setting that is not as expected.
 
     Args:
-        owner: What has the settings, as the message begins.
+        owner: The owner of the settings, with which the message begins.
         settings: The object with an attribute for each of them.
         checks: Name -> whether the value is good, and what is expected.
 

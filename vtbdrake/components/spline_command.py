@@ -29,10 +29,10 @@ class SplineCommand(LeafSystem):
 
     ``plan`` = [t_begin, w_0, ..., w_{n-1}] has 1 + n m entries: the time at which the plan begins, in seconds, and n
     knots of m entries each. At t = 0, T, 2 T, ... the system reads the plan, and its output, which is its state,
-    becomes the spline's value at t - t_begin. So one vector holds all that is decided, whether by an operator (a
-    command u), by a slow part or in a rollout; and a plan that arrives late is joined where it should be by then.
+    becomes the spline's value at t - t_begin. So one vector is the whole plan, whether it is given by an operator (a
+    command u), by a slow part or in a rollout; and a plan that arrives late is followed from its present value on.
 
-    Before t_begin the value stays as it is. After the end of the plan it is the last one, or ``after``.
+    Before t_begin the value does not change. After the end of the plan it is the last one, or ``after``.
     """
 
     __slots__ = NO_DICT

@@ -33,7 +33,7 @@ class Kernel:
     every thread has its own arrays.
 
     Attributes:
-        value: y where z is the blocks one after the other. The thread's next call overwrites it.
+        value: Returns y for the concatenated blocks of z. The thread's next call overwrites the result.
     """
 
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):

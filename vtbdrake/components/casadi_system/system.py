@@ -53,10 +53,10 @@ def CasadiSystem_(T: type) -> type:
             filter = casadi.Function("filter", [x, u], [x + 0.1 * (u - x)], ["x", "u"], ["x_next"])
             CasadiSystem(update=filter, state={"x": [0.0, 0.0]}, period=0.02)
 
-        A matrix travels as a vector, row after row (C order, as numpy's ``ravel`` and as the variables by address);
+        A matrix is a vector on ports, row after row (C order, as numpy's ``ravel`` and as the variables by address);
         CasADi's own order is column after column. Parameters and state are variables by address.
 
-        An output depends on those arguments whose symbols occur in it, and on nothing else: so an output of the state
+        An output depends exactly on the arguments whose symbols occur in it: so an output of the state
         alone is no direct feedthrough, and is computed only when the state changes. An output that is a state (and
         every output when ``output`` is left out) costs nothing. Every other output is computed for itself; what has
         much in common is cheaper as one vector. If the function is an MX graph with calls in it, all results of a

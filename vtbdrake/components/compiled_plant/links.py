@@ -36,13 +36,13 @@ class Link:
     Attributes:
         parent: Number of the link that carries the joint; -1 is the world.
         kind: Type name of the joint.
-        axis: Of the joint, in F and in M, shape (3, 1).
-        q: Where its positions lie in those of the plant.
-        v: Where its velocities lie in those of the plant.
+        axis: Axis of the joint, in F and in M, shape (3, 1).
+        q: Places of its positions among those of the plant.
+        v: Places of its velocities among those of the plant.
         X_PF: Pose of F in the frame of the parent.
         inertia: M_LMo_M of the link L, [angular; linear], shape (6, 6).
-        damping: Of the joint, shape (nv, 1).
-        reflected_inertia: Of the joint's actuators, shape (nv, 1).
+        damping: Damping of the joint, shape (nv, 1).
+        reflected_inertia: Reflected inertia of the joint's actuators, shape (nv, 1).
     """
 
     parent: int
@@ -79,7 +79,7 @@ def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = 
     Args:
         plant: The plant.
         context: The plant's own Context.
-        inputs: Addresses within the plant of what becomes a symbol instead of a number: ``mass``, ``center_of_mass``
+        inputs: Addresses within the plant of the values that become symbols: ``mass``, ``center_of_mass``
             and ``inertia`` of a body, ``damping`` of a joint, ``pose`` of a frame that carries a joint, and
             ``rotor_inertia`` of an actuator, as in `multibody_variables`.
 
@@ -250,7 +250,7 @@ class _Reader:
 
 
 def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
-    """Yield what the plant has and the compiled one would not."""
+    """Yield the parts of the plant that cannot be compiled."""
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         if joint.type_name() not in (REVOLUTE, PRISMATIC, WELD, FLOATING):

@@ -37,12 +37,12 @@ Array = NDArray[np.float64]
 class MomentumModel(PlantDynamics):
     """A free-floating tree with zero momentum, some of whose joints move as prescribed, as CasADi expressions.
 
-    The other joints stay where the Context has them. Joint quantities have m entries, in the order of ``joints``.
-    Positions and velocities of the base B, the body that floats, are relative to where it was at first, B0.
+    The other joints keep their positions in the Context. Joint quantities have m entries, in the order of ``joints``.
+    Positions and velocities of the base B, the body that floats, are relative to its initial frame B0.
 
     Attributes:
         joints: The names of the joints that move.
-        damping: Of these joints, shape (m,), in N m s/rad (or N s/m).
+        damping: Damping of these joints, shape (m,), in N m s/rad (or N s/m).
         base: The name of the body that floats.
     """
 
@@ -51,7 +51,7 @@ class MomentumModel(PlantDynamics):
 
         Args:
             plant: The plant, finalized, without gravity; it is not kept.
-            context: Its own Context, with the numbers, and the positions of the joints that do not move.
+            context: Its own Context, with the parameters, and the positions of the joints that do not move.
             joints: The m joints that move, revolute or prismatic.
 
         Raises:
@@ -125,7 +125,7 @@ class MomentumModel(PlantDynamics):
         """Return p_BoFo_B of a frame F, shape (3, 1), in m.
 
         Args:
-            frame: Of the plant.
+            frame: The frame F of the plant.
             q: Positions of the joints, shape (m, 1).
         """
         return self.frame(frame, self._positions(q)).p
@@ -195,10 +195,10 @@ class BaseMotion:
     """How the base moves.
 
     Attributes:
-        times: In s, shape (N + 1,).
+        times: Times in s, shape (N + 1,).
         rotation: Quaternions [w, x, y, z] of R_B0B, shape (N + 1, 4).
         position: p_B0B_B0 in m, shape (N + 1, 3).
-        torque: Of the drives, shape (N + 1, m), in N m (or N).
+        torque: Torques of the drives, shape (N + 1, m), in N m (or N).
     """
 
     times: Array
@@ -239,7 +239,7 @@ class BaseReaction:
         """Return the motion of the base.
 
         Args:
-            knots: Of the plan, shape (n, m), or flat.
+            knots: The knots of the plan, shape (n, m), or flat.
 
         Raises:
             ValueError: The shape does not fit.

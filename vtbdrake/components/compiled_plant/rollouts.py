@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RolloutBatch:
-    """What n rollouts came to.
+    """The results of n rollouts.
 
     Attributes:
-        costs: Shape (n,).
+        costs: The costs, shape (n,).
         overruns: The largest one of all steps, shape (n,); see `plant_step`.
         final: The last states, shape (n, nx).
     """

@@ -42,9 +42,9 @@ def compiled_world(
 
     Args:
         plant: The plant, finalized, with a time step; it is not kept.
-        context: Its own Context, with the initial state and the numbers.
-        inputs: Addresses within the plant of what becomes parameters; see `read_links`.
-        compile: As of a `CasadiSystem`.
+        context: Its own Context, with the initial state and the parameters.
+        inputs: Addresses within the plant of the values that become parameters; see `read_links`.
+        compile: Whether to make machine code; see `CasadiSystem`.
 
     Raises:
         UnsupportedPlantError: The plant has contact, loops, springs, joints of other types, and so on.

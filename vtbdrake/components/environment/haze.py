@@ -1,4 +1,4 @@
-"""Haze and dust: what they take from images and laser beams, and what they add.
+"""Haze and dust in images and laser scans: extinction, airlight and false returns.
 
 The extinction coefficient b (1/m) is the share of light that is lost per metre, by scattering and absorption:
 transmission over a distance d is exp(-b d), the law of Beer and Lambert.

@@ -1,4 +1,4 @@
-"""Light: the sun, and what the Earth reflects of it.
+"""Light: sunlight, and sunlight that the Earth reflects.
 
 Brightness is relative: 1 is that of sunlight near the Earth, of the irradiance `SOLAR_CONSTANT`, on a white surface
 that faces it. A camera with exposure 1 and gain 1 shows such a surface at full scale.
@@ -65,7 +65,7 @@ class LightConfig:
     shadows: bool = True
 
     def check(self) -> None:
-        """Raise a ValueError if there is no such light.
+        """Raise a ValueError if a value is impossible.
 
         Raises:
             ValueError: A value that no light can have.

@@ -36,10 +36,10 @@ _PROPERTY = ("markers", "size")
 
 @dataclass(frozen=True, eq=False)
 class MarkerBoard:
-    """Where the markers of a rigid body T are.
+    """The positions of the markers on a rigid body T.
 
     A marker's frame M has its origin in the marker's centre, x to the right and y upwards in the picture, and z
-    towards who reads it.
+    towards the viewer.
 
     Attributes:
         ids: The numbers of the markers in the family 36h11, (n,).
@@ -174,12 +174,12 @@ REFINEMENTS = ("lines", "subpixel", "none")
 
 @dataclass
 class MarkerDetector:
-    """How markers are found in an image.
+    """Settings of the detection of markers in an image.
 
     Attributes:
         window: The edge of the largest window of the adaptive threshold, in pixels; the smallest has 3.
         windows: The number of windows that are tried.
-        threshold: What the adaptive threshold subtracts from the mean, in 8-bit counts: less sees markers in the dark.
+        threshold: The offset of the adaptive threshold below the mean, in 8-bit counts: less finds markers in the dark.
         min_perimeter: The perimeter of the smallest marker, as a share of the image's longer side.
         refinement: ``lines`` fits lines to the edges of a marker, ``subpixel`` is OpenCV's search at the corners,
             ``none`` gives whole pixels.
@@ -231,7 +231,7 @@ def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetec
 
     Args:
         image: A colour image, or an array (height, width) of grey values.
-        detector: How they are searched for.
+        detector: The settings of the detection.
 
     Raises:
         ImportError: OpenCV is missing.
@@ -372,7 +372,7 @@ def pose_from_markers(
 
     Args:
         detections: The markers in the image.
-        board: Where they are on the body.
+        board: Their positions on the body.
         intrinsics: [fx, fy, cx, cy] of the camera in pixels, as in Drake's CameraInfo.
         time: When the image was taken, in s.
         prediction: X_CT as it is expected.

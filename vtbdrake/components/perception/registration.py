@@ -130,8 +130,8 @@ def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: 
     With a constant twist, a point of the body that is at q at the time t is at o + exp(-[ω]× t) (q - o - v t) at 0.
 
     Args:
-        points: In a fixed frame, (n, 3) in m.
-        times: When each was measured, (n,) in s.
+        points: Points in a fixed frame, (n, 3) in m.
+        times: Time of the measurement of each, (n,) in s.
         origin: A point o of the body at time 0, (3,) in m.
         velocity: The velocity v of that point, (3,) in m/s.
         rate: The angular velocity ω of the body, (3,) in rad/s.
@@ -145,18 +145,18 @@ def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: 
 
 @dataclass
 class Registration:
-    """How laser points are registered.
+    """Noise and limits of the registration of laser points.
 
     Attributes:
         range_noise: The standard deviation of the distance of a point from its face, in m.
         systematic: The standard deviation of errors that more points do not reduce, in m; assumed, not derived. As an
             angle it counts per metre.
-        basin: Up to which distance points belong to the body at first, in m. It is halved in every step, down to four
-            times the noise.
-        most_points: At most so many points are used, evenly chosen.
-        fewest_points: So many points must lie on the faces in the end.
-        share: And this share of those that lie within ``basin`` of the body.
-        steps: The number of steps at most.
+        basin: Largest distance from the body of points that are used in the first step, in m. It is halved in every
+            step, down to four times the noise.
+        most_points: Largest number of points that are used, evenly chosen.
+        fewest_points: Least number of points that must lie on the faces after the last step.
+        share: Least share that they must be of the points within ``basin`` of the body.
+        steps: Largest number of steps.
     """
 
     range_noise: float = 0.01
@@ -201,15 +201,15 @@ def register_points(
     covariance is the inverse normal matrix of the points above faces and of these offsets.
 
     Args:
-        points: In A, (n, 3) in m, measured at one instant, or de-skewed.
+        points: Points in A, (n, 3) in m, measured at one instant, or de-skewed.
         faces: The model.
         start: X_AT to start from: a prediction, or the pose from markers.
-        eye: Where the points were seen from, in A, (3,) in m.
-        time: The instant that the points belong to, in s.
+        eye: Position in A of the sensor that saw the points, (3,) in m.
+        time: The instant of the points, in s.
         registration: Noise and limits.
-        deviation: The standard deviations of the start in rad and m. What the points leave open stays as it is at the
-            start, and offsets along a face are not believed if they are four times as large. The covariance of the
-            estimate does not count the start: it is that of a start with 0.3 rad and 0.3 m.
+        deviation: The standard deviations of the start in rad and m. Motions that the points do not determine keep the
+            start, and offsets along a face of more than four deviations are rejected. The covariance of the estimate
+            does not depend on it: it is that of a start with 0.3 rad and 0.3 m.
 
     Returns:
         An estimate of X_AT; a missing one if too few points lie on the body.

@@ -1,4 +1,4 @@
-"""Distances from a pair of images: what is near is shifted more between them.
+"""Distances from a pair of images, by the shift of each point between them.
 
 The images are those of two equal cameras with the same orientation, the right one beside the left one: a rectified
 pair. A point at the depth z is shifted by the disparity d = f b / z pixels (focal length f, baseline b). So an error of
@@ -30,10 +30,10 @@ class StereoCamera:
     in C. Pixels count as in Drake's `CameraInfo`: the centre of the first one is at (0.5, 0.5).
 
     Attributes:
-        width: Of the images, in pixels.
-        height: Of the images, in pixels.
-        focal_length: In pixels; pixels are square.
-        center_x: Where the optical axis meets the images, in pixels from their left edge.
+        width: Width of the images, in pixels.
+        height: Height of the images, in pixels.
+        focal_length: Focal length in pixels; pixels are square.
+        center_x: Position of the optical axis in the images, in pixels from their left edge.
         center_y: The same, from their upper edge.
         baseline: The distance of the cameras in m.
     """
@@ -105,18 +105,18 @@ _MODES = {3: "STEREO_SGBM_MODE_SGBM_3WAY", 5: "STEREO_SGBM_MODE_SGBM", 8: "STERE
 
 @dataclass(frozen=True)
 class StereoMatcher:
-    """How disparities are found.
+    """Settings of semi-global matching.
 
     Attributes:
-        largest_disparity: In pixels, a multiple of 16; what is nearer than its depth gets none, or a wrong one.
+        largest_disparity: Largest disparity in pixels, a multiple of 16; nearer surfaces get none, or a wrong one.
         block: The edge of the blocks that are compared, in pixels, odd.
         directions: From how many directions semi-global matching collects costs: 3, 5 or 8. Only with 8 are the
             disparities of slopes not biased (with 5 by more than 0.1 pixels); it takes twice the time or more. On
             upright surfaces all are alike.
         uniqueness: By how many per cent the best cost is better than that of any other disparity.
         symmetry: How far the disparities from left to right and from right to left may differ, in pixels.
-        texture: The least contrast around a pixel: the mean absolute difference of pixels side by side in counts. What
-            has less (sky, deep shade) gets no disparity.
+        texture: The least contrast around a pixel: the mean absolute difference of pixels side by side in counts. Parts
+            with less (sky, deep shade) get no disparity.
         speckle: The least number of connected pixels with similar disparities.
     """
 

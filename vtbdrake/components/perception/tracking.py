@@ -26,7 +26,7 @@ from vtbdrake.state.systems import POSE_UNIT, pose_to_array
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What is known of a moving body T in an inertial frame I at one instant.
+    """The estimated motion of a body T in an inertial frame I at one instant.
 
     The error is [θ; d; δω; δv]: θ and d as in `PoseEstimate`, all expressed in I.
 
@@ -67,16 +67,16 @@ TRACK_SIZE = 1 + 9 + 9 + 144
 
 @dataclass
 class MotionModel:
-    """How a body in free fall is assumed to move: with constant velocity and angular velocity, but for white noise.
+    """The assumed motion of a body in free fall: constant velocity and angular velocity, plus white noise.
 
     The angular velocity of a torque-free body is constant only about a principal axis. Otherwise it changes by up to
     (I_max - I_min) / I ω², which ``rate_noise`` must cover: 0.001 rad/s² at 3 deg/s and a ratio of 0.4.
 
     Attributes:
-        rate_noise: Of the angular acceleration, the square root of the spectral density, in rad/s^1.5.
-        velocity_noise: Of the acceleration, in m/s^1.5.
-        first_rate: The standard deviation of the angular velocity before anything is known, in rad/s.
-        first_velocity: Of the velocity, in m/s.
+        rate_noise: Square root of the spectral density of the angular acceleration, in rad/s^1.5.
+        velocity_noise: Square root of the spectral density of the acceleration, in m/s^1.5.
+        first_rate: Initial standard deviation of the angular velocity, in rad/s.
+        first_velocity: Initial standard deviation of the velocity, in m/s.
     """
 
     rate_noise: float = 1e-3
@@ -207,11 +207,11 @@ class TargetTracker(LeafSystem):
         - state
         - status
 
-    Every period it fuses what is new at its sources: each estimate once, at the time at which it held, which may be
-    earlier than what was fused before. Estimates that are too far from the expected pose (``gate``, on the normalized
-    innovation squared) are left out; after ``patience`` of them in succession, the track begins anew with the next
-    estimate of a source that needs no prediction. An estimate with a time that is later than the present by more than
-    ``lost_after`` is ignored.
+    Every period it fuses the new estimates of its sources: each once, at its own time, which may be earlier than that
+    of estimates fused before. Estimates that are too far from the expected pose (``gate``, on the normalized innovation
+    squared) are rejected; after ``patience`` of them in succession, the track begins anew with the next estimate of a
+    source that needs no prediction. An estimate with a time that is later than the present by more than ``lost_after``
+    is ignored.
 
     ``state`` is the target at the present, as `body_state` orders it: (13,). Before the first estimate it is the
     identity at rest. ``status`` is [valid, age, attitude, position]: valid is 1 if the track has had ``fewest``
@@ -222,9 +222,9 @@ class TargetTracker(LeafSystem):
 
     Args:
         sources: The names of the input ports.
-        starting: Those that need no prediction.
-        period: In s.
-        motion: How the target is assumed to move.
+        starting: The sources that need no prediction.
+        period: Sample period in s.
+        motion: The assumed motion of the target.
     """
 
     __slots__ = NO_DICT

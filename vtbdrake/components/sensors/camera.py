@@ -240,7 +240,7 @@ class Camera(LeafSystem):
         return _color_image(color)
 
     def resume(self, context: Context, image: ImageRgba8U | ImageDepth32F) -> None:
-        """Go on where a camera stands that has shown ``image`` last, with all that is in transit alike."""
+        """Continue like a camera that has shown ``image`` last, which also counts as the images in transit."""
         is_color = isinstance(image, ImageRgba8U)
         if not is_color and self._depth is None:
             raise ValueError("Camera: there is no depth image to go on with")
@@ -311,7 +311,7 @@ class Camera(LeafSystem):
         return round(context.get_time() / self._period)
 
     def _begin(self, context: Context, state: State) -> EventStatus:
-        """Take the first image, which has been on its way for ever."""
+        """Take the first image, which also counts as all earlier ones that are in transit."""
         color, depth = self._take(context, self._tick(context))
         self._show(state, color, depth)
         if self._transit is not None:

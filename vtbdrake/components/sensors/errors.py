@@ -29,7 +29,7 @@ _DRIFT_CHANNEL, _DROPOUT_CHANNEL, _OUTLIER_CHANNEL, _OUTLIER_SIZE_CHANNEL = 1, 2
 
 @dataclass
 class ErrorModel:
-    r"""The errors of a sampled sensor, in the order in which a sample meets them.
+    r"""The errors of a sampled sensor, in the order in which they act on a sample.
 
     With the measured quantity m_k at tick k, of the period T, and n, n', n'' of N(0, 1), u, u' uniform in [0, 1), all
     functions of (seed, stream, k):
@@ -61,9 +61,9 @@ class ErrorModel:
     dropout: float = 0.0
     # Probability that a sample is an outlier, in all its entries.
     outlier_probability: float = 0.0
-    # Standard deviation of what an outlier is off by, in the unit of the signal.
+    # Standard deviation of the error of an outlier, in the unit of the signal.
     outlier_size: float = 0.0
-    # Of all random numbers, beside the stream, which belongs to the sensor.
+    # Seed of all random numbers, together with the stream of the sensor.
     seed: int = 0
 
     def without_chance(self) -> ErrorModel:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class ContactSensor(SampledSensor):
-    """Tells which bodies touch something: 1 where its contact forces exceed a threshold, else 0.
+    """Contact switches of bodies: 1 if the contact forces of the body exceed a threshold, else 0.
 
     .. pydrake_system::
 

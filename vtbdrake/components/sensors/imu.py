@@ -46,8 +46,8 @@ class Imu(SampledSensor):
     in a continuous plant, and empty after a restore in a discrete one). The first sample has no predecessor: it
     shows w = 0 and f = -R_WF' g, and so does the output before it, for the plant's default pose.
 
-    F starts where ``frame`` is on B. From then on the parameter ``mount``, [x, y, z, roll, pitch, yaw] of F in B, says
-    where the sensor sits; moving ``frame`` does not move it.
+    The parameter ``mount``, [x, y, z, roll, pitch, yaw], is the pose of F in B. Initially it is that of ``frame``;
+    moving ``frame`` afterwards does not change it.
     """
 
     __slots__ = NO_DICT

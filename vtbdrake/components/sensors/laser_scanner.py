@@ -53,7 +53,7 @@ _CHANNEL = 0
 
 @dataclass(kw_only=True)
 class LaserScannerConfig:
-    """How a laser scanner scans. All values are parameters of the Context, too."""
+    """The configuration of a laser scanner. All values are parameters of the Context, too."""
 
     # Scans per second.
     frequency: float = 10.0
@@ -79,7 +79,7 @@ class LaserScannerConfig:
         """Raise a ValueError if no scanner can scan like this.
 
         Args:
-            slice_period: Of the scanner, in s.
+            slice_period: Length of the scanner's slices, in s.
 
         Raises:
             ValueError: A value that no scanner can have.
@@ -203,7 +203,7 @@ class LaserScanner(LeafSystem):
         Args:
             plant: The plant, whose bodies move.
             frame: A frame of the plant, at which the scanner begins.
-            caster: What rays are cast at; several scanners can share it.
+            caster: The geometry that rays are cast at; several scanners can share it.
             config: Initial values of the parameters.
             slice_period: Length of a slice in s. It limits the frequency; shorter ones cost time.
             stream: Number of the random stream, which makes the noise of several sensors independent.
@@ -344,11 +344,11 @@ class LaserScanner(LeafSystem):
         """Return which rays are reported, and their ranges (m).
 
         Args:
-            context: At the end of the slice.
-            settings: Of the scanner.
-            generator: Of the slice.
-            directions: Of the rays, as they are reported, shape (n, 3).
-            times: When they are fired, in s, counted from the end of the slice, shape (n,).
+            context: The Context at the end of the slice.
+            settings: The settings of the scanner.
+            generator: The generator of the slice.
+            directions: The directions of the rays, as they are reported, shape (n, 3).
+            times: Their firing times in s, relative to the end of the slice, shape (n,).
         """
         config, errors = settings.config, settings.errors
         beams = directions
@@ -383,7 +383,7 @@ class LaserScanner(LeafSystem):
 def connect_laser_scanner(
     builder: DiagramBuilder, scanner: LaserScanner, plant: MultibodyPlant, *, haze: Haze | None = None
 ) -> None:
-    """Connect a laser scanner with the plant in which it is, and with the haze in front of it."""
+    """Connect a laser scanner with its plant, and with the haze."""
     for name in ("body_poses", "body_spatial_velocities"):
         builder.Connect(plant.GetOutputPort(name), scanner.GetInputPort(name))
     if haze is not None:

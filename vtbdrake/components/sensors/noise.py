@@ -1,6 +1,6 @@
 """Noise that is a function of (seed, stream, tick).
 
-Nothing is remembered between two samples, so repetitions of a simulation and copies of its Context see the same noise.
+It has no state, so repetitions of a simulation and copies of its Context have the same noise.
 """
 
 from __future__ import annotations

@@ -92,13 +92,13 @@ class SampledSensor(LeafSystem):
         return self._period
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
-        """Go on where a sensor stands that has shown ``y`` last, with all that is in transit alike.
+        """Continue like a sensor that has shown ``y`` last, which also counts as the samples in transit.
 
-        So the DPS of a mental copy gets what the DPS itself would have got, until the copy's sensors sample.
+        So the DPS of a mental copy reads the same as the DPS itself, until the copy's sensors sample.
 
         Args:
-            context: Of this sensor, in the state of the world in which it is to go on.
-            y: Shape (n,).
+            context: The Context of this sensor, in the state of the world from which it continues.
+            y: The last reading, shape (n,).
         """
         context.SetDiscreteState(self._output, y)
         if self._stage is not None:

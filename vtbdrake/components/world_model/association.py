@@ -1,4 +1,4 @@
-"""Which observation is of which object: innovations, gates, and the best one-to-one assignment."""
+"""Assignment of observations to objects: innovations, gates, and the best one-to-one assignment."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def mahalanobis(one: WorldObject, sighting: Sighting) -> tuple[float, int]:
     d² = νᵀ S⁻¹ ν. If the sighting is of the object, d² is chi-square distributed, to first order in the rotation.
 
     Args:
-        one: The object as the model has it.
-        sighting: What was seen, in the world frame of the model.
+        one: The object in the model.
+        sighting: The observation, in the world frame of the model.
 
     Raises:
         ValueError: An attribute was seen in another unit.
@@ -103,7 +103,7 @@ def associate(
 
     Args:
         objects: The objects that may have been seen.
-        sightings: What was seen at one instant.
+        sightings: The observations of one instant.
         probability: The share of right pairs that the gate lets pass.
 
     Raises:

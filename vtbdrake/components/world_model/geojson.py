@@ -9,8 +9,8 @@ Its `id` is the identity; its properties are flat, so that a table shows them:
   in the frame W of the model; ``relations``, a list of ``{"kind": ..., "other": ...}``. These three are texts of JSON,
   because tables of other programs round or lose lists; lists are read, too.
 
-Two foreign members of the FeatureCollection tell what GeoJSON has no place for: ``local_frame`` is the `LocalFrame` of
-W, and ``units`` the unit of every numeric attribute. Other programs drop both when they write; then the reader is told.
+The FeatureCollection has two foreign members: ``local_frame`` is the `LocalFrame` of W, and ``units`` the unit of every
+numeric attribute. Other programs drop both when they write; then they are arguments of `load_geojson`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def save_geojson(model: WorldModel, path: str | os.PathLike[str], *, frame: Loca
     """Write a world model as a GeoJSON file, whole or not at all.
 
     Args:
-        model: What is written.
+        model: The world model.
         path: The file.
         frame: Where the world frame of the model lies on Earth.
 
@@ -120,8 +120,8 @@ def load_geojson(
         path: The file.
         frame: The frame W of the model, for a file that does not declare it.
         units: Units of numeric attributes that the file does not declare, by name.
-        deviation: Standard deviation in m, per axis, of the positions of features without a covariance. 0 says that
-            they are exact: a localization that believes it finds nothing, or is too sure.
+        deviation: Standard deviation in m, per axis, of the positions of features without a covariance. With 0 they are
+            exact: then a localization finds nothing, or its covariance is too small.
 
     Raises:
         FileNotFoundError: There is no such file.

@@ -31,7 +31,7 @@ class _Index(NamedTuple):
 
 
 class WorldModel:
-    """What is known about the objects around: a value that never changes.
+    """The objects that are known, as an immutable value.
 
     Changes return a new model, which shares all objects that are the same. So a copy costs nothing, and a model is
     abstract state of a system, the environment of a DPS for example; `WORLD_MODEL_CODEC` carries it into snapshots.

@@ -1,4 +1,4 @@
-"""What a semantic world model says about one object: identity, class, pose, attributes, relations, life cycle."""
+"""One object of a semantic world model: identity, class, pose, attributes, relations, life cycle."""
 
 from __future__ import annotations
 
@@ -82,9 +82,9 @@ class Relation:
 class WorldObject:
     """One object O of a semantic world model, in the world frame W of the model. An object is immutable.
 
-    ``pose`` estimates X_WO and tells when it held. Its covariance is infinite where nothing is known: in all three
-    rotations (a trunk has no orientation to speak of), or in single translations (the height at which a scan cuts it).
-    There, the pose is a convention. Zero is a value that is exactly known.
+    ``pose`` is the estimate of X_WO, with its time. The covariance is infinite where nothing is known: in all three
+    rotations (a trunk has no meaningful orientation), or in single translations (the height at which a scan cuts it).
+    There, the pose is a convention. A covariance of zero is an exactly known value.
 
     Attributes:
         identity: A name that no other object of the model has.
@@ -92,7 +92,7 @@ class WorldObject:
         pose: The estimate of X_WO.
         attributes: Quantities by name (lower case, as an identifier).
         relations: Relations to other objects of the same model.
-        source: Where the knowledge comes from, such as the name of a survey or of a sensor.
+        source: The origin of the knowledge, such as the name of a survey or of a sensor.
         status: ``"tentative"``, ``"confirmed"``, ``"revised"`` or ``"retired"``, see `observe`.
         hits: How many observations have confirmed it.
         misses: How many observations since the last hit expected and did not see it.

@@ -63,7 +63,7 @@ def observe(
     expected: Collection[str] = (),
     rules: LifeCycle = DEFAULT_LIFE_CYCLE,
 ) -> WorldModel:
-    """Return the model after one observation: what was seen at one instant, and what should have been seen.
+    """Return the model after an observation: the sightings of one instant, and the objects expected to be seen.
 
     1. Sightings are associated with objects that are not retired (`associate`), and fused with them (`fused`). That is
        a *hit*; enough of them confirm a tentative object.
@@ -79,9 +79,9 @@ def observe(
 
     Args:
         model: The model before.
-        sightings: What was seen, in the world frame of the model.
+        sightings: The sightings, in the world frame of the model.
         expected: The identities of the objects that should have been seen: in the field of view and in range, and not
-            hidden. Only the sensor knows.
+            hidden. That is known to the sensor only.
         rules: The thresholds of the life cycle.
 
     Raises:
@@ -130,7 +130,7 @@ def fused(prior: PoseEstimate, seen: PoseEstimate) -> PoseEstimate:
     The object is assumed not to move. The rotation is correct to first order in δ.
 
     Args:
-        prior: What is known; its covariance may be singular, or infinite in some components.
+        prior: The estimate before; its covariance may be singular, or infinite in some components.
         seen: The measurement; its covariance is positive definite, or infinite in some components.
     """
     had, measured = finite_part(prior.covariance), finite_part(seen.covariance)
