@@ -325,6 +325,15 @@ def test_measures_are_read_beside_the_quality():
     assert result.identical(rollout(Quality(above, THETA), measures))
 
 
+def test_f_may_write_into_its_arguments():
+    def careless(state):
+        state[:] = 99.0
+        return 1.0
+
+    result = rollout(Quality(careless, "plant.state"), (Constraint(max, "plant.state", at_most=START, reading="best"),))
+    assert result.measures[0] < 0.0
+
+
 def test_f_may_not_exceed_its_stated_upper_end():
     with pytest.raises(QualityError, match=r"is 1\.4, more than its stated upper end of 1\.2"):
         rollout(Quality(above, THETA, upper=1.2))

@@ -165,7 +165,7 @@ class RolloutRunner:
         """Return f and the other measures in the present state, at the sample time ``t``."""
         with _failures_as_outcomes:
             values = {address: read(self._context) for address, read in self._readers.items()}
-        return [_sample(measure, [values[a] for a in measure.of], t) for measure in self._measures]
+        return [_sample(measure, [_own(values[a]) for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float, *, start: Start | None = None) -> Any:
         """Return s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
@@ -431,6 +431,11 @@ class _Samples:
         if at_end:
             return runner.testbed.snapshot(runner.context)
         return runner.state(parameters, t_star, start=runner._beginning.start)
+
+
+def _own(value: Any) -> Any:
+    # A function may write into its arguments, which others get, too.
+    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
